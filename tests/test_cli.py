@@ -124,8 +124,8 @@ def test_an_error_stays_a_line_whatever_it_quotes(monkeypatch, capfd):
 
 
 def test_help_lists_verbs_and_choices_also_of_the_users_folders(tmp_path, capsys):
-    (tmp_path / "own" / "densify").mkdir(parents=True)
-    (tmp_path / "own" / "densify" / "calm.yaml").touch()
+    (tmp_path / "own/densify").mkdir(parents=True)
+    (tmp_path / "own/densify/calm.yaml").touch()
     assert cli.run(split("--config-dir own --help")) == 0
     said = capsys.readouterr().out
     assert said.startswith(cli.USAGE)

@@ -179,7 +179,7 @@ def place(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "path", list(sys.path))
     (tmp_path / "own.py").write_text(OWN)
     (tmp_path / "broken.py").write_text("def (:\n")
-    experiments = tmp_path / "conf" / "experiment"
+    experiments = tmp_path / "conf/experiment"
     experiments.mkdir(parents=True)
     (experiments / "calls.yaml").write_text(
         "# @package _global_\nhydra:\n  callbacks:\n    x:\n      _target_: os.system\n"
@@ -189,8 +189,8 @@ def place(tmp_path, monkeypatch):
         "a0: &a0 [x]",
         *(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 10)),
     ]
-    (tmp_path / "bombs" / "experiment").mkdir(parents=True)
-    (tmp_path / "bombs" / "experiment" / "bomb.yaml").write_text(
+    (tmp_path / "bombs/experiment").mkdir(parents=True)
+    (tmp_path / "bombs/experiment/bomb.yaml").write_text(
         "\n".join(["# @package _global_", *bomb]) + "\n"
     )
     for module in ("own", "broken"):

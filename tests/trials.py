@@ -137,7 +137,7 @@ def write_trial(
     for key, value in (settings or {}).items():
         group, _, name = key.partition(".")
         config[group] = config.get(group, {}) | {name: value} if name else value
-    path = runs / experiment / scene / f"{init}-{densify}" / f"{config_hash}-seed{seed}"
+    path = runs / experiment / f"{scene}/{init}-{densify}/{config_hash}-seed{seed}"
     path.mkdir(parents=True)
     with (path / "per_view.csv").open("w", newline="") as file:
         writer = csv.writer(file)

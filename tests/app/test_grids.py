@@ -100,7 +100,7 @@ def test_grids_in_a_users_own_experiment(tmp_path):
 
     def join(grids):
         head = "# @package _global_\nname: mine\nhydra:\n  mode: MULTIRUN\n  sweeper:\n    grids: "
-        write(tmp_path / "own" / "experiment" / "mine.yaml", f"{head}{grids}\n")
+        write(tmp_path / "own/experiment/mine.yaml", f"{head}{grids}\n")
 
     join('[{densify: adc, seed: "0,1"}, {densify: none, train.iterations: 0}, {eval.flip: false}]')
     assert arms(*words) == [("adc", 0), ("adc", 1), ("none", 0), ("volumetric", 0)]

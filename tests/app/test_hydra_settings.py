@@ -114,7 +114,7 @@ def test_a_glob_in_the_quotes_that_the_error_advises_works(said):
     "words", [split("--config-dir own --help"), ["-h", "--config-dir=own"], ["-m", "--help"]]
 )
 def test_help_is_printed_wherever_its_option_stands(words, tmp_path, said):
-    write(tmp_path / "own" / "densify" / "patient.yaml", "defaults: [adc]\n")
+    write(tmp_path / "own/densify/patient.yaml", "defaults: [adc]\n")
     out = said(*words)
     assert "Verbs" in out
     # a folder's own choices are listed

@@ -196,7 +196,7 @@ def test_settings_make_arms_and_the_report_opens_with_the_looks(sweep, runs, sai
         for count in (1000, 2000)
     ]
     said("report stop")
-    text = (runs / "stop" / "report.html").read_text()
+    text = (runs / "stop/report.html").read_text()
     pair = "random-volumetric[max_gaussians=1000] against random-adc[max_gaussians=1000]"
     assert f"{pair}: better in PSNR (dB) on this scene" in text
     assert "launch.stop_when_decided" in text

@@ -230,10 +230,10 @@ def test_another_sweeper_gets_a_value_for_each_job(tmp_path):
 
     jobs = [["a=1"], ["a=2"], ["a=3"]]
     task = TrialTask(run, objective=Objective(1, ("seed=1", "seed=2")), sweep=own)
-    config = OmegaConf.create({"hydra": {"sweep": {"dir": str(tmp_path / "new" / "dir")}}})
+    config = OmegaConf.create({"hydra": {"sweep": {"dir": str(tmp_path / "new/dir")}}})
     first, second, third = task.run_jobs(jobs, config)
     assert composed == [[*job, seed] for job in jobs for seed in ("seed=1", "seed=2")]
-    assert (tmp_path / "new" / "dir").is_dir()
+    assert (tmp_path / "new/dir").is_dir()
     assert [one.overrides for one in (first, second, third)] == jobs
     assert (first.status, first.return_value) == (JobStatus.COMPLETED, 21.5)
     assert second.return_value == 31.5

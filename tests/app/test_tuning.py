@@ -107,7 +107,7 @@ def sweep(runs, tmp_path, monkeypatch):
 
 
 def tuning(runs, arm):
-    return read_typed(runs / f"fair-tune-random-{arm}" / TUNING, TuningRecord)
+    return read_typed(runs / f"fair-tune-random-{arm}/{TUNING}", TuningRecord)
 
 
 def chosen(runs, arm):
@@ -167,7 +167,7 @@ def test_a_killed_tuning_continues_and_chooses_the_same_values(
 @pytest.mark.slow
 def test_settings_added_to_a_record_are_ignored(strange, sweep, runs):
     assert sweep(Fake()) == 0
-    file = runs / "fair-tune-random-volumetric" / "tuning.json"
+    file = runs / "fair-tune-random-volumetric/tuning.json"
     record = read_json(file)
     for point in record["points"]:
         point["settings"] |= strange
@@ -334,7 +334,7 @@ def test_trials_from_before_the_tuning_and_with_other_values_are_named(sweep, ru
         change_json(file, measured="2020-01-01T00:00:00Z")
     (line,) = [note for note in notes(runs) if "random-volumetric: " in note]
     assert "when 2 of these 2 trials had been measured" in line
-    file = runs / "fair-tune-random-volumetric" / "tuning.json"
+    file = runs / "fair-tune-random-volumetric/tuning.json"
     record = read_json(file)
     for point in record["points"]:
         point["settings"]["densify.volume_threshold"] = 0.5

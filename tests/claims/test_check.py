@@ -243,7 +243,7 @@ def test_check_judges_made_up_trials_and_their_archive_alike(
     assert "1 claim to be tested" in out
     words = "4 trials until the first look, 8 at most; each test may err in 5 % of such sweeps"
     assert words in out
-    own = runs / "check_it" / "claims.html"
+    own = runs / "check_it/claims.html"
     assert said("check", path) == f"supported            lpips: {SENTENCE}\n{own}\n"
     assert runner.batches == [4]
     assert "supported" in own.read_text()
@@ -304,7 +304,7 @@ def test_check_declares_before_it_runs_trials_and_repeats_its_page(
     assert run(["check", str(path)]) == 0
     assert (home / "claims.html").read_text() == first
     assert read_declarations(home) == [declared]
-    archive = tmp_path / "published" / "check_it.zip"
+    archive = tmp_path / "published/check_it.zip"
     assert run(["export", "--results", "check_it", "--out", str(archive)]) == 0
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "elsewhere"))
     capsys.readouterr()
@@ -312,7 +312,7 @@ def test_check_declares_before_it_runs_trials_and_repeats_its_page(
     printed = said(*recheck)
     assert len(printed.splitlines()) < 15
     assert "?  claim" not in printed
-    page = tmp_path / "pages" / "claims.html"
+    page = tmp_path / "pages/claims.html"
     assert run([*recheck, "--out", str(page)]) == 0
     assert page.read_text().count("Fairness sheet: ") == first.count("Fairness sheet: ")
     assert capsys.readouterr().out.endswith(f"{page}\n")

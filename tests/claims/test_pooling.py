@@ -218,14 +218,14 @@ def test_archives_with_the_same_file_name_are_distinguished(tmp_path, said):
     for lab, seed in (("one", 0), ("two", 1)):
         (tmp_path / lab).mkdir()
         archive(tmp_path / lab, "results", seed)
-    sources = [tmp_path / lab / "results.zip" for lab in ("one", "two")]
+    sources = [tmp_path / f"{lab}/results.zip" for lab in ("one", "two")]
     assert f"| {sources[1]} |" in said(*POOL, *sources)
 
 
 def test_scenes_of_an_archive_under_other_conditions_are_noted(tmp_path):
     file = archive(tmp_path, "lab")
     runs = tmp_path / "runs_lab_0"
-    for path in (runs / "exp" / "garden").glob("*/*/results.json"):
+    for path in (runs / "exp/garden").glob("*/*/results.json"):
         change_json(path, iterations=7000)
     write_archive(loaded(runs), file)
     _, notes, _ = read_studies(file, WANTED, "lab")

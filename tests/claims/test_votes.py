@@ -56,10 +56,10 @@ def made(runs, tmp_path):
     """A function that makes a round of ``exp`` with its page in ``page``, and returns its key."""
 
     def make(*words, pairs="12", out="page"):
-        before = set((runs / "exp" / "votes").glob("*"))
+        before = set((runs / "exp/votes").glob("*"))
         made = ["vote", "make", "exp", "--out", str(tmp_path / out), "--pairs", pairs]
         assert run([*made, *words]) == 0
-        (folder,) = set((runs / "exp" / "votes").glob("*")) - before
+        (folder,) = set((runs / "exp/votes").glob("*")) - before
         return read_key(folder)
 
     return make
@@ -120,12 +120,12 @@ def made_up(arms, scenes, views, people=9, traps=4):
 
 def test_the_page_does_not_reveal_arms(made, tmp_path):
     key = made("--people", "2")
-    text = (tmp_path / "page" / "index.html").read_text()
+    text = (tmp_path / "page/index.html").read_text()
     for word in ("sfm", "volumetric", "courtyard", "garden", "view0", key.salt, "blurred"):
         assert word not in text
     for showing in key.showings:
         assert key.commitment(showing) in text
-    files = sorted((tmp_path / "page" / "pictures").iterdir())
+    files = sorted((tmp_path / "page/pictures").iterdir())
     assert len(files) == 3 * len(key.showings)
     for file in files:
         assert not set(file.stem) - set("0123456789abcdef")
@@ -145,14 +145,14 @@ def test_each_showing_has_the_pictures_that_its_key_names(made, runs, tmp_path):
         photo, left, right = (pixels(page / entry[what]) for what in ("photo", "left", "right"))
         name = f"{showing.view}.png"
         folder = trials[showing.scene, ADC, showing.seed]
-        np.testing.assert_array_equal(photo, pixels(folder / "ground_truth" / name))
+        np.testing.assert_array_equal(photo, pixels(folder / f"ground_truth/{name}"))
         for side, shown in (("left", left), ("right", right)):
             what = getattr(showing, side)
             if showing.kind == "trap":
                 assert np.array_equal(shown, photo) == (what == "photograph")
             else:
                 folder = trials[showing.scene, what, showing.seed]
-                np.testing.assert_array_equal(shown, pixels(folder / "renders" / name))
+                np.testing.assert_array_equal(shown, pixels(folder / f"renders/{name}"))
 
 
 def pixels(file):
@@ -176,7 +176,7 @@ def test_views_sides_repeats_and_traps_follow_the_rules(made, runs):
         differences = {}
         for place in range(7):
             both = [
-                pixels(t.path / "renders" / f"view{place:03}.png").astype(float)
+                pixels(t.path / f"renders/view{place:03}.png").astype(float)
                 for t in trials_of(runs)
                 if t.scene == scene and t.seed == place % 2
             ]
@@ -223,7 +223,7 @@ def test_a_round_is_declared_apart_from_metrics_and_claims(made, runs, tmp_path)
     archive = str(tmp_path / "exp.zip")
     assert run(["export", "--results", "exp", "--out", archive]) == 0
     assert run(["site", archive, "--out", str(tmp_path / "site")]) == 0
-    assert "vote " + key.round not in (tmp_path / "site" / "index.html").read_text()
+    assert "vote " + key.round not in (tmp_path / "site/index.html").read_text()
 
 
 @pytest.mark.parametrize(
@@ -314,7 +314,7 @@ def test_every_field_of_the_key_is_sealed_by_the_rounds_name():
 
 def test_a_changed_key_is_refused(made, runs, tmp_path, refused):
     key = made()
-    file = runs / "exp" / "votes" / key.round / "key.json"
+    file = runs / f"exp/votes/{key.round}/key.json"
     text = file.read_text()
     write(file, replace(key, traps_allowed=4).to_json())
     assert "was changed after the page was made" in refused(
@@ -363,7 +363,7 @@ def test_a_change_of_stored_votes_costs_that_file_and_is_shown(
     key = made("--people", "9")
     ballots = [ballot(key, n, prefers(VOLUMETRIC), minute=n) for n in range(2)]
     judge(*ballots)
-    change(runs / "exp" / "votes" / key.round / f"{0:016x}.json")
+    change(runs / f"exp/votes/{key.round}/{0:016x}.json")
     out = judge(ballots[1])
     assert f"Round {key.round}: {12 * people} votes of {people} p" in out
     assert re.search(f"Left out: .*{words}", out)
@@ -375,7 +375,7 @@ def test_a_stored_file_of_another_round_does_not_count(made, runs, judge):
     for key in (one, two):
         judge(ballot(key, 1, prefers(ADC)))
     name = f"{1:016x}.json"
-    folders = [runs / "exp" / "votes" / key.round for key in (one, two)]
+    folders = [runs / f"exp/votes/{key.round}" for key in (one, two)]
     (folders[1] / name).write_text((folders[0] / name).read_text())
     assert re.search(f"Left out: {name} .*of another round", judge())
 
@@ -543,7 +543,7 @@ class Voter:
 @pytest.mark.browser
 def test_two_people_vote_by_keyboard_and_are_judged(made, runs, tmp_path, capsys, said):
     key = made("--people", "2")
-    address, files, last = (tmp_path / "page" / "index.html").as_uri(), [], len(key.showings)
+    address, files, last = (tmp_path / "page/index.html").as_uri(), [], len(key.showings)
     for width, chooser in ((1200, prefers(VOLUMETRIC)), (400, prefers(ADC))):
         with Browser(address, tmp_path / f"profile{width}", (width, 800)) as browser:
             metrics = {"width": width, "height": 800, "deviceScaleFactor": 1, "mobile": False}

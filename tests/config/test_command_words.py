@@ -195,7 +195,7 @@ def test_special_characters_are_shown_quoted(word, said):
 @pytest.mark.parametrize("group, word", [("experiment", "experiment=a"), ("init", "init=[a]")])
 def test_choices_of_the_users_folder_are_listed_too(tmp_path, group, word):
     (tmp_path / group).mkdir()
-    (tmp_path / group / "of_mine.yaml").touch()
+    (tmp_path / f"{group}/of_mine.yaml").touch()
     words, *_ = parse(["--config-dir", str(tmp_path), word])
     with refusal(r"\bof_mine\b"):
         check_words(words)
@@ -207,9 +207,9 @@ def test_a_word_that_is_a_choice_gets_a_hint(tmp_path):
     assert hint_for("demo") == "; did you mean +experiment=demo?"
     assert hint_for("none").startswith("; did you mean densify=none or ")
     assert hint_for("nosuch") == ""
-    (tmp_path / "densify" / "external").mkdir(parents=True)
+    (tmp_path / "densify/external").mkdir(parents=True)
     for name in ("adc", "zeta", "alpha", "external/mine"):
-        (tmp_path / "densify" / f"{name}.yaml").touch()
+        (tmp_path / f"densify/{name}.yaml").touch()
     found = options("densify", [tmp_path])
     assert found[: len(options("densify"))] == options("densify")
     assert found[len(options("densify")) :] == ["alpha", "zeta", "external/mine"]

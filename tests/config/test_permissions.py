@@ -82,7 +82,7 @@ def strange_runs(settings):
         "allow_targets": ["bomb", "bash", "os", "gsbench", "bombs"]
     }
     nested(settings, values)
-    folder = Path(values["runs"]) / "x" / "courtyard" / "sfm-volumetric" / "01234567-seed0"
+    folder = Path(values["runs"]) / "x/courtyard/sfm-volumetric/01234567-seed0"
     write(folder / "config.yaml", yaml.safe_dump(values))
     write(folder / "failed.json", {"message": "no luck"})
     return folder
@@ -232,7 +232,7 @@ def test_a_plan_gives_no_permission_and_no_folder_of_modules(place, monkeypatch,
     (theirs / "mine.py").write_text(f"open({str(place / 'exploded')!r}, 'w')\nclass Mine: ...\n")
     words = ["name=x", "densify=adc", "densify._target_=mine.Mine", "seed=0,1"]
     add_to_plan(compose_trials([*words, "allow_targets=[mine]"], multirun=True))
-    plan = place / "runs" / "x" / "plan.json"
+    plan = place / "runs/x/plan.json"
     strange = plan.read_text().replace(f'"cwd": "{place}"', f'"cwd": "{theirs}"')
     assert str(theirs) in strange
     assert "allow_targets=[mine]" in strange
@@ -252,22 +252,22 @@ def test_a_plan_gives_no_permission_and_no_folder_of_modules(place, monkeypatch,
 
 def test_a_plan_reaches_no_other_experiment(place, refused):
     add_to_plan(compose_trials(["name=x", "seed=0,1"], multirun=True))
-    plan = place / "runs" / "x" / "plan.json"
+    plan = place / "runs/x/plan.json"
     plan.write_text(plan.read_text().replace("name=x", "name=mine"))
     for words in (["retry", "x"], ["retry", "x", "--dry-run"]):
         assert "is planned as a trial of mine, not of x" in refused(*words)
-    assert not (place / "runs" / "mine").exists()
+    assert not (place / "runs/mine").exists()
 
 
 def test_a_plan_gives_no_folder_for_packages_of_settings(place, monkeypatch):
     """Hydra imports ``pkg://conf_of_mine`` while it composes: the user's own, not the plan's."""
     theirs = place / "theirs"
     for folder, line in (("theirs", f"open({str(place / 'exploded')!r}, 'w')\n"), (".", "")):
-        (place / folder / "conf_of_mine").mkdir(parents=True)
-        (place / folder / "conf_of_mine" / "__init__.py").write_text(line)
+        (place / f"{folder}/conf_of_mine").mkdir(parents=True)
+        (place / f"{folder}/conf_of_mine/__init__.py").write_text(line)
     monkeypatch.chdir(place)
     add_to_plan(compose_trials(["name=x", "seed=0,1"], multirun=True))
-    plan = place / "runs" / "x" / "plan.json"
+    plan = place / "runs/x/plan.json"
     content = read_json(plan)
     for planned in content["trials"].values():
         planned |= {
@@ -276,7 +276,7 @@ def test_a_plan_gives_no_folder_for_packages_of_settings(place, monkeypatch):
         }
     write(plan, content)
     assert cli.run(["retry", "x", "allow_targets=[conf_of_mine]", "--dry-run"]) == 0
-    assert sys.modules.pop("conf_of_mine").__file__ == str(place / "conf_of_mine" / "__init__.py")
+    assert sys.modules.pop("conf_of_mine").__file__ == str(place / "conf_of_mine/__init__.py")
     assert not (place / "exploded").exists()
 
 

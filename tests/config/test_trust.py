@@ -414,7 +414,7 @@ def test_an_allowed_callback_is_made(capsys, monkeypatch):
 def test_only_allowed_modules_of_the_folder_are_found_and_installed_ones_come_first(place):
     (place / "yaml.py").write_text(BOMB)
     (place / "json").mkdir()
-    (place / "json" / "__init__.py").write_text(BOMB)
+    (place / "json/__init__.py").write_text(BOMB)
     (place / "mine.py").write_text("import helper\nclass Mine:\n    pass\n")
     (place / "helper.py").write_text("")
     allow_modules(["mine", "yaml", "json"])
@@ -430,7 +430,7 @@ def test_only_allowed_modules_of_the_folder_are_found_and_installed_ones_come_fi
 
 
 def test_looking_for_a_users_source_imports_nothing(place):
-    (place / "bombs" / "sub.py").write_text("class Sub: ...\n")
+    (place / "bombs/sub.py").write_text("class Sub: ...\n")
     allow_modules(["bombs"])
     assert module_digest("bombs")
     assert not Path("exploded").exists()

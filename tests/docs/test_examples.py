@@ -45,7 +45,7 @@ def run_command(page, part, small=TINY):
 
     Its seeds are replaced by those of ``small``, if any.
     """
-    text = re.sub(r" *\\\n +", " ", (ROOT / "docs" / page).read_text(encoding="utf-8"))
+    text = re.sub(r" *\\\n +", " ", (ROOT / f"docs/{page}").read_text(encoding="utf-8"))
     (found,) = [line for line in re.findall(r"^    gsbench (.*)$", text, re.M) if part in line]
     typed = [word for word in shlex.split(found) if not word.startswith("seed=")]
     keys = {word.split("=")[0] for word in typed}
@@ -77,7 +77,7 @@ def folder(tmp_path, monkeypatch):
 
 
 def test_the_code_of_the_library_document_trains_and_resumes(folder):
-    found = run_blocks(ROOT / "docs" / "library.md", folder)
+    found = run_blocks(ROOT / "docs/library.md", folder)
     assert sum(found["losses"][-10:]) < 0.9 * sum(found["losses"][:10])
     assert len(found["trained"]) > len(found["initial"])
     for name, tensor in found["trained"].tensors().items():
@@ -85,7 +85,7 @@ def test_the_code_of_the_library_document_trains_and_resumes(folder):
 
 
 def test_the_densifier_of_its_document_runs(folder):
-    run_blocks(ROOT / "docs" / "densifier.md", folder)
+    run_blocks(ROOT / "docs/densifier.md", folder)
     schedule = " train.iterations=120 train.densify_start=20 train.densify_stop=100"
     small = TINY.replace(" train.iterations=5", schedule) + " +densify.interval=20 seed=0"
     run_command("densifier.md", "densify._target_=largest.SplitLargest", small)
@@ -97,13 +97,13 @@ def test_the_densifier_of_its_document_runs(folder):
 
 
 def test_the_rasterizer_of_its_document_runs(folder):
-    run_blocks(ROOT / "docs" / "rasterizer.md", folder)
+    run_blocks(ROOT / "docs/rasterizer.md", folder)
     run_command("rasterizer.md", "raster._target_=oversampled.Oversampled")
     assert len(list(Path("runs").glob("oversampled/courtyard/*/*/results.json"))) == 1
 
 
 def test_the_metric_of_its_document_is_measured_and_shown(folder, capsys):
-    run_blocks(ROOT / "docs" / "metric.md", folder)
+    run_blocks(ROOT / "docs/metric.md", folder)
     early = "train.iterations=40 train.densify_start=5 train.densify_interval=5"
     small = TINY.replace("train.iterations=5", early)
     run_command("metric.md", "-m densify=adc,volumetric", f"{small} seed=0,1")
@@ -145,7 +145,7 @@ SCENE = " ".join(word for word in TINY.split() if not word.startswith("init"))
 
 
 def test_the_initialiser_of_its_document_runs(folder):
-    run_blocks(ROOT / "docs" / "initialiser.md", folder)
+    run_blocks(ROOT / "docs/initialiser.md", folder)
     run_command("initialiser.md", "init._target_=shell.Shell", SCENE)
     (results,) = Path("runs").glob("shell/courtyard/shell-none/*/results.json")
     values = json.loads(results.read_text())
@@ -162,7 +162,7 @@ def test_a_cloud_from_a_file_keeps_as_many_points_as_asked_for(folder):
 
 
 def test_the_tracker_of_its_document_gets_every_trial(folder):
-    run_blocks(ROOT / "docs" / "hydra.md", folder)
+    run_blocks(ROOT / "docs/hydra.md", folder)
     run_command("hydra.md", "kept.Kept", f"{TINY.replace(' tracking=none', '')} seed=0,1")
     shown = {one["tags"]["seed"]: one for one in map(_json, Path("runs/told/shown").iterdir())}
     results = {one["seed"]: one for one in map(_json, Path("runs/told").rglob("results.json"))}
@@ -180,9 +180,9 @@ def _json(path):
 
 def test_the_reader_of_its_document_finds_the_cameras(folder):
     """The same training as with the cameras' COLMAP model, but for rounding."""
-    run_blocks(ROOT / "docs" / "library.md", folder)
-    capture = folder / "library" / "courtyard"
-    np.save(capture / "poses_bounds.npy", _llff(read_model(capture / "sparse" / "0")))
+    run_blocks(ROOT / "docs/library.md", folder)
+    capture = folder / "library/courtyard"
+    np.save(capture / "poses_bounds.npy", _llff(read_model(capture / "sparse/0")))
     small = " ".join(word for word in TINY.split() if not word.startswith("scene"))
     own = "scene=reader scene._target_=llff.LLFF allow_targets=[llff] name=llff"
     for words in (own, "scene=colmap scene.name=courtyard name=colmap"):
@@ -218,7 +218,7 @@ def test_the_densifier_of_its_document_resumes_to_the_bit(folder):
 
     (code,) = (
         b
-        for b in BLOCK.findall((ROOT / "docs" / "densifier.md").read_text())
+        for b in BLOCK.findall((ROOT / "docs/densifier.md").read_text())
         if b.startswith("# largest.py")
     )
     (folder / "largest.py").write_text(code)
@@ -276,7 +276,7 @@ def test_the_example_of_state_trains_and_resumes_to_the_bit(folder):
 
     (code,) = (
         block
-        for block in BLOCK.findall((ROOT / "docs" / "densifier.md").read_text())
+        for block in BLOCK.findall((ROOT / "docs/densifier.md").read_text())
         if block.startswith("# careful.py")
     )
     (folder / "careful.py").write_text(code)
@@ -318,7 +318,7 @@ def test_the_governed_densifier_of_the_document_ends_at_its_limit(folder):
     from gsbench.gaussians.trainable import TrainableGaussians
     from tests.gaussians.helpers import random_gaussians
 
-    run_blocks(ROOT / "docs" / "densifier.md", folder)
+    run_blocks(ROOT / "docs/densifier.md", folder)
     from largest import SplitLargest
 
     gaussians, rng = random_gaussians(100), torch.Generator().manual_seed(0)

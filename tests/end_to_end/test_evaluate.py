@@ -59,7 +59,7 @@ def better_renders(runs, folder, seed):
     own = trial(runs, seed=seed)
     for file in (own / "renders").glob("*.png"):
         mixed = Image.blend(
-            Image.open(file), Image.open(own / "ground_truth" / file.name), 0.5 + 0.05 * seed
+            Image.open(file), Image.open(own / f"ground_truth/{file.name}"), 0.5 + 0.05 * seed
         )
         mixed.save(folder / f"render_{int(file.stem)}.png")
     return folder
@@ -111,8 +111,8 @@ def test_entered_renders_are_in_the_table_and_get_a_verdict(
     assert found["evaluated_from"] == "renders"
     assert found["num_gaussians"] is None
     assert list(views(entered)) == list(views(trial(runs)))
-    picture = np.asarray(Image.open(entered / "renders" / "0008.png"))
-    assert_array_equal(picture, np.asarray(Image.open(tmp_path / "theirs1" / "render_8.png")))
+    picture = np.asarray(Image.open(entered / "renders/0008.png"))
+    assert_array_equal(picture, np.asarray(Image.open(tmp_path / "theirs1/render_8.png")))
 
     table = gsbench("tables small")
     assert (
@@ -123,7 +123,7 @@ def test_entered_renders_are_in_the_table_and_get_a_verdict(
     assert row.count("n/a") == 3  # LPIPS (not asked for), Gaussians, time
     assert "**" in row  # compared, and best
     gsbench("report small")
-    text = (runs / "small" / "report.html").read_text()
+    text = (runs / "small/report.html").read_text()
     # Two seeds decide nothing among three metrics, however much better these renders are.
     assert "random-theirs against random-adc, on this scene: undecided in PSNR" in text
     assert "by a training elsewhere, which left no record" in text

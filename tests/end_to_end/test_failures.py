@@ -48,7 +48,7 @@ def test_a_failed_trial_does_not_stop_the_others_and_retry_completes_it(gsbench,
         "super().begin(gaussians, context)\n"
     )
     write(
-        tmp_path / "conf" / "densify" / "mine.yaml",
+        tmp_path / "conf/densify/mine.yaml",
         "defaults: [adc, _self_]\n_target_: mine.Mine\nname: mine\n",
     )
     own = "name=own densify=mine,adc allow_targets=[mine] tracking=none train.iterations=20"

@@ -41,16 +41,16 @@ def test_two_ideas_at_once_share_the_baseline(do, start, tmp_path):
     both = [start("ledger", "try", "night", *own) for own in words]
     ends = [process.communicate(timeout=300) for process in both]
     assert {process.returncode for process in both} <= {0, 1, 3}, ends
-    ledger = read_ledger(tmp_path / "runs" / "night")
+    ledger = read_ledger(tmp_path / "runs/night")
     assert len(ledger.started) == len(ledger.ended) == 2
     assert len({one.seeds for one in ledger.tests.values()}) == len(ledger.tests)
-    baselines = (tmp_path / "runs" / "night").glob("courtyard/random-adc/*-seed0/results.json")
+    baselines = (tmp_path / "runs/night").glob("courtyard/random-adc/*-seed0/results.json")
     assert len(list(baselines)) == 2  # that of the ledger, and that of the second idea
 
 
 def test_a_killed_try_continues(do, start, tmp_path):
     do(*NEW, "seed=0,1,2")
-    home = tmp_path / "runs" / "night"
+    home = tmp_path / "runs/night"
     killed = start("ledger", "try", "night", "densify=volumetric")
     deadline = time.monotonic() + 120
     while not list(home.glob("*/*/*/results.json")) and time.monotonic() < deadline:
@@ -86,5 +86,5 @@ def test_the_ledger_is_in_the_archive(do, tmp_path):
     do("export --results night")
     with zipfile.ZipFile(tmp_path / "night.zip") as archive:
         (tmp_path / "ledger.jsonl").write_bytes(archive.read("ledger.jsonl"))
-    kept = read_ledger(tmp_path / "runs" / "night")
+    kept = read_ledger(tmp_path / "runs/night")
     assert read_ledger(tmp_path).ended == kept.ended

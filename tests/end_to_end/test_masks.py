@@ -46,15 +46,15 @@ def captures(tmp_path_factory):
     for place, name in enumerate(names):
         ignored = ((rows - 70) ** 2 + (columns - 40 - 10 * place) ** 2 < 30**2) | (rows > 130)
         Image.fromarray(np.where(ignored, 0, 255).astype(np.uint8)).save(
-            clean / "masks" / f"{name}.png"
+            clean / f"masks/{name}.png"
         )
     shutil.copytree(clean, noisy)
     rng = np.random.default_rng(0)
     for name in names:
-        ignored = np.asarray(Image.open(clean / "masks" / f"{name}.png")) == 0
-        pixels = np.array(Image.open(clean / "images" / name))
+        ignored = np.asarray(Image.open(clean / f"masks/{name}.png")) == 0
+        pixels = np.array(Image.open(clean / f"images/{name}"))
         pixels[ignored] = rng.integers(0, 256, (ignored.sum(), 3))
-        Image.fromarray(pixels).save(noisy / "images" / name)
+        Image.fromarray(pixels).save(noisy / f"images/{name}")
     return clean, noisy
 
 
@@ -97,7 +97,7 @@ def test_ignored_pixels_do_not_change_one_bit_of_a_trial(captures, tmp_path, wor
 def _points(folder):
     """The digests of the trial's initial cloud and cameras."""
     key = read_json(folder / "results.json")["hashes"]["init"]
-    model = folder.parents[3] / "store" / "init" / key / MODEL_FOLDER
+    model = folder.parents[3] / f"store/init/{key}" / MODEL_FOLDER
     return {path.name: file_sha256(path) for path in model.iterdir()}
 
 
@@ -203,4 +203,4 @@ def test_no_keypoint_lies_on_an_ignored_pixel(captures, tmp_path, make, request)
             assert inside.all(), image.name
             seen += len(points)
     assert seen > 200
-    assert len(read_model(tmp_path / "out" / MODEL_FOLDER).points3D) > 0
+    assert len(read_model(tmp_path / f"out/{MODEL_FOLDER}").points3D) > 0

@@ -59,8 +59,8 @@ COURTYARD = ["scene.views=12", "scene.width=96", "scene.height=72", *QUICK]
 def trainers(tmp_path_factory):
     """A folder of configurations with the two trainers: a user's own YAML files."""
     folder = tmp_path_factory.mktemp("conf")
-    write(folder / "densify" / "cloud.yaml", CLOUD)
-    (folder / "densify" / "painter.yaml").write_text(PAINTER)
+    write(folder / "densify/cloud.yaml", CLOUD)
+    (folder / "densify/painter.yaml").write_text(PAINTER)
     return folder
 
 
@@ -125,7 +125,7 @@ def test_two_programs_and_a_folder_of_renders_in_one_table(home, monkeypatch, ca
         folder = tmp_path / f"renders{seed}"
         folder.mkdir()
         for file in (trial(home, "adc", seed) / "renders").glob("*.png"):
-            truth = Image.open(trial(home, "adc") / "ground_truth" / file.name)
+            truth = Image.open(trial(home, "adc") / f"ground_truth/{file.name}")
             Image.blend(Image.open(file), truth, 0.5).save(folder / file.name)
         words = split(f"--truth three:garden:adc --as three:folder --seed {seed}")
         assert run(["evaluate", str(folder), *words]) == 0
@@ -150,7 +150,7 @@ def test_two_programs_and_a_folder_of_renders_in_one_table(home, monkeypatch, ca
         "random-folder." in table
     )
     assert run(["report", "three"]) == 0
-    report = (home / "runs" / "three" / "report.html").read_text()
+    report = (home / "runs/three/report.html").read_text()
     for arm in ("cloud", "painter", "folder"):
         assert re.search(
             rf"random-{arm} against random-adc, on this scene: (better|worse)", report
@@ -170,7 +170,7 @@ def test_the_model_of_another_program_can_be_viewed_and_exported(
     viewed = load_viewed(find_trial("three:garden:cloud:0", home / "runs"), torch.device("cpu"))
     assert len(viewed.gaussians) == 2000
     assert len(viewed.views) == 2
-    assert (trial(home, "cloud") / "figures" / "ellipsoids.png").is_file()
+    assert (trial(home, "cloud") / "figures/ellipsoids.png").is_file()
     assert run(["export", "three:garden:cloud:0", "--out", str(tmp_path / "x.ply")]) == 0
     assert run(["export", "three:garden:painter:0", "--out", str(tmp_path / "y.ply")]) == 2
     assert "it has no model" in capsys.readouterr().err
@@ -187,7 +187,7 @@ def test_a_trial_of_another_program_has_a_full_record(home):
     assert (trial(home, "cloud") / "point_cloud.ply").is_file()
     assert (trial(home, "painter") / "trainer.log").is_file()
     assert model["hashes"]["train"] != results(trial(home, "cloud", 1))["hashes"]["train"]
-    assert not list((home / "runs" / "store").rglob("work"))
+    assert not list((home / "runs/store").rglob("work"))
 
 
 @pytest.mark.parametrize("arm", ["cloud", "painter"])
@@ -198,9 +198,7 @@ def test_no_test_photograph_reaches_another_program(home, arm):
     held_out = {
         file.name: pixels(file) for file in (trial(home, arm) / "ground_truth").glob("*.png")
     }
-    photographs = {
-        file.name: pixels(file) for file in (home / "data" / "garden" / "images_4").iterdir()
-    }
+    photographs = {file.name: pixels(file) for file in (home / "data/garden/images_4").iterdir()}
     training = photographs.keys() - held_out.keys()
     assert len(held_out) == 2
     assert len(training) == 10
@@ -226,7 +224,7 @@ def test_a_finished_trial_is_not_repeated_and_another_version_is_another_trial(
     words = [*own(trainers), *QUICK, *split("scene=garden densify=cloud name=three eval.maps=true")]
 
     def written():
-        stored = (home / "runs" / "store").glob("*/*/manifest.json")
+        stored = (home / "runs/store").glob("*/*/manifest.json")
         return {path: path.stat().st_mtime_ns for path in stored}
 
     before = written()
@@ -297,7 +295,7 @@ def hanging(environment, trainers, tmp_path):
     pids = []
     deadline = time.monotonic() + 300
     while not pids and process.poll() is None and time.monotonic() < deadline:
-        for log in (tmp_path / "runs" / "store" / "train").glob(".*/trainer.log"):
+        for log in (tmp_path / "runs/store/train").glob(".*/trainer.log"):
             pids = pids_in(log)
         time.sleep(0.05)
     yield process, pids

@@ -83,7 +83,7 @@ def test_wheel_runs_a_trial_outside_the_checkout(environment, tmp_path):
     (wheel,) = (tmp_path / "dist").glob("gsbench_3dgs-*.whl")
     home = tmp_path / "clean"
     venv.create(home, with_pip=False)
-    python = home / "bin" / "python"
+    python = home / "bin/python"
     packages = next((home / "lib").glob("python*/site-packages"))
     # The dependencies come from this environment, after the wheel's own files; gsbench itself from
     # the wheel alone.

@@ -16,7 +16,7 @@ from gsbench.verbs import VERBS
 from gsbench.view.trials import find_trial, model_file
 from tests.end_to_end.conftest import FINISHED
 
-PAGE = Path(__file__).parents[2] / "docs" / "security.md"
+PAGE = Path(__file__).parents[2] / "docs/security.md"
 pytestmark = pytest.mark.slow
 
 

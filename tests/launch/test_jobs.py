@@ -320,7 +320,7 @@ def test_ctrl_c_is_passed_on_to_the_processes_that_still_run(tmp_path):
 def test_submitits_link_is_removed_and_any_other_link_is_refused(tmp_path):
     values = trial_values(tmp_path, name="cluster")
     folder = job_folder(values)
-    assert folder == tmp_path / ".jobs" / "cluster"
+    assert folder == tmp_path / ".jobs/cluster"
     script = new_job_folder(values) / "2_submission.sh"
     script.write_text("#!/bin/bash\n")
     left = script.with_name(".submission_file_aaa46bf3.sh")
@@ -331,13 +331,13 @@ def test_submitits_link_is_removed_and_any_other_link_is_refused(tmp_path):
     (folder / "2_0_0_log.out").symlink_to(tmp_path / "elsewhere")
     with refusal(r"2_0_0_log\.out is a link"):
         job_folder(values)
-    (tmp_path / ".jobs" / "other").symlink_to(tmp_path)
+    (tmp_path / ".jobs/other").symlink_to(tmp_path)
     with refusal(r"other is a link"):
         job_folder(trial_values(tmp_path, name="other"))
 
 
 def test_through_a_link_no_file_of_another_folder_is_removed(tmp_path):
-    kept = tmp_path / "elsewhere" / ".submission_file_aaa46bf3.sh"
+    kept = tmp_path / "elsewhere/.submission_file_aaa46bf3.sh"
     kept.parent.mkdir()
     kept.symlink_to(tmp_path)
     runs = tmp_path / "runs"

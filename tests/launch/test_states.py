@@ -99,7 +99,7 @@ def test_the_state_of_a_submitted_trial_is_that_of_its_job(
         assert states_of_experiment(tmp_path / "x") == []
         planned = PlannedTrial(overrides=("a=1",), cwd="", time=5)
         record = PlanFile(trials={"/".join(one.folder.parts[-3:]): planned})
-        write(tmp_path / "x" / "plan.json", record.to_json())
+        write(tmp_path / "x/plan.json", record.to_json())
         (found,) = states_of_experiment(tmp_path / "x")
         assert (found.state, found.since) == ("missing", 5)
         assert found.note == "never started; Slurm job 7_1 has ended, log: a.log"

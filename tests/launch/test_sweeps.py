@@ -53,7 +53,7 @@ def why_not_done(values):
 def finish(values, seconds=100.0, awaited=()):
     """Make the files of a finished trial, with one stage in the store and one source file."""
     folder = TrialFolder.of(values)
-    source = folder.runs.parent / "photos" / "a.jpg"
+    source = folder.runs.parent / "photos/a.jpg"
     if not source.exists():
         write(source, b"photo")
     entry = Store(folder.runs / "store").get(
@@ -240,9 +240,9 @@ def test_changes_are_noticed_and_named(change, names, runs):
     folder = TrialFolder.of(values).path
     content = read_json(folder / "results.json")
     if change == "photo":
-        (runs.parent / "photos" / "a.jpg").write_bytes(b"other")
+        (runs.parent / "photos/a.jpg").write_bytes(b"other")
     elif change == "photo gone":
-        (runs.parent / "photos" / "a.jpg").unlink()
+        (runs.parent / "photos/a.jpg").unlink()
     elif change == "new photo":
         os.utime(runs.parent / "photos", ns=(1, 1))
     elif change == "published":
@@ -250,7 +250,7 @@ def test_changes_are_noticed_and_named(change, names, runs):
     elif change == "a flipped bit":
         edit(folder / "table.csv", "a,b", "a,c")
     elif change == "store":
-        (model,) = (runs / "store" / "train").glob("*/model")
+        (model,) = (runs / "store/train").glob("*/model")
         model.write_text("n")
     elif change == "results":
         content["metrics"]["psnr"] = 30.5
@@ -268,7 +268,7 @@ def test_a_dry_run_says_what_has_changed(runs):
     finish(values)
     trial = replace(composed([])[0], values=values)
     assert describe_plan([trial])[0].startswith("done     courtyard/sfm-volumetric seed 0")
-    (runs.parent / "photos" / "a.jpg").write_bytes(b"other")
+    (runs.parent / "photos/a.jpg").write_bytes(b"other")
     assert describe_plan([trial])[0].endswith(
         f"  will be checked: {runs.parent / 'photos' / 'a.jpg'} has changed"
     )
@@ -339,7 +339,7 @@ def test_the_plan_keeps_requested_trials_and_status_lists_missing_ones(runs):
 
 def test_a_damaged_plan_is_named_and_the_next_command_repairs_it(runs, caplog):
     (runs / "x").mkdir(parents=True)
-    (runs / "x" / "plan.json").write_text("{")
+    (runs / "x/plan.json").write_text("{")
     assert read_plan(runs / "x") == {}
     assert states_of_experiment(runs / "x") == []
     assert "left out: " in caplog.text
@@ -453,7 +453,7 @@ def test_full_disk_ends_the_sweep(fake_trial):
 @pytest.mark.parametrize("number", [errno.EFBIG, errno.ENOLCK, errno.EROFS])
 def test_verbs_that_write_report_storage_errors_in_one_line(number, runs, monkeypatch, refused):
     def refuse(*arguments):
-        raise OSError(number, os.strerror(number), str(runs / "x" / "plan.json"))
+        raise OSError(number, os.strerror(number), str(runs / "x/plan.json"))
 
     add_to_plan([bare_trial(runs, words=["seed=0"])])
     monkeypatch.setattr("gsbench.runs.plan.write_json", refuse)

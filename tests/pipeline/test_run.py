@@ -66,7 +66,7 @@ def test_a_trial_runs_unless_it_is_done_and_one_process_at_a_time(tmp_path, monk
 )
 def test_a_failure_is_recorded_and_raised(tmp_path, monkeypatch, error, kind, message, bad_input):
     monkeypatch.setattr("time.time", lambda: 12.5)
-    folder = TrialFolder(tmp_path / "a" / "b" / "c" / "d")
+    folder = TrialFolder(tmp_path / "a/b/c/d")
     folder.path.mkdir(parents=True)
     for _ in range(2):
         with pytest.raises(kind), _recorded_failures({"seed": 4, "device": "cuda"}, folder):
@@ -208,8 +208,8 @@ def test_files_of_the_steps_are_published_in_the_trials_folder(tmp_path, normali
             write(place / name, f"{stage.name} {name}")
         entries[stage.name] = SimpleNamespace(path=place)
     gaussians = random_gaussians(5, dtype=torch.float32)
-    write_ply(gaussians, tmp_path / "train" / "point_cloud.ply")
-    (tmp_path / "init" / trials.PICTURE_FILE).write_text("init picture.png")
+    write_ply(gaussians, tmp_path / "train/point_cloud.ply")
+    (tmp_path / f"init/{trials.PICTURE_FILE}").write_text("init picture.png")
     folder = tmp_path / "trial"
     folder.mkdir()
     published = _publish(folder, entries, normalization)
@@ -227,7 +227,7 @@ def test_files_of_the_steps_are_published_in_the_trials_folder(tmp_path, normali
     model = read_ply(folder / "point_cloud.ply")
     given = gaussians.means / normalization.scale + torch.tensor(normalization.center)
     assert_close(model.means, given.float())
-    is_linked = (folder / "point_cloud.ply").samefile(tmp_path / "train" / "point_cloud.ply")
+    is_linked = (folder / "point_cloud.ply").samefile(tmp_path / "train/point_cloud.ply")
     assert is_linked == (normalization is IDENTITY)
 
 

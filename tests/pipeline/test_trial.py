@@ -19,7 +19,7 @@ from tests.helpers import read_json, refusal
 
 @pytest.mark.parametrize("code", [0, None, 3, "text"])
 def test_code_that_ends_the_process_counts_as_a_failure(code, tmp_path):
-    folder = TrialFolder(tmp_path / "a" / "b" / "c" / "d" / "x")
+    folder = TrialFolder(tmp_path / "a/b/c/d/x")
     folder.path.mkdir(parents=True)
     with (
         pytest.raises(TrainingError, match="ended the process"),

@@ -68,7 +68,7 @@ ENTRIES = [
 
 @pytest.fixture
 def home(tmp_path):
-    home = tmp_path / "runs" / "night"
+    home = tmp_path / "runs/night"
     home.mkdir(parents=True)
     begin_ledger(home, OPENED)
     for entry in ENTRIES:

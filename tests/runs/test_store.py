@@ -25,7 +25,7 @@ LETTERS = Stage("letters", 1)
 def write_letters(folder):
     (folder / "sub").mkdir()
     (folder / "a.txt").write_text("alpha")
-    (folder / "sub" / "b.bin").write_bytes(bytes(range(256)))
+    (folder / "sub/b.bin").write_bytes(bytes(range(256)))
 
 
 def refuse(folder):
@@ -82,7 +82,7 @@ def test_damage_is_named_and_repaired(store, name, damage, caplog):
     assert store.find(FOUND) is None
     mended = store.get(BUILD)
     assert not mended.cached
-    assert (mended.path / "sub" / "b.bin").read_bytes() == bytes(range(256))
+    assert (mended.path / "sub/b.bin").read_bytes() == bytes(range(256))
     message = " ".join(record.getMessage() for record in caplog.records)
     assert "damaged" in message
     assert name in message
@@ -152,7 +152,7 @@ def test_damage_that_keeps_size_and_time_is_found_by_a_thorough_check(store):
 
 def test_a_flipped_bit_is_found_before_a_result_becomes_an_input(store, monkeypatch, caplog):
     step = BUILD
-    path = store.get(step).path / "sub" / "b.bin"
+    path = store.get(step).path / "sub/b.bin"
     flip_a_bit(path)
     later = Store(store.root)  # as a later process
     assert not later.get(step).cached
@@ -245,12 +245,12 @@ def test_sweep_removes_leftovers_and_keeps_what_a_build_would_continue(store):
     stale = store.partial(long, entry.key)
     useful = store.partial(long, "1" * 64)
     useless = store.partial(LETTERS, "2" * 64)
-    half_removed = store.root / "long" / ".33.removed"
-    old, young = store.root / "views" / ".old", store.root / "views" / ".young"
+    half_removed = store.root / "long/.33.removed"
+    old, young = store.root / "views/.old", store.root / "views/.young"
     for folder in (stale, useful, useless, half_removed, old, young):
         write(folder / "file", "x")
-    (store.root / "views" / ".file").touch()
-    for path, hours in ((old, 25), (young, 23), (store.root / "views" / ".file", 25)):
+    (store.root / "views/.file").touch()
+    for path, hours in ((old, 25), (young, 23), (store.root / "views/.file", 25)):
         os.utime(path, (time.time() - hours * 3600,) * 2)
     store.sweep([long, LETTERS])
     assert useful.exists()

@@ -152,7 +152,7 @@ def test_a_trial_folder_knows_its_runs_folder_key_and_label(trial):
 
 
 def test_the_state_of_a_trial_follows_from_its_files(tmp_path):
-    folder = TrialFolder(tmp_path / "x" / "s" / "a-b" / "01234567-seed0")
+    folder = TrialFolder(tmp_path / "x/s/a-b/01234567-seed0")
     folder.path.mkdir(parents=True)
     assert (folder.state(), folder.has_failed()) == ("missing", False)
     (folder.path / "config.yaml").touch()
@@ -171,10 +171,10 @@ def test_the_stage_and_the_last_iteration_are_read_from_the_files_of_a_training(
     assert folder.stage_and_step() == ("train", 0)
     (tmp_path / "built").mkdir()
     rows = "".join(json.dumps({"step": step, "loss": 0.1}) + "\n" for step in range(1000))
-    (tmp_path / "built" / "metrics.jsonl").write_text(rows + '{"step": 10')
+    (tmp_path / "built/metrics.jsonl").write_text(rows + '{"step": 10')
     assert folder.stage_and_step() == ("train", 10)
     # only the end of a large file is read
-    (tmp_path / "built" / "metrics.jsonl").write_text('{"step": 7' + " " * 5000)
+    (tmp_path / "built/metrics.jsonl").write_text('{"step": 7' + " " * 5000)
     assert folder.stage_and_step() == ("train", 0)
 
 
@@ -242,7 +242,7 @@ def test_a_changed_file_is_found_even_if_the_results_were_not_read_before(trial)
 def test_pictures_are_sorted_by_name(trial):
     (trial / "renders").mkdir()
     for name in ("b.png", "a.png", "c.txt"):
-        (trial / "renders" / name).touch()
+        (trial / f"renders/{name}").touch()
     assert [path.name for path in TrialFolder(trial).pictures("renders")] == ["a.png", "b.png"]
 
 

@@ -132,7 +132,7 @@ def test_portrait_and_landscape_pictures_keep_their_sizes(runs):
     for kind in ("renders", "ground_truth"):
         (folder / kind).mkdir()
         for name, size in sizes.items():
-            Image.new("RGB", size).save(folder / kind / f"{name}.png")
+            Image.new("RGB", size).save(folder / f"{kind}/{name}.png")
     assert mirror_trial(options(), folder, values)
     client = connect(None, runs)
     run = run_of(client, 2000)

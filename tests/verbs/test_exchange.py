@@ -47,9 +47,9 @@ def test_export_of_the_model_and_the_initial_cloud(runs, gaussians, tmp_path, sa
     out = said("export x:courtyard:adc:0 --out new/model.ply")
     assert "new/model.ply: x/courtyard/sfm-adc/" in out
     model = (folder / "point_cloud.ply").read_bytes()
-    assert (tmp_path / "new" / "model.ply").read_bytes() == model
+    assert (tmp_path / "new/model.ply").read_bytes() == model
     said(f"export init {folder} --out model")
-    assert (tmp_path / "model" / "sparse" / "0" / "points3D.bin").read_bytes() == b"points"
+    assert (tmp_path / "model/sparse/0/points3D.bin").read_bytes() == b"points"
     refused(f"export init {folder} --out model")
     refused(f"export {folder} --out model.xyz")
     refused("export x:courtyard:mcmc --out model.ply")
@@ -94,7 +94,7 @@ def test_only_the_3dgs_form_is_written(name, good):
 
 def test_an_initial_model_that_is_no_longer_stored_is_named(runs, gaussians, refused):
     folder = finished_trial(runs, gaussians)
-    (runs / "store" / "init").rename(runs / "gone")
+    (runs / "store/init").rename(runs / "gone")
     assert "is gone: run this trial again" in refused("export init", folder, "--out", "model")
 
 

@@ -77,7 +77,7 @@ def _finished(home, trials):
 @pytest.fixture
 def home(trainings, tmp_path):
     assert run(["ledger", *NEW]) == 0
-    return tmp_path / "runs" / "night"
+    return tmp_path / "runs/night"
 
 
 def attempt(*words):
@@ -437,7 +437,7 @@ def test_names_of_ledgers_and_ideas_are_not_given_twice(home, trainings, refused
         line = refused(f"ledger try night {SPLIT}=0.04 --as", name)
         assert f"--as {name}: another idea has this name" in line
     assert "'store' cannot be the name" in refused("ledger show store")
-    folder = home.parent / "used" / "courtyard" / "random-adc" / "12345678-seed0"
+    folder = home.parent / "used/courtyard/random-adc/12345678-seed0"
     write_results(folder, composed(NEW[6:])[0].values | {"name": "used"})
     assert "used has trials already" in refused("ledger new used", *NEW[2:])
 
@@ -461,7 +461,7 @@ def test_the_simulated_rule_decides_as_the_ledger_does(trainings, monkeypatch, t
             for trial in trials:
                 own = trial.values["densify"]["split_size"] == pytest.approx(size)
                 seed = trial.values["seed"]
-                tests = entries(tmp_path / "runs" / "night", Promoted)
+                tests = entries(tmp_path / "runs/night", Promoted)
                 row = shared[0] if seed < 6 else new[0]
                 place = seed if seed < 6 else seed - tests[-1].seeds[0]
                 psnr = 20 + row[place] if own else 20.0
@@ -471,7 +471,7 @@ def test_the_simulated_rule_decides_as_the_ledger_does(trainings, monkeypatch, t
 
         monkeypatch.setattr(verb, "run_trials", training)
         attempt(f"{SPLIT}={size:.2f}")
-    home = tmp_path / "runs" / "night"
+    home = tmp_path / "runs/night"
     kept, tests = np.array([0]), np.array([0])
     levels = [one.level for one in entries(home, Promoted)]
     assert 1 < len(levels) < len(draws)

@@ -144,7 +144,7 @@ def test_doctor_says_what_is_missing(monkeypatch):
 def test_a_full_disk_is_noted(tmp_path, monkeypatch):
     for free, verdict in ((machine.LITTLE_SPACE - 1, "note"), (machine.LITTLE_SPACE, "ok")):
         monkeypatch.setattr("shutil.disk_usage", lambda _, free=free: SimpleNamespace(free=free))
-        assert next(machine.check_runs(tmp_path / "a" / "b")).verdict == verdict
+        assert next(machine.check_runs(tmp_path / "a/b")).verdict == verdict
 
 
 def test_proofs_are_listed_and_rasterizers_of_a_gpu_without_one_noted(gpus, monkeypatch):
