@@ -5,6 +5,7 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
+from shlex import split
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -253,18 +254,18 @@ def test_errors_of_a_separate_process_are_one_line(place):
 @pytest.mark.parametrize(
     "words",
     [
-        ["launch=slurm", "launch.sbatch={constraint: a100}"],
-        ["launch=slurm", "launch.sbatch.constraint=a100"],
-        ["train.iterations=1e3", "densify.max_gaussians=1e5"],
-        ["scene.downscale=4", "scene.max_size=100"],
-        ['name="größe"'],
-        ["~densify.cap"],
+        "launch=slurm 'launch.sbatch={constraint: a100}'",
+        "launch=slurm launch.sbatch.constraint=a100",
+        "train.iterations=1e3 densify.max_gaussians=1e5",
+        "scene.downscale=4 scene.max_size=100",
+        "'name=\"größe\"'",
+        "~densify.cap",
     ],
 )
 def test_unusual_but_right_words_are_accepted(words):
-    (trial,) = compose_trials(words)
+    (trial,) = compose_trials(split(words))
     assert trial.values["launch"]["sbatch"] == (
-        {"constraint": "a100"} if words[0] == "launch=slurm" else {}
+        {"constraint": "a100"} if split(words)[0] == "launch=slurm" else {}
     )
 
 

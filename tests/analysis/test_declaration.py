@@ -332,7 +332,10 @@ def test_declarations_are_read_back_as_they_were_written(tmp_path):
 def test_the_verdict_on_a_sweep_in_looks_is_that_of_its_looks(tmp_path):
     experiment = declared_experiment(tmp_path, effect=CLEAR)
     asked = Question(
-        **{"metric": "lpips_vgg_raw", "sign": -1, "least": 0.005, "baseline": ADC},
+        metric="lpips_vgg_raw",
+        sign=-1,
+        least=0.005,
+        baseline=ADC,
         arm=VOLUMETRIC,
         scenes={
             scene: tuple(f"{scene}/{arm}/c0ffee00" for arm in (ADC, VOLUMETRIC))

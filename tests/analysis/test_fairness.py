@@ -3,7 +3,6 @@
 import re
 import shutil
 from pathlib import Path
-from shlex import split
 from types import SimpleNamespace
 
 import pytest
@@ -14,10 +13,9 @@ from gsbench.analysis.fairness import UNLIKE, _shown, fairness_table
 from gsbench.analysis.notes import Note
 from gsbench.analysis.table_formats import to_latex
 from gsbench.runs.experiments import Arm
-from gsbench.verbs.results import tables
 from tests.analysis.helpers import page_of, trials_of
 from tests.analysis.test_attribution import densifier
-from tests.helpers import change_json, refusal, write, write_lines
+from tests.helpers import change_json, write, write_lines
 from tests.trials import search_record, write_arms
 
 LEFT, RIGHT = Arm("sfm", "adc"), Arm("sfm", "longaxis")
@@ -199,20 +197,6 @@ def test_the_report_shows_the_sheet_before_the_numbers_of_the_verdict(tmp_path, 
         < page.index("seeds to resolve")
     )
     assert page.count("<caption>Fairness sheet") == 1
-
-
-def test_the_verb_writes_a_sheet_for_each_pair_in_every_format(tmp_path, paths, capsys):
-    assert tables(split("exp --layout fairness"), tmp_path) == 0
-    assert "### Fairness sheet: sfm-longaxis against sfm-adc" in capsys.readouterr().out
-    for format_name, suffix in (("latex", "tex"), ("csv", "csv"), ("html", "html")):
-        out = tmp_path / "out"
-        words = [*split("exp --layout fairness --format"), format_name, "--out", str(out)]
-        assert tables(words, tmp_path) == 0
-        assert (out / f"exp-fairness-sfm-longaxis-sfm-adc.{suffix}").stat().st_size > 500
-    one = tmp_path / "one"
-    write_arms(one, {"adc": densifier("adc")})
-    with refusal("one arm"):
-        tables(split("exp --layout fairness"), one)
 
 
 def test_the_latex_has_columns_that_wrap(tmp_path, paths):

@@ -9,7 +9,7 @@ from numpy.testing import assert_array_equal
 from gsbench.analysis import to_frame
 from gsbench.verbs.results import tables
 from tests.analysis.helpers import loaded
-from tests.helpers import read_json, refusal
+from tests.helpers import read_json
 from tests.trials import write_trial
 
 
@@ -48,7 +48,3 @@ def test_the_csv_of_trials_reads_back_as_the_frame(make_experiment, tmp_path, ca
     assert again.columns.tolist() == frame.columns.tolist()
     for name in ("psnr", "flip", "seconds_train"):
         assert_array_equal(again[name], frame[name])
-    assert tables(split(f"exp --format trials --where seed=1 --out {tmp_path}/out"), tmp_path) == 0
-    assert len(pd.read_csv(tmp_path / "out/exp-trials.csv")) == 4
-    with refusal("takes no --metrics"):
-        tables(split("exp --format trials --metrics psnr"), tmp_path)

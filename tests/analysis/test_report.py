@@ -36,7 +36,6 @@ from gsbench.analysis.statistics import Interval
 from gsbench.analysis.verdict_words import by_scene_lines, sentence
 from gsbench.analysis.verdicts import judge_pairs
 from gsbench.runs.trial_record import Histogram
-from gsbench.verbs.results import report
 from tests.analysis.helpers import ADC, VOLUMETRIC, loaded, page_of, rows_of, trials_of
 from tests.helpers import refusal, write
 from tests.markup import Page
@@ -467,14 +466,6 @@ def test_a_chart_with_nothing_to_draw_is_an_empty_string():
     assert "a from 0.25 at 0.5 to 0.5 at 2." in line_chart("t", [("a", points)], "x", "y", log=True)
     dropped = line_chart("t", [("a", points[1:3] + points[:1])], "x", "y", log=True)
     assert "a from 0.25 at 0.5 to 0.25 at 0.5." in dropped
-
-
-def test_the_report_verb_writes_the_file(runs, tmp_path, capsys):
-    file = tmp_path / "sub/r.html"
-    assert report(["exp", "--out", str(file)], runs) == 0
-    assert file.read_text().startswith("<!doctype html>")
-    assert str(file) in capsys.readouterr().out
-    assert [*file.parent.iterdir()] == [file]
 
 
 def test_one_trial_of_each_arm_gives_no_verdict(tmp_path):

@@ -110,22 +110,6 @@ def test_grids_in_a_users_own_experiment(tmp_path):
             arms(*words)
 
 
-@pytest.mark.parametrize(
-    "words, text",
-    [
-        (
-            ["+experiment=threshold", "hydra/sweeper=basic"],
-            "gsbench's own sweeper alone joins grids",
-        ),
-        (["hydra.sweeper.grids=[{seed: 1}]"], "add -m"),
-    ],
-    ids=lambda value: " ".join(value) if isinstance(value, list) else None,
-)
-def test_impossible_joins_of_grids_are_refused_in_one_line(words, text, refused):
-    line = refused(*["-m", *words] if len(words) < 2 and "grids" not in words[0] else words)
-    assert text in line
-
-
 def test_plan_dry_run_and_retry_see_one_experiment(runs, monkeypatch, capsys, said):
     words = split("+experiment=threshold densify.volume_threshold=0.5 seed=0")
     assert "2 trials: 2 missing" in said(*words, "--dry-run")

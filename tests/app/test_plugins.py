@@ -38,8 +38,10 @@ def test_a_trial_is_judged_by_its_declared_metric(primary, found):
 
 def test_the_value_of_a_job_is_the_mean_of_its_seeds_towards_the_wanted_end(tmp_path, monkeypatch):
     for primary, sign, value in (
-        *((None, 1, 21.0), (None, -1, -21.0)),
-        *(("lpips_vgg", 1, -0.3), ("lpips_vgg", -1, 0.3)),
+        (None, 1, 21.0),
+        (None, -1, -21.0),
+        ("lpips_vgg", 1, -0.3),
+        ("lpips_vgg", -1, 0.3),
     ):
         trials = [trial(tmp_path, seed, eval={"primary": primary, "extra": {}}) for seed in (0, 1)]
         for one, psnr, lpips in zip(trials, (20.0, 22.0), (0.2, 0.4), strict=True):

@@ -167,12 +167,6 @@ def test_different_budgets_are_named(tmp_path, said):
     assert sentence in said(*POOL, steered, growing)
 
 
-def test_three_archives_have_a_mean(tmp_path, said):
-    out = said(*POOL, *(archive(tmp_path, f"lab{k}", k) for k in range(3)))
-    for words in ("| lab0 | +", "of 3 studies", "a further one would lie between"):
-        assert words in out
-
-
 def test_two_protocols_have_no_mean_and_one_can_be_chosen(tmp_path, said):
     """The protocols differ between archives or within one; every study is shown."""
     protocols = {"a": "paper-1", "b": "both", "c": "paper-1"}
@@ -199,6 +193,7 @@ def test_each_bad_source_has_one_line_and_the_others_are_pooled(tmp_path, capsys
     assert run(["pool", *sources, "--arm", "volumetric"]) == 1
     captured = capsys.readouterr()
     assert "of 2 studies" in captured.out
+    assert "a further one would lie between" in captured.out
     lines = captured.err.splitlines()
     for name, reason in (
         ("cut.zip", "not a complete zip"),

@@ -6,6 +6,7 @@ import random
 import re
 from dataclasses import fields, replace
 from pathlib import Path
+from shlex import split
 
 import numpy as np
 import pytest
@@ -97,7 +98,9 @@ def made_up(arms, scenes, views, people=9, traps=4):
     pair = {"kind": "pair", "seed": 0}
     showings = [
         Showing(
-            **{"id": f"{scene}{view}{one}{two}", "scene": str(scene), "view": str(view)},
+            id=f"{scene}{view}{one}{two}",
+            scene=str(scene),
+            view=str(view),
             **pair | {"left": one, "right": two},
         )
         for scene in range(scenes)
@@ -193,7 +196,7 @@ def test_views_sides_repeats_and_traps_follow_the_rules(made, runs):
 
 def test_a_repeated_pair_does_not_follow_its_first_showing_soon(runs, tmp_path):
     trials = trials_of(runs)
-    for seed in range(8):
+    for seed in range(3):
         arms = [Arm("sfm", "adc"), Arm("sfm", "volumetric")]
         key = make_round(trials, arms, 12, 1, tmp_path / str(seed), random.Random(seed))
         places = {showing.id: place for place, showing in enumerate(key.showings)}
@@ -229,18 +232,18 @@ def test_a_round_is_declared_apart_from_metrics_and_claims(made, runs, tmp_path)
 @pytest.mark.parametrize(
     "words, message",
     [
-        (["make", "exp"], "needs --out"),
-        (["make", "exp", "--out", "."], "is there already"),
-        (["make", "exp", "--out", "new", "--arms", "adc"], "sfm-adc alone"),
+        ("make exp", "needs --out"),
+        ("make exp --out .", "is there already"),
+        ("make exp --out new --arms adc", "sfm-adc alone"),
         (
-            ["make", "exp", "--out", "new", "--arms", "adc,mcmc"],
+            "make exp --out new --arms adc,mcmc",
             "'mcmc' names 0 arms; choose one of sfm-adc",
         ),
-        (["make", "exp", "--out", "new", "--pairs", "0"], "from 1 to 1000"),
-        (["make", "exp", "x.json", "--out", "new"], "takes no files"),
-        (["judge", "exp", "absent.json"], "absent.json is not there"),
-        (["judge", "exp", "--arms", "adc"], "files of votes alone"),
-        (["look", "exp"], "invalid choice"),
+        ("make exp --out new --pairs 0", "from 1 to 1000"),
+        ("make exp x.json --out new", "takes no files"),
+        ("judge exp absent.json", "absent.json is not there"),
+        ("judge exp --arms adc", "files of votes alone"),
+        ("look exp", "invalid choice"),
     ],
 )
 def test_bad_input_of_vote_is_refused_in_one_line(
@@ -248,7 +251,7 @@ def test_bad_input_of_vote_is_refused_in_one_line(
 ):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").touch()
-    assert message in refused("vote", *words)
+    assert message in refused("vote", *split(words))
 
 
 def test_trials_without_pictures_are_refused_and_no_page_is_written(tmp_path):
@@ -380,18 +383,13 @@ def test_a_stored_file_of_another_round_does_not_count(made, runs, judge):
     assert re.search(f"Left out: {name} .*of another round", judge())
 
 
-def test_a_name_cannot_write_lines_of_its_own(made, judge):
+def test_a_name_cannot_write_lines_or_elements_of_its_own(made, runs, judge):
     key = made("--people", "9")
-    forged = "Ann\nRound zero: 99 votes\u2028x\u202e\x1b[2J"
+    forged = "Ann\nRound zero: 99 votes\u2028x\u202e\x1b[2J<img src=x>"
     out = judge(ballot(key, 1, lambda showing: "same", name=forged))
     assert "\nRound zero" not in out
     assert {"\u2028", "\u202e", "\x1b"}.isdisjoint(out)
-    assert "Left out: Ann Round zero: 99 votes x[2J (000000) failed" in out
-
-
-def test_html_in_names_of_people_is_escaped(made, runs, judge):
-    key = made("--people", "1")
-    judge(ballot(key, 1, lambda showing: "left", name="<img src=x onerror=alert(1)>"))
+    assert "Left out: Ann Round zero: 99 votes x[2J<img src=x> (000000) failed" in out
     page = page_of(runs)
     assert "&lt;img src=x" in page
     assert "<img src=x" not in page

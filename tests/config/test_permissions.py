@@ -166,11 +166,21 @@ CANNOT_SET = {("plan", "a folder to write"), ("config.yaml", "a folder to write"
 CANNOT_SET |= {(file, case) for file in FILES if file != "experiment" for case in OF_AN_APP}
 CANNOT_SET |= {("config.yaml", case) for case, (own, _) in STRANGE.items() if "hydra" in str(own)}
 CANNOT_SET |= {("experiment", "a package of settings")}
+KINDS = ("an address", "a class", "a program", "a shell", "a package of settings", "a callback")
+KINDS += ("a class and its permission", "a folder to write", "a variable")
 
 
 @pytest.mark.parametrize(
     "file, case",
-    [(file, case) for file in FILES for case in STRANGE if (file, case) not in CANNOT_SET],
+    [
+        # quick tests have all cases in an experiment, and one of each kind in the other files
+        pytest.param(
+            file, case, marks=[pytest.mark.slow] * (file != "experiment" and case not in KINDS)
+        )
+        for file in FILES
+        for case in STRANGE
+        if (file, case) not in CANNOT_SET
+    ],
 )
 def test_no_file_of_a_stranger_decides_what_runs_and_where_results_go(
     file, case, monkeypatch, refused

@@ -72,28 +72,15 @@ def test_renders_of_a_trial_are_measured_with_its_metrics_to_the_last_digit(gsbe
         ("small:courtyard:adc:0", []),
         ("courtyard", SCENE + EVAL),
     ):
-        done = gsbench(
-            "evaluate",
-            str(own / "renders"),
-            "--truth",
-            truth,
-            *settings,
-            "--json",
-        )
+        done = gsbench(f"evaluate {own}/renders --truth {truth} --json", *settings)
         found = json.loads(done.stdout)
         assert found["metrics"] == results(own)["metrics"]
         assert found["protocol"] == "paper-1"
         for view, row in views(own).items():
             metrics = {key: value for key, value in row.items() if key not in (ANGLE, DISTANCE)}
             assert {key: repr(value) for key, value in found["views"][view].items()} == metrics
-    shown = gsbench(
-        "evaluate",
-        str(own / "renders"),
-        "--truth",
-        str(own / "ground_truth"),
-        "--protocol",
-        "standard",
-    )
+    truth = f"--truth {own}/ground_truth --protocol standard"
+    shown = gsbench(f"evaluate {own}/renders {truth}")
     assert "protocol standard-1" in shown.stdout
 
 

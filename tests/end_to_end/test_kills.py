@@ -155,8 +155,14 @@ def test_a_killed_trial_harms_no_other_and_the_next_command_completes_it(start, 
 
 
 TUNED = [
-    *("+experiment=tuned", "seed=0", *SMALL, "train.iterations=120", "eval.lpips=[]"),
-    *("tracking=none", "hydra.sweeper.tune.points=2", "name=small"),
+    "+experiment=tuned",
+    "seed=0",
+    *SMALL,
+    "train.iterations=120",
+    "eval.lpips=[]",
+    "tracking=none",
+    "hydra.sweeper.tune.points=2",
+    "name=small",
 ]
 
 

@@ -150,7 +150,10 @@ def test_the_recipe_of_the_readme_gives_a_declared_verdict_in_two_commands(gsben
     first, second = (shlex.split(one or other) for one, other in commands)
     tiny = [
         *split("scene.width=96 scene.height=72 scene.views=12 init=random init.count=1000"),
-        *("train.steps_scaler=0.1", "densify.max_gaussians=1500", "eval.lpips=[]", "tracking=none"),
+        "train.steps_scaler=0.1",
+        "densify.max_gaussians=1500",
+        "eval.lpips=[]",
+        "tracking=none",
     ]
     done = gsbench(*first, *tiny)
     (verdict,) = [line for line in done.stderr.splitlines() if " against " in line]

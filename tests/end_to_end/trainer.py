@@ -14,6 +14,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from shlex import split
 
 import numpy as np
 import pycolmap
@@ -21,22 +22,9 @@ from PIL import Image
 from scipy.spatial import cKDTree
 
 SH_DC = 0.28209479177387814  # of the constant harmonic, 1 / (2 sqrt(pi))
-COLUMNS = [
-    "x",
-    "y",
-    "z",
-    "f_dc_0",
-    "f_dc_1",
-    "f_dc_2",
-    "opacity",
-    "scale_0",
-    "scale_1",
-    "scale_2",
-    "rot_0",
-    "rot_1",
-    "rot_2",
-    "rot_3",
-]
+COLUMNS = split(
+    "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
+)
 
 
 def project(image, camera, points):

@@ -3,6 +3,7 @@
 import json
 import logging
 import time
+from shlex import split
 
 import pytest
 
@@ -16,17 +17,10 @@ from tests.helpers import refusal, write
 from tests.trials import bare_trial as trial
 
 # later words win: a trial of seconds
-TINY = [
-    *(
-        *SMALL,
-        "train.iterations=2",
-        "scene.views=9",
-        "scene.width=48",
-        "scene.height=36",
-        "init.count=200",
-    ),
-    *("raster=reference", "eval.lpips=[]", "eval.flip=false", "tracking=none", "densify=none"),
-]
+TINY = SMALL + split(
+    "train.iterations=2 scene.views=9 scene.width=48 scene.height=36 init.count=200 "
+    "raster=reference eval.lpips=[] eval.flip=false tracking=none densify=none"
+)
 
 
 def declaring(runs, primary, seed=0, **densify):

@@ -39,9 +39,16 @@ from tests.trials import bare_trial as trial
 
 SLURM = {
     **dict.fromkeys(("partition", "account", "qos", "mem_gb"), None),
-    **{"name": "slurm", "parallel": 2, "timeout_min": 60, "wait": False},
-    **{"cpus_per_trial": 4, "gpus_per_trial": 0, "signal_seconds": 90},
-    **{"setup": [], "sbatch": {}, "max_requeues": 5},
+    "name": "slurm",
+    "parallel": 2,
+    "timeout_min": 60,
+    "wait": False,
+    "cpus_per_trial": 4,
+    "gpus_per_trial": 0,
+    "signal_seconds": 90,
+    "setup": [],
+    "sbatch": {},
+    "max_requeues": 5,
 }
 
 
@@ -437,8 +444,13 @@ def test_settings_become_options_of_slurm(tmp_path, monkeypatch):
 
     monkeypatch.setattr(submitit, "SlurmExecutor", Executor)
     expected = {
-        **{"folder": tmp_path, "requeues": 5, "job_name": "gsbench", "time": 60},
-        **{"cpus_per_task": 4, "signal_delay_s": 90, "array_parallelism": 2},
+        "folder": tmp_path,
+        "requeues": 5,
+        "job_name": "gsbench",
+        "time": 60,
+        "cpus_per_task": 4,
+        "signal_delay_s": 90,
+        "array_parallelism": 2,
     }
     slurm_jobs.make_executor(SLURM, tmp_path)
     assert given == expected
@@ -446,7 +458,8 @@ def test_settings_become_options_of_slurm(tmp_path, monkeypatch):
     sizes = {"gpus_per_trial": 1, "mem_gb": 16, "sbatch": {"constraint": "a100"}}
     slurm_jobs.make_executor(SLURM | more | sizes, tmp_path)
     assert given == expected | more | {
-        **{"gpus_per_node": 1, "mem": "16GB"},
+        "gpus_per_node": 1,
+        "mem": "16GB",
         "additional_parameters": {"constraint": "a100"},
     }
 

@@ -160,7 +160,9 @@ def test_each_missing_folder_is_named_once_with_the_way_to_get_it(tmp_path, monk
         trial(tmp_path, **{group: {"name": "a", "weights": folder}}) for group, folder in named
     ]
     assert [line.partition(":")[0] for line in missing_weights(trials)] == [
-        *("eval.weights=y", "eval.weights=z", "init.weights=z")
+        "eval.weights=y",
+        "eval.weights=z",
+        "init.weights=z",
     ]
     assert missing_folders(trials) == missing_weights(trials)
 

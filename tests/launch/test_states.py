@@ -126,7 +126,11 @@ def test_states_have_the_time_of_the_file_that_tells_them(tmp_path, monkeypatch)
         unknown = {state.folder: state for state in states_of_experiment(tmp_path / "x")}
     found = [seen[one.folder] for one in (done, damaged, failed, running, stopped)]
     assert {one.state: one.since for one in found} == {
-        **{"done": 1, "damaged": 2, "failed": 3, "running": since, "partial": 4}
+        "done": 1,
+        "damaged": 2,
+        "failed": 3,
+        "running": since,
+        "partial": 4,
     }
     assert "results.json is not JSON" in found[1].note
     assert [found[2].note, found[4].note] == ["no luck", "stopped"]

@@ -40,7 +40,9 @@ def parts_of(fps, evaluator=None, **changes):
         "device": torch.device("cpu"),
         "train": SimpleNamespace(background=(0.1, 0.2, 0.3)),
         "eval": SimpleNamespace(maps=False, fps=fps),
-        **{"measured_earlier": [], "user_code": UserCode(), "program": None},
+        "measured_earlier": [],
+        "user_code": UserCode(),
+        "program": None,
     }
     return SimpleNamespace(**parts | changes)
 

@@ -74,7 +74,10 @@ def test_a_failure_is_recorded_and_raised(tmp_path, monkeypatch, error, kind, me
         failure = folder.failure()
         assert failure.message.startswith(message)
         assert (failure.error, failure.seed, failure.time, failure.bad_input) == (
-            *(kind.__name__, 4, 12.5, bad_input),
+            kind.__name__,
+            4,
+            12.5,
+            bad_input,
         )
         assert type(error).__name__ in failure.traceback
 
@@ -135,8 +138,12 @@ def made(monkeypatch):
     monkeypatch.setattr(trials, "evaluate_step", note("evaluate", step(EVALUATE)))
     initializer = SimpleNamespace(needs_reference=lambda capture: state.needs)
     state.parts = SimpleNamespace(
-        **{"scene": SimpleNamespace(transparent="white"), "initializer": initializer},
-        **{"threads": 3, "program": None, "user_code": "code", "reader": None},
+        scene=SimpleNamespace(transparent="white"),
+        initializer=initializer,
+        threads=3,
+        program=None,
+        user_code="code",
+        reader=None,
     )
     return state
 
@@ -148,14 +155,24 @@ def test_the_steps_of_photographs_follow_each_other(made, tmp_path):
     assert own.photographs == own.capture == "given"
     init = step(INIT, of=str(made.parts.initializer))
     assert [word for word, *_ in made.told] == [
-        *("read", "masking", "normalizing", "init", "train", "truth", "evaluate")
+        "read",
+        "masking",
+        "normalizing",
+        "init",
+        "train",
+        "truth",
+        "evaluate",
     ]
     by_name = {name: rest for name, *rest in made.told}
     assert by_name["read"] == [None]
     assert by_name["masking"] == ["given", "white"]
     assert by_name["init"] == ["given", made.parts.initializer, None, "code"]
     assert [given if not isinstance(given, Step) else given.key for given in own.views] == [
-        *("views", store, "given", init.key, made.parts.scene)
+        "views",
+        store,
+        "given",
+        init.key,
+        made.parts.scene,
     ]
     assert by_name["train"] == [own.views, made.parts]
     assert by_name["truth"] == [own.views]
@@ -217,8 +234,8 @@ def test_files_of_the_steps_are_published_in_the_trials_folder(tmp_path, normali
         **{name: f"train {name}" for name in ("lineage.npz", "metrics.jsonl", "events.jsonl")},
         **{name: f"evaluate {name}" for name in content[EVALUATE].split()[:4]},
         **{f"ground_truth/{name}": f"ground_truth {name}" for name in ("a.png", "b.png")},
-        **{"masks/b.png": "ground_truth masks/b.png"},
-        **{"figures/initial_cloud.png": "init picture.png"},
+        "masks/b.png": "ground_truth masks/b.png",
+        "figures/initial_cloud.png": "init picture.png",
     }
     found = {path.relative_to(folder).as_posix() for path in published}
     assert found == {*texts, "point_cloud.ply"}

@@ -176,31 +176,31 @@ def test_proofs_are_listed_and_rasterizers_of_a_gpu_without_one_noted(gpus, monk
 @pytest.mark.parametrize(
     "words, message",
     [
-        (["--json"], "belong to --prove"),
-        (["--raster", "cpu"], "belong to --prove"),
-        (["--device", "cpu"], "belong to --prove"),
+        ("--json", "belong to --prove"),
+        ("--raster cpu", "belong to --prove"),
+        ("--device cpu", "belong to --prove"),
     ],
 )
 def test_options_of_a_proof_need_prove(tmp_path, words, message):
     with refusal(message):
-        machine.doctor(words, tmp_path)
+        machine.doctor(split(words), tmp_path)
 
 
 @pytest.mark.parametrize(
     "words, message",
     [
-        (["--size", "15x20"], "a size is WIDTHxHEIGHT"),
-        (["--size", "500"], "a size is WIDTHxHEIGHT"),
-        (["--count", "0"], "a count is at least 1"),
-        (["--count", "5,x"], "a count is at least 1"),
-        (["--ply", "nowhere.ply"], "nowhere.ply does not exist"),
-        (["--kernels"], "has no place in the table: add --json"),
-        (["--raster", "cpu,auto"], "name those to time"),
+        ("--size 15x20", "a size is WIDTHxHEIGHT"),
+        ("--size 500", "a size is WIDTHxHEIGHT"),
+        ("--count 0", "a count is at least 1"),
+        ("--count 5,x", "a count is at least 1"),
+        ("--ply nowhere.ply", "nowhere.ply does not exist"),
+        ("--kernels", "has no place in the table: add --json"),
+        ("--raster cpu,auto", "name those to time"),
     ],
 )
 def test_bad_words_of_bench_are_refused(words, message):
     with refusal(message):
-        machine.bench(words)
+        machine.bench(split(words))
 
 
 def test_bench_times_what_the_words_name(monkeypatch, capsys):
@@ -218,8 +218,12 @@ def test_bench_times_what_the_words_name(monkeypatch, capsys):
     *lists, named = asked[0]
     assert lists == [["cpu", "reference"], [(16, 32), (32, 16)], [7, 8]]
     assert named == {
-        **{"ply": None, "repeats": 3, "threads": None, "memory": False},
-        **{"scene": "trained", "kernels": False},
+        "ply": None,
+        "repeats": 3,
+        "threads": None,
+        "memory": False,
+        "scene": "trained",
+        "kernels": False,
     }
     header, line = capsys.readouterr().out.splitlines()
     assert header.split() == ["raster", "size", "count", "step_ms", "step_ratio"]
