@@ -243,7 +243,7 @@ def test_a_runs_folder_that_cannot_be_made_is_refused(capsys):
 
 def test_errors_of_a_separate_process_are_one_line(place):
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    for command in ("+extra=1", "-m seed=range(0,0)", "=3"):
+    for command in ("+extra=1", "=3"):
         argv = [sys.executable, "-m", "gsbench.cli", *shlex.split(command)]
         done = subprocess.run(
             argv, capture_output=True, text=True, env=environment, timeout=120, check=False

@@ -142,18 +142,11 @@ def flip_a_bit(path):
     os.utime(path, ns=(state.st_atime_ns, state.st_mtime_ns))
 
 
-def test_damage_that_keeps_size_and_time_is_found_by_a_thorough_check(store):
-    folder = store.get(BUILD).path
-    flip_a_bit(folder / "a.txt")
-    read_manifest(folder)
-    with pytest.raises(ValueError, match=r"a\.txt"):
-        read_manifest(folder, thorough=True)
-
-
 def test_a_flipped_bit_is_found_before_a_result_becomes_an_input(store, monkeypatch, caplog):
     step = BUILD
     path = store.get(step).path / "sub/b.bin"
     flip_a_bit(path)
+    read_manifest(path.parents[1])  # only a thorough check reads the content
     later = Store(store.root)  # as a later process
     assert not later.get(step).cached
     assert "is damaged" in caplog.text

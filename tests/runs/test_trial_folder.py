@@ -120,26 +120,6 @@ def test_changed_curves_are_not_used(trial, caplog):
     assert len(one.folder.curves("events.jsonl")) == 10
 
 
-def test_a_failed_trial_is_superseded_once_its_mended_class_has_results(trial):
-    """The settings are equal, but the class was edited since, and the later trial is done."""
-    old = trial.with_name(f"0ld0ld00-{trial.name.partition('-')[2]}")
-    write(old / "config.yaml", (trial / "config.yaml").read_text())
-    write(old / "failed.json", {"error": "TypeError", "message": "mine.Mine has no x"})
-    found = {one.folder: one for one in states_of_experiment(trial.parents[2])}
-    assert found[old].state == "superseded"
-    assert f"{trial.name} is done, made by later code: mine.Mine has no x" in found[old].note
-    # with other settings it is still a failed trial
-    edit(old / "config.yaml", '"volume_threshold": 0.03', '"volume_threshold": 0.04')
-    assert {one.folder: one.state for one in states_of_experiment(trial.parents[2])}[
-        old
-    ] == "failed"
-    edit(old / "config.yaml", '"volume_threshold": 0.04', '"volume_threshold": 0.03')
-    (trial / "results.json").unlink()  # no later trial is done
-    assert {one.folder: one.state for one in states_of_experiment(trial.parents[2])}[
-        old
-    ] == "failed"
-
-
 def test_a_trial_folder_knows_its_runs_folder_key_and_label(trial):
     folder = TrialFolder(trial)
     values = folder.settings()
