@@ -3,7 +3,8 @@
 The pages are docs/, the `PAGES` of the root, the findings, and parts generated from the code
 (`reference.py`, `fidelity.py`). In the repository a page may link to any file. On the site, a link
 to a file that is no page leads to the repository if its address is known (``$GSBENCH_REPOSITORY``);
-otherwise only the file's name stays. A broken link is left as it is, so that Zensical refuses it.
+otherwise only the file's name stays. A link to an example that stands alone on a line becomes the
+example's code. A broken link is left as it is, so that Zensical refuses it.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ PAGES = {
     "findings/simulations.md": "findings/simulations.md",
 }  # file of the repository: page of the site
 LINK = re.compile(r"(?<!!)\[(?P<text>[^\]]*)\]\((?P<target>[^)#\s]+)(?P<anchor>#[^)]*)?\)")
+EXAMPLE = re.compile(r"^\[(examples/\w+\.py)\]\(\.\./\1\)$", re.MULTILINE)
 PICTURE = re.compile(r"(!\[[^\]]*\]\()docs/")  # the README's, from the root
 FENCE = re.compile(r"(^```.*?^```$)", re.DOTALL | re.MULTILINE)
 # page: the part that `reference.py` or `fidelity.py` adds to its end
@@ -57,6 +59,12 @@ def with_site_links(markdown: str, folder: Path, repository: str | None) -> str:
     parts = FENCE.split(markdown)
     parts[::2] = [LINK.sub(replace, part) for part in parts[::2]]
     return "".join(parts)
+
+
+def code_of_example(match: re.Match[str]) -> str:
+    """The example that is linked, as a block of code under its name."""
+    code = (ROOT / match[1]).read_text(encoding="utf-8")
+    return f"`{match[1]}`\n\n```python\n{code}```"
 
 
 def page_of(name: str) -> str | None:
@@ -95,7 +103,7 @@ def write_pages(target: Path, repository: str | None) -> None:
         text = path.read_text(encoding="utf-8")
         if name.removeprefix("docs/") in GENERATED:
             text += "\n" + parts[GENERATED[name.removeprefix("docs/")]]()
-        text = PICTURE.sub(r"\1", text)
+        text = PICTURE.sub(r"\1", EXAMPLE.sub(code_of_example, text))
         place.write_text(with_site_links(text, path.parent, repository), encoding="utf-8")
     (target / "api.md").write_text(reference.api_page(), encoding="utf-8")
     (target / "results.schema.json").write_text(reference.schema_text(), encoding="utf-8")

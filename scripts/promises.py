@@ -43,7 +43,7 @@ from gsbench.claims.stopping import Asked, KeyAndSeed
 from gsbench.runs import ledger as records
 from gsbench.runs.experiments import Declaration, Question, trial_key
 from gsbench.runs.trial_record import TrialRecord
-from gsbench.verbs.claims import purpose_of
+from gsbench.verbs.plan import purpose_of
 
 # If no bad training is seen, nothing tells such an arm from a better one (docs/verdict.md).
 ONE_ARM_LIMIT = 0.22

@@ -22,7 +22,7 @@ from gsbench.claims.file import parse_claims
 from gsbench.config.compose import with_seed
 from gsbench.runs.experiments import read_declarations
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.verbs.claims import describe
+from gsbench.verbs.check import describe
 from tests.claims.test_file import CLAIM, changed
 from tests.helpers import read_json, refusal, write
 from tests.launch.test_declare import TINY
@@ -235,7 +235,7 @@ def test_check_judges_made_up_trials_and_their_archive_alike(
     runs, tmp_path, monkeypatch, said, refused
 ):
     runner = FakeRunner(noise=0.001)
-    monkeypatch.setattr("gsbench.verbs.claims.run_batch", runner)
+    monkeypatch.setattr("gsbench.verbs.check.run_batch", runner)
     path, archive, page = tmp_path / "claims.yaml", tmp_path / "a.zip", tmp_path / "page.html"
     write(path, content())
     out = said("check", path, "--dry-run")

@@ -188,7 +188,7 @@ def test_no_file_of_a_stranger_decides_what_runs_and_where_results_go(
     for variable in ADDRESS_VARIABLES:
         monkeypatch.delenv(variable, raising=False)
     settings, said = STRANGE[case]
-    for function in ("verbs.ledger.run_trials", "app.command.run_batch", "verbs.claims.run_batch"):
+    for function in ("verbs.ledger.run_trials", "app.command.run_batch", "verbs.check.run_batch"):
         monkeypatch.setattr(f"gsbench.{function}", no_trial)
     commands = FILES[file](settings)
     for words in commands if case == "an address" else commands[:1]:

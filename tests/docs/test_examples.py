@@ -1,4 +1,4 @@
-"""The Python blocks and commands of the documents run, in order, as a reader would run them."""
+"""The blocks and commands of the documents, and the examples, run as a reader would run them."""
 
 import csv
 import importlib
@@ -6,6 +6,7 @@ import json
 import os
 import re
 import shlex
+import shutil
 import sys
 from pathlib import Path
 
@@ -24,21 +25,15 @@ pytestmark = pytest.mark.slow
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 TINY = "scene=courtyard scene.views=8 scene.width=64 scene.height=48 train.iterations=5"
 TINY += " init=random init.count=500 init.size=1.2 densify=none eval.lpips=[] tracking=none"
-FILE = re.compile(r"# (\w+\.py)\n")  # the first line of a block that is a file of this name
 
 
-def run_blocks(document, folder):
-    """Write the blocks that are files to ``folder``, run the others, and return their variables."""
+def run_blocks(document):
+    """Run the Python blocks of a document in order, and return their variables."""
     text = document.read_text(encoding="utf-8")
     variables = {"__name__": "document"}
     for match in BLOCK.finditer(text):
-        code = match.group(1)
-        name = FILE.match(code)
-        if name:
-            (folder / name.group(1)).write_text(code, encoding="utf-8")
-            continue
         line = text[: match.start(1)].count("\n")
-        exec(compile("\n" * line + code, str(document), "exec"), variables)
+        exec(compile("\n" * line + match.group(1), str(document), "exec"), variables)
     return variables
 
 
@@ -56,16 +51,16 @@ def run_command(page, part, small=TINY):
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """An empty working folder, whose modules can be imported and are forgotten afterwards."""
+    """A working folder with the examples, whose modules can be imported and are forgotten."""
     for key in os.environ:
         if key.startswith(("GSBENCH_", "MLFLOW_")):
             monkeypatch.delenv(key)
     monkeypatch.setenv("MLFLOW_DISABLE_TELEMETRY", "true")
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
-    # of other tests, or of another document
-    for name in shlex.split("kept llff mine shell oversampled largest careful"):
-        monkeypatch.delitem(sys.modules, name, raising=False)
+    for example in (ROOT / "examples").glob("*.py"):
+        shutil.copy(example, tmp_path)
+        monkeypatch.delitem(sys.modules, example.stem, raising=False)  # of another test
     before = set(sys.modules)
     yield tmp_path
     for name in set(sys.modules) - before:
@@ -74,7 +69,7 @@ def folder(tmp_path, monkeypatch):
 
 
 def test_the_code_of_the_library_document_trains_and_resumes(folder):
-    found = run_blocks(ROOT / "docs/library.md", folder)
+    found = run_blocks(ROOT / "docs/library.md")
     assert sum(found["losses"][-10:]) < 0.9 * sum(found["losses"][:10])
     assert len(found["trained"]) > len(found["initial"])
     for name, tensor in found["trained"].tensors().items():
@@ -82,7 +77,6 @@ def test_the_code_of_the_library_document_trains_and_resumes(folder):
 
 
 def test_the_densifier_of_its_document_runs(folder):
-    run_blocks(ROOT / "docs/densifier.md", folder)
     schedule = " train.iterations=120 train.densify_start=20 train.densify_stop=100"
     small = TINY.replace(" train.iterations=5", schedule) + " +densify.interval=20 seed=0"
     run_command("densifier.md", "densify._target_=largest.SplitLargest", small)
@@ -94,13 +88,12 @@ def test_the_densifier_of_its_document_runs(folder):
 
 
 def test_the_rasterizer_of_its_document_runs(folder):
-    run_blocks(ROOT / "docs/rasterizer.md", folder)
+    run_blocks(ROOT / "docs/rasterizer.md")
     run_command("rasterizer.md", "raster._target_=oversampled.Oversampled")
     assert len(list(Path("runs").glob("oversampled/courtyard/*/*/results.json"))) == 1
 
 
 def test_the_metric_of_its_document_is_measured_and_shown(folder, capsys):
-    run_blocks(ROOT / "docs/metric.md", folder)
     early = "train.iterations=40 train.densify_start=5 train.densify_interval=5"
     small = TINY.replace("train.iterations=5", early)
     run_command("metric.md", "-m densify=adc,volumetric", f"{small} seed=0,1")
@@ -142,7 +135,6 @@ SCENE = " ".join(word for word in TINY.split() if not word.startswith("init"))
 
 
 def test_the_initialiser_of_its_document_runs(folder):
-    run_blocks(ROOT / "docs/initialiser.md", folder)
     run_command("initialiser.md", "init._target_=shell.Shell", SCENE)
     (results,) = Path("runs").glob("shell/courtyard/shell-none/*/results.json")
     values = read_json(results)
@@ -159,7 +151,6 @@ def test_a_cloud_from_a_file_keeps_as_many_points_as_asked_for(folder):
 
 
 def test_the_tracker_of_its_document_gets_every_trial(folder):
-    run_blocks(ROOT / "docs/hydra.md", folder)
     run_command("hydra.md", "kept.Kept", f"{TINY.replace(' tracking=none', '')} seed=0,1")
     shown = {one["tags"]["seed"]: one for one in map(read_json, Path("runs/told/shown").iterdir())}
     results = {one["seed"]: one for one in map(read_json, Path("runs/told").rglob("results.json"))}
@@ -173,7 +164,7 @@ def test_the_tracker_of_its_document_gets_every_trial(folder):
 
 def test_the_reader_of_its_document_finds_the_cameras(folder):
     """The same training as with the cameras' COLMAP model, but for rounding."""
-    run_blocks(ROOT / "docs/library.md", folder)
+    run_blocks(ROOT / "docs/library.md")
     capture = folder / "library/courtyard"
     np.save(capture / "poses_bounds.npy", _llff(read_model(capture / "sparse/0")))
     small = " ".join(word for word in TINY.split() if not word.startswith("scene"))
@@ -216,7 +207,6 @@ def test_the_densifiers_of_the_document_resume_to_the_bit(folder, file, name, op
     from gsbench.raster.base import RenderOutput
     from tests.gaussians.helpers import random_gaussians
 
-    run_blocks(ROOT / "docs/densifier.md", folder)
     cls = getattr(importlib.import_module(file), name)
 
     def rounds(state, first, last):
@@ -252,13 +242,12 @@ def test_the_densifiers_of_the_document_resume_to_the_bit(folder, file, name, op
 
 
 def test_the_governed_densifier_of_the_document_ends_at_its_limit(folder):
+    from largest import SplitLargest
+
     from gsbench.densify import DensifyContext
     from gsbench.gaussians.paper_values import LearningRates
     from gsbench.gaussians.trainable import TrainableGaussians
     from tests.gaussians.helpers import random_gaussians
-
-    run_blocks(ROOT / "docs/densifier.md", folder)
-    from largest import SplitLargest
 
     gaussians, rng = random_gaussians(100), torch.Generator().manual_seed(0)
     densifier = SplitLargest(

@@ -1,7 +1,7 @@
-"""A rasterizer from a file outside gsbench: the one of docs/rasterizer.md, in the real program."""
+"""A rasterizer from a file outside gsbench: examples/oversampled.py, in the real program."""
 
 import os
-import re
+import shutil
 import sys
 from shlex import split
 
@@ -30,13 +30,8 @@ OWN = ["raster._target_=oversampled.Oversampled", "allow_targets=[oversampled]"]
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """A folder with the document's ``oversampled.py``, from which modules can be imported."""
-    blocks = re.findall(
-        r"^```python\n(# oversampled\.py\n.*?)^```$",
-        (ROOT / "docs/rasterizer.md").read_text(),
-        re.S | re.M,
-    )
-    (tmp_path / "oversampled.py").write_text(blocks[0])
+    """A folder with a copy of the example, from which modules can be imported."""
+    shutil.copy(ROOT / "examples/oversampled.py", tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.delitem(sys.modules, "oversampled", raising=False)
     return tmp_path

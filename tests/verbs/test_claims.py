@@ -6,8 +6,8 @@ from shlex import split
 
 import pytest
 
-from gsbench.verbs import claims
-from gsbench.verbs.claims import plan
+from gsbench.verbs import ablate
+from gsbench.verbs.plan import PLANNED, plan
 from tests.helpers import change_json, refusal
 from tests.trials import write_results, write_runs, write_trial
 
@@ -38,7 +38,7 @@ def test_plan_answers_for_the_command_given(pilots, capsys):
         out = capsys.readouterr().out
         trials[words[0]] = int(re.search(r"on these scenes.*?\((\d+) trials", out)[1])
         assert "seeds that the pilot does not have (it has 0, 1, 2), under another name" in out
-        assert claims.PLANNED[words[0]].partition(" {")[0] in out
+        assert PLANNED[words[0]].partition(" {")[0] in out
         assert re.search(r"only within 0\.\d+ to 1\.\d+ times \(80 % of pilots\)", out)
     assert trials["sweep"] < trials["looks"] < trials["check"] < trials["ledger"]
 
@@ -131,7 +131,7 @@ def trained(runs, monkeypatch):
             (trial.folder / "config.yaml").write_text(trial.yaml)
         return 0
 
-    monkeypatch.setattr(claims, "run_trials", run_trials)
+    monkeypatch.setattr(ablate, "run_trials", run_trials)
     return trained
 
 
@@ -156,8 +156,8 @@ def test_a_dry_run_of_ablate_trains_nothing(trained, said):
 
 
 def test_failed_trials_of_ablate_are_not_judged(runs, monkeypatch, capsys):
-    monkeypatch.setattr(claims, "run_trials", lambda trials: 1)
-    assert claims.ablate([*ABLATE, "densify=adc", *SWITCH], runs) == 1
+    monkeypatch.setattr(ablate, "run_trials", lambda trials: 1)
+    assert ablate.ablate([*ABLATE, "densify=adc", *SWITCH], runs) == 1
     assert "| run |" not in capsys.readouterr().out
 
 
@@ -166,7 +166,7 @@ def test_failed_trials_of_ablate_are_not_judged(runs, monkeypatch, capsys):
     [(["densify=adc", "densify=taming/mine"], "ablate_taming_mine"), (["seed=1"], "ablate")],
 )
 def test_the_experiment_is_named_after_the_chosen_densifier(words, name):
-    assert claims._default_name(words) == name
+    assert ablate._default_name(words) == name
 
 
 def test_a_switch_that_changes_no_setting_is_refused(runs, refused):

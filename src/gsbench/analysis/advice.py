@@ -29,8 +29,8 @@ Advice = Callable[[Sequence[TrialResult], Sequence[TrialResult]], str]
 def start_smaller(trials: Iterable[TrialResult]) -> str:
     """The advice where an arm ended with fewer Gaussians than initial points; "" elsewhere."""
     records = [trial.record for trial in trials]
-    points = max((one.num_init_points or 0 for one in records), default=0)
-    if all((one.num_gaussians or points) >= points for one in records):
+    points = max((record.num_init_points or 0 for record in records), default=0)
+    if all((record.num_gaussians or points) >= points for record in records):
         return ""
     return f"start both arms with fewer than {points:,} points, as no limit can be below these"
 
@@ -61,13 +61,13 @@ def equal_counts_command(baseline: Sequence[TrialResult], arm: Sequence[TrialRes
     if not added:
         return ""
     both = places_of(baseline) & places_of(arm)
-    trials = [one for one in (*baseline, *arm) if (one.scene, one.seed) in both]
+    trials = [trial for trial in (*baseline, *arm) if (trial.scene, trial.seed) in both]
     home = baseline[0].path.parents[2]
     planned = _planned_words(home)
     if not all(planned.get(trial.path) for trial in trials):
         return equal_counts_settings(baseline, arm)
     # a sweep in looks may have stopped before its last seed
-    looks = [one.planned for one in read_declarations(home) if one.looks]
+    looks = [declaration.planned for declaration in read_declarations(home) if declaration.looks]
     most: Planned = reduce(merge_planned, looks, {})
     commands: list[Words] = []
     for trial in trials:

@@ -25,7 +25,7 @@ def measured_versions(
     of_arm = [*arm, *of_same_arm(arm, older)]
     pairs = places_of(baseline) & places_of(arm)
     parts = {part for trial in of_arm for part in trial.code}
-    chosen = [part for part in parts if len({one.code.get(part) for one in of_baseline}) < 2]
+    chosen = [part for part in parts if len({trial.code.get(part) for trial in of_baseline}) < 2]
     versions = {
         tuple(trial.code.get(part) for part in chosen)
         for trial in of_arm
@@ -60,7 +60,7 @@ def measured_elsewhere(
 
     settings, found = Configurations(), []
     for other in list_experiments(runs) if versions else ():
-        arms = {runs / other / one.scene / f"{one.init}-{one.densify}" for one in arm}
+        arms = {runs / other / trial.scene / f"{trial.init}-{trial.densify}" for trial in arm}
         paths = (path for folder in sorted(arms) if folder.is_dir() for path in folders_in(folder))
         if other != name and any(map(is_other, paths)):
             found.append(other)
@@ -79,7 +79,11 @@ def share_of_version(number: int) -> float:
 
 def of_same_arm(arm: Sequence[TrialResult], older: Iterable[TrialResult]) -> list[TrialResult]:
     """The trials of earlier code with the name and the swept settings of an arm."""
-    return [one for one in older if arm and arm[0].arm.has(f"{one.init}-{one.densify}", one.config)]
+    return [
+        trial
+        for trial in older
+        if arm and arm[0].arm.has(f"{trial.init}-{trial.densify}", trial.config)
+    ]
 
 
 def places_of(trials: Iterable[TrialResult]) -> set[tuple[str, int]]:

@@ -115,14 +115,19 @@ class Comparison:
     @property
     def sentences(self) -> list[str]:
         """The verdict on each compared pair of arms, in one sentence each."""
-        return [sentence(one) for one in self.answers]
+        return [sentence(answer) for answer in self.answers]
 
     @cached_property
     def unused(self) -> list[Note]:
         """A note with the reason for each arm and each trial that no verdict uses."""
-        verdicts = [verdict for one in self.answers for verdict in one.verdicts]
+        verdicts = [verdict for answer in self.answers for verdict in answer.verdicts]
         # Where an arm has no verdict at all, its sentence says why.
-        asked = {arm for one in self.answers if one.verdicts for arm in (one.first, one.second)}
+        asked = {
+            arm
+            for answer in self.answers
+            if answer.verdicts
+            for arm in (answer.first, answer.second)
+        }
         trials = [trial for trial in self.trials if trial.arm in asked]
         return [*self.arms.uncompared, *unused_trials(trials, verdicts), *self._apart]
 
@@ -130,16 +135,18 @@ class Comparison:
     def _apart(self) -> list[Note]:
         """Notes on trials that some verdicts on their arm use, and others do not."""
         used = {
-            (one.first, one.second): {
-                trial.path for verdict in one.verdicts for trial in verdict.pairs.trials
+            (answer.first, answer.second): {
+                trial.path for verdict in answer.verdicts for trial in verdict.pairs.trials
             }
-            for one in self.answers
-            if one.verdicts
+            for answer in self.answers
+            if answer.verdicts
         }
         anywhere = set().union(*used.values())
         apart: dict[tuple[Arm, tuple[str, ...]], list[Arm]] = {}
         for pair, own in used.items():
-            beside = [one for one in self.trials if one.arm in pair and one.path in anywhere - own]
+            beside = [
+                trial for trial in self.trials if trial.arm in pair and trial.path in anywhere - own
+            ]
             if beside:
                 labels = tuple(trial.label for trial in beside)
                 apart.setdefault((pair[0], labels), []).append(pair[1])
@@ -157,8 +164,8 @@ class Comparison:
         """
         lacking = [
             note
-            for one in self.answers
-            for note in one.notes
+            for answer in self.answers
+            for note in answer.notes
             if note.kind in ("no direction", "valueless")
         ]
         early = [note for note in self._progress if note.kind == "early look"]
@@ -188,17 +195,23 @@ class Comparison:
         notes, in_force = [], group_by(self.answers, lambda one: one.declared)
         for metric, own in in_force.items():
             if metric is not None and own[0].standing is not None:
-                doubted = any(not one.beforehand for one in own)
+                doubted = any(not answer.beforehand for answer in own)
                 notes += own[0].standing.active.notes(metric.name, doubted)
-        known = [one.standing.active.records for one in self.answers if one.standing]
-        unused = [one for one in self.declared.declared if one not in itertools.chain(*known)]
-        notes += [Note.of("replaced", metric=one.primary, when=one.when) for one in unused]
+        known = [answer.standing.active.records for answer in self.answers if answer.standing]
+        unused = [
+            declaration
+            for declaration in self.declared.declared
+            if declaration not in itertools.chain(*known)
+        ]
+        notes += [
+            Note.of("replaced", metric=replaced.primary, when=replaced.when) for replaced in unused
+        ]
         return [*notes, *(note for note in self._progress if note.kind == "looks to come")]
 
     def notes(self) -> list[Note]:
         """The notes below a table: verdicts, remarks, and what was declared."""
         return [
-            *(Note.of("verdict", sentence=one) for one in self.sentences),
+            *(Note.of("verdict", sentence=text) for text in self.sentences),
             *self.remarks,
             *self.declared_notes,
         ]
@@ -206,7 +219,7 @@ class Comparison:
     def to_json(self) -> dict[str, Any]:
         """The verdicts on each compared pair of arms and what is left out, for other programs."""
         left_out = texts([*self.remarks, *self.experiment.warnings])
-        return {"pairs": [_as_json(one) for one in self.answers], "left_out": left_out}
+        return {"pairs": [_as_json(answer) for answer in self.answers], "left_out": left_out}
 
 
 def edited_notes(trials: Sequence[TrialResult]) -> list[Note]:
@@ -221,7 +234,7 @@ def edited_notes(trials: Sequence[TrialResult]) -> list[Note]:
             "edited",
             module=module,
             trials=len(own),
-            arms=sorted({f"{one.init}-{one.densify}" for one in own}),
+            arms=sorted({f"{trial.init}-{trial.densify}" for trial in own}),
         )
         for module, own in of_module.items()
     ]
@@ -252,7 +265,9 @@ def unused_trials(trials: Sequence[TrialResult], verdicts: Sequence[Verdict]) ->
     left_out = [trial for trial in trials if trial.path not in used]
     found = []
     for own in group_by(left_out, lambda trial: trial.arm).values():
-        asked = [one for one in verdicts if any(_asks(one.question, trial) for trial in own)]
+        asked = [
+            verdict for verdict in verdicts if any(_asks(verdict.question, trial) for trial in own)
+        ]
         scenes = {trial.scene for trial in own}
         reasons = [reason for verdict in asked for reason in _reasons(verdict, scenes)]
         if not reasons:
@@ -272,7 +287,7 @@ def _asks(question: Question, trial: TrialResult) -> bool:
 def _reasons(verdict: Verdict, scenes: Collection[str]) -> list[str]:
     """The reasons why a verdict leaves trials of its question on these scenes out."""
     notes = [note for note in (verdict.untestable, *verdict.notes) if note]
-    reasons = [one.sentence for one in notes if dict(one.facts).get("scene") in (None, *scenes)]
+    reasons = [note.sentence for note in notes if dict(note.facts).get("scene") in (None, *scenes)]
     if verdict.question.seeds and verdict.answer is not None and verdict.final:
         reasons.append(Note.of("decided before", seeds=verdict.pairs.seeds).sentence)
     if not reasons and verdict.question.seeds and verdict.answer is None:
@@ -318,7 +333,7 @@ def compare(experiment: Experiment, baseline: str = BASELINE) -> Comparison:
     answers = judge_pairs(arms.trials, arms.pairs, declared, lacking, others, older)
     if (experiment.folder / LEDGER).exists():
         answers = [
-            replace(one, undeclared=LEDGER_DECIDES.format(experiment.name)) for one in answers
+            replace(answer, undeclared=LEDGER_DECIDES.format(experiment.name)) for answer in answers
         ]
     return Comparison(experiment, arms, declared, tuple(answers))
 

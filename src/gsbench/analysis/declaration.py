@@ -92,41 +92,43 @@ class ActiveDeclaration:
         """
         old = of_same_arm(arm, self.older)
         first = min((trial.measured for trial in (*arm, *old)), default=math.inf)
-        if known := [one for one in self.declared if one.moment <= first]:
+        if known := [record for record in self.declared if record.moment <= first]:
             metric = known[-1].primary
             kept = tuple(o for o in self.declared if o.moment <= first or o.primary == metric)
             if kept != self.declared:
                 return replace(self, declared=kept).standing(baseline, arm, other_pair)
         first = min((trial.measured for trial in arm), default=math.inf)
         # times are whole seconds: a declaration of the arm's first second may be later
-        before = [one for one in self.records if one is self.records[0] or one.moment < first]
+        before = [
+            record for record in self.records if record is self.records[0] or record.moment < first
+        ]
         keys = {trial.key for trial in arm}
-        naming = [one for one in before if keys & one.planned.keys()] or before[:1]
-        in_looks = [one for one in naming if one.looks]
+        naming = [record for record in before if keys & record.planned.keys()] or before[:1]
+        in_looks = [record for record in naming if record.looks]
         of_baseline = {trial.key for trial in baseline}
         asked = [
-            (one, question)
-            for one in in_looks
-            for question in one.questions
+            (declaration, question)
+            for declaration in in_looks
+            for question in declaration.questions
             # some scenes may have no result yet
             if any(a in of_baseline for a, _ in question.scenes.values())
             and any(b in keys for _, b in question.scenes.values())
         ]
-        seen = [one for one in (*arm, *old) if one.measured < self.records[0].moment]
+        seen = [trial for trial in (*arm, *old) if trial.measured < self.records[0].moment]
         # Only pairs of trials reach a verdict. Of the baseline, what was there before the arm's
         # first result could not be chosen by it.
         places, others = places_of(baseline), places_of(arm)
         paired = [trial for trial in arm if (trial.scene, trial.seed) in places]
         paired += [t for t in baseline if (t.scene, t.seed) in others and t.measured >= first]
         if before[-1].names_trials:
-            planned = reduce(merge_planned, (one.planned for one in before))
-            added = [one for one in paired if one.seed not in planned.get(one.key, ())]
+            planned = reduce(merge_planned, (record.planned for record in before))
+            added = [trial for trial in paired if trial.seed not in planned.get(trial.key, ())]
         else:
             # The record's file may be lost, and results repeat only its metric and time. Then every
             # trial that was measured after the next record with trials may have been added.
-            named = (one.moment for one in self.records if one.names_trials)
+            named = (record.moment for record in self.records if record.names_trials)
             next_record = min(named, default=math.inf)
-            added = [one for one in paired if one.measured >= next_record]
+            added = [trial for trial in paired if trial.measured >= next_record]
         declaration, question = asked[-1] if asked else ((*in_looks, naming[0])[0], None)
         # a sweep in looks stopped by its own questions
         other_pair = not asked if in_looks else other_pair
@@ -134,7 +136,7 @@ class ActiveDeclaration:
 
     def progress(self, trials: Sequence[TrialResult]) -> list[Note]:
         """A note on the declared trials that are missing; none if all are there."""
-        planned = reduce(merge_planned, (one.planned for one in self.declared))
+        planned = reduce(merge_planned, (declaration.planned for declaration in self.declared))
         done = {(trial.key, trial.seed) for trial in trials}
         replaced = {trial.key for trial in self.older}
         wanted = [
@@ -147,7 +149,11 @@ class ActiveDeclaration:
         missing = sum(one not in done for one in wanted)
         if not missing:
             return []
-        kind = "looks to come" if any(one.looks for one in self.declared) else "early look"
+        kind = (
+            "looks to come"
+            if any(declaration.looks for declaration in self.declared)
+            else "early look"
+        )
         return [Note.of(kind, missing=missing, declared=len(wanted))]
 
     def _is_replaced(self, key: str, seeds: Iterable[int], trials: Sequence[TrialResult]) -> bool:
@@ -161,9 +167,11 @@ class ActiveDeclaration:
             if not (config := next(filter(None, found), None)):
                 continue
             place = key.rpartition("/")[0]
-            same_arm = [one for one in trials if one.key.rpartition("/")[0] == place]
+            same_arm = [trial for trial in trials if trial.key.rpartition("/")[0] == place]
             text = settings_text(config)
-            return any(one.key != key and settings_text(one.config) == text for one in same_arm)
+            return any(
+                trial.key != key and settings_text(trial.config) == text for trial in same_arm
+            )
         return False
 
     def notes(self, name: str, doubted: bool) -> list[Note]:
@@ -179,5 +187,7 @@ def active_declaration(experiment: Experiment) -> ActiveDeclaration | None:
 
     The latest metric is in force. Further commands may add trials to an arm until its first result.
     """
-    declared = tuple(one for one in experiment.declarations if one.kind == "sweep")
+    declared = tuple(
+        declaration for declaration in experiment.declarations if declaration.kind == "sweep"
+    )
     return ActiveDeclaration(declared, experiment.folder, experiment.older) if declared else None

@@ -131,7 +131,12 @@ def seeds_needed(deviation: float, scenes: int, difference: float) -> int | None
     """
     designs = (Design(scenes, seeds) for seeds in range(2, MAX_SEEDS + 1))
     return next(
-        (one.seeds for one in designs if power_of_mean(deviation, one, difference) >= POWER), None
+        (
+            design.seeds
+            for design in designs
+            if power_of_mean(deviation, design, difference) >= POWER
+        ),
+        None,
     )
 
 

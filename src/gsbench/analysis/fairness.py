@@ -23,7 +23,7 @@ from gsbench.analysis.differences import (
 from gsbench.analysis.notes import Note
 from gsbench.analysis.pairing import pair_trials
 from gsbench.analysis.quantities import COSTS, Reader, relative_change
-from gsbench.analysis.results import Arm, TrialResult, group_by, read_experiment
+from gsbench.analysis.results import Arm, TrialResult, group_by, read_experiment, trials_of
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.analysis.trial_settings import canonical
 from gsbench.gaussians.paper_values import PAPER_CAP
@@ -65,7 +65,7 @@ def counts_note(
     advise: Advice = equal_counts_command,
 ) -> Note | None:
     """A note on how many more Gaussians the second arm has over common scenes, if it has."""
-    baseline, other = ([trial for trial in trials if trial.arm == arm] for arm in (first, second))
+    baseline, other = (trials_of(trials, arm) for arm in (first, second))
     change = relative_change(baseline, other, COSTS["gaussians"][1])
     if change is None or abs(change.of_totals) <= EQUAL_COUNTS:
         return None
@@ -138,7 +138,7 @@ def fairness_table(
     """
     pairs = pair_trials(trials, first, second)
     compared = list(itertools.chain(*pairs)) or trials
-    groups = [[trial for trial in compared if trial.arm == arm] for arm in (first, second)]
+    groups = [trials_of(compared, arm) for arm in (first, second)]
     rows = [_row(what, list(map(show, groups))) for what, show in MEASURED.items()]
     configs = [
         (one.config, other.config) for one, other in compared_trials(compared, first, second)
@@ -267,7 +267,7 @@ def tuning_notes(
     unlike = tuning_note(trials, pair)
     notes = [unlike] if unlike else []
     for arm in pair:
-        own = [trial for trial in trials if trial.arm == arm]
+        own = trials_of(trials, arm)
         notes += [_search_note(own, name, record) for name, record in _searches(own[0]).items()]
         notes += _varied_settings([*trials, *older], own[0])
     return notes or [Note.of("no tuning")]
@@ -279,7 +279,7 @@ def tuning_note(trials: Sequence[TrialResult], pair: Sequence[Arm]) -> Note | No
     A search counts if its best point has exactly the arm's settings. Settings that were all run as
     arms are no search, since each has its own verdict.
     """
-    budgets = [_tuning_budget(next(trial for trial in trials if trial.arm == arm)) for arm in pair]
+    budgets = [_tuning_budget(trials_of(trials, arm)[0]) for arm in pair]
     if len(set(budgets)) < 2:
         return None
     each = [f"{arm} {budget}" for arm, budget in zip(pair, budgets, strict=True)]

@@ -223,7 +223,7 @@ def judge(
         family = [k for k in testable if unjudged[k].question.secondary == secondary]
         # With looks, the shares of the error rate were fixed beforehand: questions without pairs
         # keep theirs.
-        beside = [one for one in others if one.secondary == secondary]
+        beside = [other for other in others if other.secondary == secondary]
         sharing = len(beside) + sum(
             question.secondary == secondary for question in declaration.questions
         )
@@ -234,12 +234,12 @@ def judge(
         else:
             candidates = max((_candidate_metrics(unjudged[k]) for k in family), default=1)
             differences = [unjudged[k].pairs.differences for k in family]
-            tests = [one for one in beside if one.paired]
-            known = [one.p for one in tests if one.p is not None]
+            tests = [other for other in beside if other.paired]
+            known = [test.p for test in tests if test.p is not None]
             answers = answer_family(differences, declaration.error_rate / candidates, known)
             asked = [unjudged[k].question for k in family]
-            arms = {str(one.arm) for one in asked if one.arm and not one.name}
-            named = tuple(sorted(arms | {str(one.arm) for one in tests}))
+            arms = {str(question.arm) for question in asked if question.arm and not question.name}
+            named = tuple(sorted(arms | {str(test.arm) for test in tests}))
             for k, answer in zip(family, answers, strict=True):
                 size = len(family) + len(tests)
                 own = replace(unjudged[k], family=size, family_arms=named)
@@ -400,9 +400,9 @@ def _with_scenes(verdicts: Sequence[Verdict], level: float) -> list[Verdict]:
     question's own answer.
     """
     several = [
-        one.pairs.differences
-        for one in verdicts
-        if one.answer is not None and len(one.pairs.rows) > 1
+        verdict.pairs.differences
+        for verdict in verdicts
+        if verdict.answer is not None and len(verdict.pairs.rows) > 1
     ]
     answers = iter(
         answer_family([row[None] for differences in several for row in differences], level)
@@ -415,7 +415,7 @@ def _with_scenes(verdicts: Sequence[Verdict], level: float) -> list[Verdict]:
                 next(answers) if verdict.answer and len(verdict.pairs.rows) > 1 else verdict.answer
             )
             if answer is not None:
-                tested = row.scene not in {one.scene for one in verdict.lacking}
+                tested = row.scene not in {trial.scene for trial in verdict.lacking}
                 interval, p = (answer.interval, answer.p) if tested else (None, None)
                 scenes.append(
                     SceneVerdict(row.scene, answer.mean, verdict.pairs.seeds, interval, p)

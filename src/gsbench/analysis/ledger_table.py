@@ -48,7 +48,9 @@ def ledger_tables(ledger: Ledger) -> list[Table]:
     notes = (LEVEL,) if ledger.shares_seeds else (LEVEL, UNTESTED)
     title = "Ideas in their order"
     tables = [Table(title, ("idea",), columns, tuple(rows), notes)]
-    return tables + [_confirmation_table(ledger.opened, *one) for one in ledger.confirmations]
+    return tables + [
+        _confirmation_table(ledger.opened, *confirmation) for confirmation in ledger.confirmations
+    ]
 
 
 LEVEL = (

@@ -125,7 +125,11 @@ class Pairs:
         paths = {trial.path for trial in outlying}
         rows = [
             row.subset(
-                [k for k, pair in enumerate(row.trials) if not paths & {one.path for one in pair}]
+                [
+                    k
+                    for k, pair in enumerate(row.trials)
+                    if not paths & {trial.path for trial in pair}
+                ]
             )
             for row in self.rows
         ]
@@ -281,9 +285,9 @@ def choose_pairs(
     """
 
     def partners(arm: Arm, densify: str) -> list[Arm]:
-        found = [one for one in arms if (one.init, one.densify) == (arm.init, densify)]
-        unlike = {one: _unlike(arm, one, settings) for one in found}
-        return [one for one in found if unlike[one] == min(unlike.values())]
+        found = [other for other in arms if (other.init, other.densify) == (arm.init, densify)]
+        unlike = {other: _unlike(arm, other, settings) for other in found}
+        return [other for other in found if unlike[other] == min(unlike.values())]
 
     pairs = [
         (one, arm) for arm in arms if arm.densify != baseline for one in partners(arm, baseline)
@@ -294,7 +298,9 @@ def choose_pairs(
     for arm in arms:
         control = controls.get(arm.densify, arm.densify)
         if control != arm.densify:
-            pairs += [(one, arm) for one in partners(arm, control) if (one, arm) not in pairs]
+            pairs += [
+                (partner, arm) for partner in partners(arm, control) if (partner, arm) not in pairs
+            ]
     return pairs
 
 
@@ -335,7 +341,7 @@ def uncompared(arms: Sequence[Arm], pairs: Sequence[tuple[Arm, Arm]], baseline: 
         if arm.densify != baseline:
             partner = replace(arm, densify=baseline, variant=())
             notes.append(Note.of("no partner", arm=arm, partner=partner))
-        elif any(one.init == arm.init and one.densify != baseline for one in arms):
+        elif any(other.init == arm.init and other.densify != baseline for other in arms):
             notes.append(Note.of("far baseline", arm=arm))
         else:
             notes.append(Note.of("lone baseline", arm=arm))

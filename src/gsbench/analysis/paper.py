@@ -188,7 +188,7 @@ def paper_tables(
         | {own: PRINTED_NAMES[of_paper] for of_paper, own in run_as.items() if own in STAND_FOR},
     )
     papers_init = {own: init for init, own in run_as.items()}
-    keys = [one.key for one in choose_quantities(trials, metrics)]
+    keys = [metric.key for metric in choose_quantities(trials, metrics)]
     compared = [key for key in keys if key in QUANTITIES[name]]
     if left_out := [key for key in keys if key not in compared]:
         notes.append(f"Not compared, since the paper prints no such number: {', '.join(left_out)}.")

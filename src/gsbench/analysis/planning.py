@@ -55,7 +55,7 @@ class Purpose:
             return 1.0 if difference else 0.0
         if self.screen:
             first, then = replace(self, rate=self.screen, screen=0.0), replace(self, screen=0.0)
-            return math.prod(one.power(design, difference, deviation) for one in (first, then))
+            return math.prod(test.power(design, difference, deviation) for test in (first, then))
         if not self.looks:
             return power_of_mean(deviation, design, difference, self.rate)
         shown = np.zeros(DESIGN_DRAWS, dtype=bool)
@@ -109,7 +109,7 @@ class Plan:
 
     def to_json(self) -> dict[str, Any]:
         def listed(designs: Sequence[Design]) -> list[dict[str, int]]:
-            return [asdict(one) | {"trials": one.trials} for one in designs]
+            return [asdict(design) | {"trials": design.trials} for design in designs]
 
         like_these = None if self.like_these is None else listed(self.like_these)
         components = asdict(self.components)
@@ -145,7 +145,7 @@ def deviation_range(components: Components) -> tuple[float, float]:
     """The deviations between which that of trainings lies in `UNSURE` of such pilots."""
     degrees = components.trials - components.scenes
     tails = (1 - (1 - UNSURE) / 2, (1 - UNSURE) / 2)
-    low, high = (math.sqrt(degrees / special.chdtri(degrees, 1 - one)) for one in tails)
+    low, high = (math.sqrt(degrees / special.chdtri(degrees, 1 - tail)) for tail in tails)
     return components.within * low, components.within * high
 
 

@@ -115,6 +115,6 @@ def rank_all(trials: Sequence[TrialResult], quantities: Sequence[Quantity]) -> l
     """The ranking in each of ``quantities`` that is no cost and has one."""
     return [
         ranking
-        for one in quantities
-        if not one.cost and (ranking := rank_arms(trials, one)) is not None
+        for quantity in quantities
+        if not quantity.cost and (ranking := rank_arms(trials, quantity)) is not None
     ]

@@ -19,12 +19,7 @@ from gsbench.errors import InputError
 from gsbench.files import require_no_links
 from gsbench.parsing import DamagedError, one_line
 from gsbench.runs.experiments import Arm as Arm
-from gsbench.runs.experiments import (
-    Declaration,
-    experiment_home,
-    read_declarations,
-    trial_folders,
-)
+from gsbench.runs.experiments import Declaration, experiment_home, read_declarations, trial_folders
 from gsbench.runs.freshness import Change, code_changes
 from gsbench.runs.layout import CONFIG, FAILED, FORGOTTEN, PER_VIEW, RESULTS, SEED
 from gsbench.runs.nested import SHOWN
@@ -79,6 +74,11 @@ class Experiment:
     @property
     def seeds(self) -> tuple[int, ...]:
         return tuple(sorted({trial.seed for trial in self.trials}))
+
+
+def trials_of(trials: Sequence[TrialResult], arm: Arm) -> list[TrialResult]:
+    """The trials of one arm, in their order."""
+    return [trial for trial in trials if trial.arm == arm]
 
 
 def group_by(items: Iterable[T], key: Callable[[T], K]) -> dict[K, list[T]]:

@@ -172,7 +172,7 @@ def to_latex(table: Table) -> str:
         share = f"{WRAPPED_SHARE / len(table.columns):.2f}"
         columns = f">{{\\raggedright\\arraybackslash}}p{{{share}\\linewidth}}" * len(table.columns)
     heads = [("", name) for name in table.row_headings] + [
-        (one.group, one.heading) for one in table.columns
+        (column.group, column.heading) for column in table.columns
     ]
     heads = [(escape_latex(group), escape_latex(name)) for group, name in heads]
     grouped = any(group for group, _ in heads)

@@ -86,5 +86,5 @@ def lacking_words(lacking: Sequence[Unfinished]) -> str:
     """The reason why a verdict that would favour an arm with such trials is undecided."""
     return (
         f"{counted(len(lacking), 'trial')} of one arm alone failed, stopped or gave no value, "
-        f"perhaps its bad ones: {some_of([one.label for one in lacking])}"
+        f"perhaps its bad ones: {some_of([trial.label for trial in lacking])}"
     )

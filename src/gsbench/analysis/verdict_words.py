@@ -202,7 +202,7 @@ def sentence(judged: PairVerdicts) -> str:
     if not verdicts:
         return f"{against}: no verdict, since {no_pairs(judged)}."
     where = _scope(verdicts[0])
-    if all(one.equal for one in verdicts):
+    if all(verdict.equal for verdict in verdicts):
         return (
             f"{against}, on {where}: equal in every metric, to the last bit. The settings that "
             "differ had no effect: look at the events, and at train.densify_start and "
@@ -220,14 +220,14 @@ def sentence(judged: PairVerdicts) -> str:
             f"{against}: {waits}{words}. The metric was declared beforehand."
             f"{_versions_words(judged)}"
         )
-    in_doubt = [one for one in verdicts if one.favours_lacking][:1]
-    if all(one.interval is None for one in verdicts):
+    in_doubt = [verdict for verdict in verdicts if verdict.favours_lacking][:1]
+    if all(verdict.interval is None for verdict in verdicts):
         return f"{against}: no verdict, {TOO_FEW.format(where)}."
     return (
         f"{against}, on {where}: {_by_word(verdicts, with_numbers=True)}. Exploratory: "
         f"{_why_exploratory(judged)}, so all metrics count, adjusted for their number "
-        f"({max(one.family for one in verdicts)}).{_versions_words(judged)}"
-        + "".join(f" Undecided: {lacking_words(one.lacking)}." for one in in_doubt)
+        f"({max(verdict.family for verdict in verdicts)}).{_versions_words(judged)}"
+        + "".join(f" Undecided: {lacking_words(verdict.lacking)}." for verdict in in_doubt)
     )
 
 
@@ -272,8 +272,8 @@ def _why_exploratory(judged: PairVerdicts) -> str:
 
 def secondary(judged: PairVerdicts) -> str:
     """The verdicts in secondary metrics in one sentence; "" if none of them has an interval."""
-    secondaries = [one for one in judged.verdicts if one.question.secondary]
-    decidable = any(one.interval is not None for one in secondaries)
+    secondaries = [verdict for verdict in judged.verdicts if verdict.question.secondary]
+    decidable = any(verdict.interval is not None for verdict in secondaries)
     return f"Secondary, adjusted for their number: {_by_word(secondaries)}." if decidable else ""
 
 
@@ -288,7 +288,7 @@ def _by_word(verdicts: Sequence[Verdict], with_numbers: bool = False) -> str:
         return f"{name} ({numbers})"
 
     names_by_word = {
-        word: [named(one) for one in verdicts if WORDS[one.outcome] == word]
+        word: [named(verdict) for verdict in verdicts if WORDS[verdict.outcome] == word]
         for word in WORDS.values()
     }
     return "; ".join(
@@ -299,9 +299,9 @@ def _by_word(verdicts: Sequence[Verdict], with_numbers: bool = False) -> str:
 def detail_lines(verdicts: Sequence[Verdict]) -> list[str]:
     """Lines on scenes like these and on outlying trials, for each metric that has them."""
     return [
-        f"{one.quantity.name}: {line}"
-        for one in verdicts
-        for line in (like_these_words(one), outlying_words(one))
+        f"{verdict.quantity.name}: {line}"
+        for verdict in verdicts
+        for line in (like_these_words(verdict), outlying_words(verdict))
         if line
     ]
 
@@ -331,7 +331,7 @@ def by_scene_lines(verdicts: Sequence[Verdict]) -> list[str]:
 def families(judged: Sequence[PairVerdicts]) -> list[str]:
     """Lines on the families of tests: their sizes, and how they are adjusted."""
     by_role = group_by(
-        ((one.role(verdict), verdict) for one in judged for verdict in one.verdicts),
+        ((pair.role(verdict), verdict) for pair in judged for verdict in pair.verdicts),
         lambda entry: entry[0],
     )
     sizes = {role: sorted({one.family for _, one in own}) for role, own in by_role.items()}

@@ -65,7 +65,7 @@ class PairVerdicts:
     def missing(self) -> Note | None:
         """The reason why the declared metric has no verdict, if it has none."""
         if self.declared is None or any(
-            one.quantity.key == self.declared.key for one in self.verdicts
+            verdict.quantity.key == self.declared.key for verdict in self.verdicts
         ):
             return None
         return next((note for note in self.notes if note.about == self.declared.name), None)
@@ -77,7 +77,7 @@ class PairVerdicts:
     @property
     def primary(self) -> tuple[Verdict, ...]:
         """The verdicts that are not secondary."""
-        return tuple(one for one in self.verdicts if not one.question.secondary)
+        return tuple(verdict for verdict in self.verdicts if not verdict.question.secondary)
 
 
 def judge_pairs(
@@ -159,7 +159,7 @@ def _why_missing(trials: Sequence[TrialResult], metric: Quantity, verdict: Verdi
     if not lacking:
         return why
     reasons = [trial.unavailable.get(metric.key) for trial in lacking]
-    reason = next((short_reason(one) for one in reasons if one is not None), why.sentence)
+    reason = next((short_reason(text) for text in reasons if text is not None), why.sentence)
     if len(lacking) == len(trials):
         return Note.of("no value", reason=reason)
     arms = [str(arm) for arm in dict.fromkeys(trial.arm for trial in lacking)]
@@ -224,12 +224,14 @@ def _judge_families(
             if (named := own[0][1].declaration) is not None:
                 looks = named.looks if questions[0].seeds else ()
                 # an arm without any trial yet keeps its share of the error rate
-                asked_scenes = [one.scenes for one in questions]
+                asked_scenes = [question.scenes for question in questions]
                 waiting = [
-                    one for one in named.questions if looks and one.scenes not in asked_scenes
+                    question
+                    for question in named.questions
+                    if looks and question.scenes not in asked_scenes
                 ]
                 # a look's own questions wait already
-                others = [one for one in others if one.secondary or not looks]
+                others = [other for other in others if other.secondary or not looks]
                 declaration = replace(
                     declaration,
                     questions=(*questions, *waiting),
@@ -256,9 +258,13 @@ def _before_late_trials(
     if not whole.beforehand:
         return []
     late = {(trial.scene, trial.seed) for trial in standing.added}
-    in_time = [one for one in arm if (one.scene, one.seed) not in late]
-    questions = [Asked(pair, one, _question(baseline, pair, one, whole), whole) for one in metrics]
-    return [(one, other_test([*baseline, *in_time], one.question)) for one in questions]
+    in_time = [trial for trial in arm if (trial.scene, trial.seed) not in late]
+    questions = [
+        Asked(pair, metric, _question(baseline, pair, metric, whole), whole) for metric in metrics
+    ]
+    return [
+        (question, other_test([*baseline, *in_time], question.question)) for question in questions
+    ]
 
 
 def _of_earlier_code(
@@ -273,21 +279,22 @@ def _of_earlier_code(
     The new code is tested in another family.
     """
     found = []
-    old = [replace(one, variant=pair[1].variant) for one in of_same_arm(arm, declared.older)]
+    old = [replace(trial, variant=pair[1].variant) for trial in of_same_arm(arm, declared.older)]
     for version in group_by(old, lambda trial: frozenset(trial.code.items())).values():
         # the state when this version was trained
         first = min(trial.measured for trial in version)
         known = replace(
-            declared, older=tuple(one for one in declared.older if one.measured < first)
+            declared, older=tuple(trial for trial in declared.older if trial.measured < first)
         )
         standing = known.standing(baseline, version)
         questions = [
-            Asked(pair, one, _question(baseline, pair, one, standing), standing) for one in metrics
+            Asked(pair, metric, _question(baseline, pair, metric, standing), standing)
+            for metric in metrics
         ]
         found += [
-            (one, other_test([*baseline, *version], one.question))
-            for one in questions
-            if one.declaration is not None
+            (question, other_test([*baseline, *version], question.question))
+            for question in questions
+            if question.declaration is not None
         ]
     return found
 

@@ -119,8 +119,10 @@ def vote_table(
         )
         for units, like in (("people", pair.people), ("scenes", pair.scenes))
     ]
-    own = [one for one in judged if (one.first, one.second) == (pair.baseline, pair.arm)]
-    verdicts = {verdict.question.metric: verdict for one in own for verdict in one.verdicts}
+    own = [
+        answer for answer in judged if (answer.first, answer.second) == (pair.baseline, pair.arm)
+    ]
+    verdicts = {verdict.question.metric: verdict for answer in own for verdict in answer.verdicts}
     gains = view_gains(trials, pair)
     for metric in _metrics(pair, trials):
         both = zip(pair.views, gains, strict=True)
@@ -150,7 +152,7 @@ def vote_table(
 def _metrics(pair: PairVotes, trials: Sequence[TrialResult]) -> list[Quantity]:
     """The metrics of the two arms that have a direction, LPIPS first."""
     own = [trial for trial in trials if trial.arm in (pair.arm, pair.baseline)]
-    metrics = [one for one in choose_quantities(own) if one.direction and not one.cost]
+    metrics = [metric for metric in choose_quantities(own) if metric.direction and not metric.cost]
     return sorted(metrics, key=lambda one: not one.key.startswith(LPIPS))
 
 

@@ -92,7 +92,7 @@ def judge_round(key: RoundKey, ballots: Sequence[Ballot]) -> RoundVerdict:
     """
     left_out: dict[str, str] = {}
     counted = list[Ballot]()
-    traps = [one for one in key.showings if one.kind == "trap"]
+    traps = [showing for showing in key.showings if showing.kind == "trap"]
     for ballot in ballots:
         wrong = sum(_preference(trap, ballot, PHOTOGRAPH) != 1 for trap in traps)
         if wrong > key.traps_allowed:
@@ -107,8 +107,13 @@ def judge_round(key: RoundKey, ballots: Sequence[Ballot]) -> RoundVerdict:
         else:
             counted.append(ballot)
     pairs = [_judge_pair(key, counted, arm) for arm in key.arms[1:] if counted]
-    first = {one.id: one for one in key.showings}
-    seen = [(one, ballot) for one in key.showings for ballot in counted if one.kind != "trap"]
+    first = {showing.id: showing for showing in key.showings}
+    seen = [
+        (showing, ballot)
+        for showing in key.showings
+        for ballot in counted
+        if showing.kind != "trap"
+    ]
     again = [
         _preference(one, ballot, one.left) == _preference(first[one.of], ballot, one.left)
         for one, ballot in seen
@@ -139,13 +144,15 @@ def _preference(showing: Showing, ballot: Ballot, side: str) -> int:
 def _judge_pair(key: RoundKey, counted: Sequence[Ballot], arm: Arm) -> PairVotes | None:
     """The verdict on ``arm`` against the baseline; None if the round shows no view of the two."""
     sides = {str(arm), str(key.arms[0])}
-    showings = [one for one in key.pairs if {one.left, one.right} == sides]
+    showings = [pair for pair in key.pairs if {pair.left, pair.right} == sides]
     if not showings:
         return None
     votes = np.array(
-        [[_preference(one, ballot, str(arm)) for one in showings] for ballot in counted]
+        [[_preference(showing, ballot, str(arm)) for showing in showings] for ballot in counted]
     )
-    statements = judge_votes(votes, [one.scene for one in showings], ALPHA / (len(key.arms) - 1))
+    statements = judge_votes(
+        votes, [showing.scene for showing in showings], ALPHA / (len(key.arms) - 1)
+    )
     wins, losses, ties = (int((votes == side).sum()) for side in (1, -1, 0))
     means = zip(showings, map(float, votes.mean(axis=0)), strict=True)
     return PairVotes(key.arms[0], arm, wins, losses, ties, *statements, tuple(means))
@@ -170,7 +177,7 @@ def judge_votes(
 def rank_arms(key: RoundKey, counted: Sequence[Ballot]) -> tuple[tuple[Arm, float, Interval], ...]:
     """The arms by their chance to win against the average arm, the best first."""
     names = [str(arm) for arm in key.arms]
-    scenes = list(dict.fromkeys(one.scene for one in key.pairs))
+    scenes = list(dict.fromkeys(pair.scene for pair in key.pairs))
     people, arms = len(counted), len(names)
     wins = np.zeros((people, len(scenes), arms, arms))  # [K, S, A, A], of row against column
     for person, ballot in enumerate(counted):

@@ -31,7 +31,7 @@ from gsbench.runs.experiments import (
     read_declarations,
 )
 from gsbench.runs.layout import FAILED, SEED
-from gsbench.runs.trial_record import Failure
+from gsbench.runs.trial_files import Failure
 from gsbench.words import some_of, without_folders
 
 # a line for each thing that these trials need and lack
@@ -122,7 +122,9 @@ class Check:
     def checked(self, judged: Sequence[Verdict]) -> Checked:
         """All claims in the order of the file, with the reasons why trials failed."""
         verdicts = claim_verdicts(self.file, self.declaration, judged)
-        verdicts = [replace(one, failed=tuple(self._failures(one.verdict))) for one in verdicts]
+        verdicts = [
+            replace(verdict, failed=tuple(self._failures(verdict.verdict))) for verdict in verdicts
+        ]
         unused = unused_trials(list(self.asked.read()), judged)
         declarations = read_declarations(self.home)
         return Checked(self.file, verdicts, self.declaration, declarations, unused)
@@ -220,7 +222,11 @@ def recheck(file: ClaimsFile, archive: Path, folder: Path) -> Checked:
     experiment = unpack_archive(archive, folder)
     if experiment.name != file.name:
         raise InputError(f"{archive} is of the experiment {experiment.name}, not of {file.name}")
-    declarations = [one for one in read_declarations(experiment.folder) if one.kind == "claims"]
+    declarations = [
+        declaration
+        for declaration in read_declarations(experiment.folder)
+        if declaration.kind == "claims"
+    ]
     if not declarations:
         raise InputError(
             f"{archive}: it declares no claims, so it is not an archive of a gsbench check"

@@ -151,8 +151,8 @@ def _declared_line(declared: Declaration, declarations: Sequence[Declaration]) -
         f"The claims were declared {declared.when}. A claim says so if trials had been "
         "measured before."
     )
-    claims = [one for one in declarations if one.kind == "claims"]
-    if earlier := {one.hash for one in claims if one.moment < declared.moment}:
+    claims = [declaration for declaration in declarations if declaration.kind == "claims"]
+    if earlier := {claim.hash for claim in claims if claim.moment < declared.moment}:
         line += f" Earlier declarations under this name: {len(earlier)}."
     return line
 

@@ -151,7 +151,7 @@ def _declared(home: Path, trials: Sequence[TrialResult]) -> dict[str, bytes]:
         contents[DECLARED] = read_bytes(home / DECLARED)
     if (home / LEDGER).is_file():
         contents[LEDGER] = _shared_ledger(home)
-    asked = itertools.chain(*(one.questions for one in read_declarations(home)))
+    asked = itertools.chain(*(declaration.questions for declaration in read_declarations(home)))
     if TEXTURED.key in {question.metric for question in asked}:
         measured = []
         for trial in trials:

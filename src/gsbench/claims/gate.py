@@ -43,9 +43,9 @@ def ask_gate(declaration: Declaration, baseline: ReadTrials, new: ReadTrials) ->
 def _versions(sides: Mapping[str, ReadTrials]) -> ReadTrials:
     """A function that reads the trials of all versions, with the versions in their keys."""
     return lambda: [
-        one if one.config_hash == version else replace(one, config_hash=version)
+        trial if trial.config_hash == version else replace(trial, config_hash=version)
         for version, read in sides.items()
-        for one in read()
+        for trial in read()
     ]
 
 

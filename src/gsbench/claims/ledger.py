@@ -86,7 +86,7 @@ def level_of_test(rate: float, ideas: int, number: int, kept: int) -> float:
     The weights ``1 / number`` give the first tests more than equal weights would: few ideas of the
     planned ones pass on to a test, and each kept one raises the levels after it.
     """
-    return rate * (kept + 1) / number / sum(1 / one for one in range(1, ideas + 1))
+    return rate * (kept + 1) / number / sum(1 / test for test in range(1, ideas + 1))
 
 
 def _new_seeds(ledger: Ledger, idea: str) -> tuple[int, ...]:
@@ -214,11 +214,11 @@ def end_of(idea: str, verdict: Verdict, time: str, tested: bool = True) -> Ended
 
 def confirmed(number: int, verdicts: Sequence[Verdict], time: str) -> Confirmed:
     """The ledger's entry for the verdicts of the confirmation ``number``."""
-    differences = {one.question.name: difference_of(one) for one in verdicts}
+    differences = {verdict.question.name: difference_of(verdict) for verdict in verdicts}
     return Confirmed(
         time=time,
         number=number,
-        results={one.question.name: result_of(one) for one in verdicts},
+        results={verdict.question.name: result_of(verdict) for verdict in verdicts},
         differences={idea: one for idea, one in differences.items() if one is not None},
     )
 
@@ -235,7 +235,7 @@ def unused(ledger: Ledger, trials: Sequence[TrialResult]) -> list[Note]:
     declarations = [screening_of(ledger, idea) for idea in ledger.started]
     declarations += [test_of(ledger, idea) for idea in ledger.tests]
     declarations += [confirmation_of(ledger.opened, asked) for asked, _ in ledger.confirmations]
-    verdicts = [verdict for one in declarations for verdict in judge(trials, one)]
+    verdicts = [verdict for declaration in declarations for verdict in judge(trials, declaration)]
     return unused_trials(trials, verdicts)
 
 

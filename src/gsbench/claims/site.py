@@ -95,7 +95,7 @@ def _section(experiment: Experiment, key: str) -> dict[str, Any]:
         ),
     }
     arms = comparison.trials
-    ranks = [rank_plot(one) for one in rank_all(arms, choose_quantities(arms))]
+    ranks = [rank_plot(ranking) for ranking in rank_all(arms, choose_quantities(arms))]
     shown = {
         "facts": list(facts.items()),
         "claims": claims,
@@ -109,7 +109,11 @@ def _section(experiment: Experiment, key: str) -> dict[str, Any]:
 
 def _claims(experiment: Experiment) -> list[Verdict]:
     """The verdicts on declared claims, as `gsbench check --from` gives them, without gates."""
-    declared = [one for one in read_declarations(experiment.folder) if one.kind == "claims"]
+    declared = [
+        declaration
+        for declaration in read_declarations(experiment.folder)
+        if declaration.kind == "claims"
+    ]
     if not declared:
         return []
     judged = judge(experiment.trials, latest_declaration(declared))

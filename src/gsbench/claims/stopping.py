@@ -92,7 +92,7 @@ class Asked:
         """The verdicts so far; all are final as soon as they give a result."""
         verdicts = judge(list(self.read()), self.declaration)
         ended = self.ends(verdicts)
-        return [replace(one, final=one.final or ended) for one in verdicts]
+        return [replace(verdict, final=verdict.final or ended) for verdict in verdicts]
 
     def answer(self, run: Callable[[list[KeyAndSeed]], object]) -> list[Verdict]:
         """The verdicts after all looks that are needed (`run_looks`)."""

@@ -16,8 +16,8 @@ from gsbench.errors import InputError
 from gsbench.launch.states import TrialState, names_of, states_of_experiment
 from gsbench.runs.experiments import experiment_home
 from gsbench.runs.layout import CURVES
+from gsbench.runs.rows import read_rows
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.runs.trial_record import read_rows
 
 if TYPE_CHECKING:
     import pandas as pd

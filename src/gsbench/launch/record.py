@@ -117,7 +117,9 @@ def declare(trials: Sequence[Trial]) -> None:
             # The declared metric stays, since the time of its first declaration decides whether a
             # verdict was declared before its trials.
             if latest is not None and given is None:
-                first = of_latest_metric([one for one in declarations if one.kind == "sweep"])[0]
+                first = of_latest_metric(
+                    [declaration for declaration in declarations if declaration.kind == "sweep"]
+                )[0]
                 log.info("%s: %s stays declared, since %s", home.name, metric, first.when)
             before = {} if latest is None else latest.planned
             together = merge_planned(before, asked)

@@ -48,7 +48,9 @@ from gsbench.runs import keys, layout
 from gsbench.runs.config_hash import config_hash
 from gsbench.runs.experiments import read_declarations
 from gsbench.runs.nested import flatten, sha256_of
+from gsbench.runs.rows import read_rows
 from gsbench.runs.store import Store, StoredResult, read_manifest
+from gsbench.runs.trial_files import Failure
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import (
     FROM_MODEL,
@@ -59,11 +61,9 @@ from gsbench.runs.trial_record import (
     Code,
     Declared,
     Evaluation,
-    Failure,
     Training,
     TrialRecord,
     TwinViews,
-    read_rows,
     split_text,
 )
 from gsbench.runs.user_code import user_modules

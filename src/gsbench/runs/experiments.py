@@ -17,7 +17,8 @@ from gsbench.files import require_no_links
 from gsbench.parsing import STRICT, Amount, Count, Number, Record, Text, Whole
 from gsbench.runs.layout import DECLARED, IN_RUNS
 from gsbench.runs.nested import sha256_of
-from gsbench.runs.trial_record import Declared, read_rows
+from gsbench.runs.rows import read_rows
+from gsbench.runs.trial_record import Declared
 from gsbench.settings import ARM_BYTES, is_folder_name
 
 log = logging.getLogger(__name__)
@@ -340,11 +341,12 @@ def of_latest_metric(sweeps: Sequence[Declaration]) -> tuple[Declaration, ...]:
     ``sweeps`` are declarations of sweeps, in the order of time.
     """
     latest = sweeps[-1]
-    others = [one.moment for one in sweeps if one.primary != latest.primary]
+    others = [sweep.moment for sweep in sweeps if sweep.primary != latest.primary]
     return tuple(
-        one
-        for one in sweeps
-        if one is latest or (one.primary == latest.primary and one.moment > max(others, default=-1))
+        sweep
+        for sweep in sweeps
+        if sweep is latest
+        or (sweep.primary == latest.primary and sweep.moment > max(others, default=-1))
     )
 
 

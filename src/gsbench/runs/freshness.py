@@ -22,7 +22,8 @@ from gsbench.runs.keys import STAGES
 from gsbench.runs.nested import sha256_of
 from gsbench.runs.package_code import state_of
 from gsbench.runs.store import read_manifest
-from gsbench.runs.trial_record import Code, MadeOf, Stamp, TrialRecord
+from gsbench.runs.trial_files import MadeOf, Stamp
+from gsbench.runs.trial_record import Code, TrialRecord
 from gsbench.runs.user_code import module_digest
 from gsbench.system.install import version_of
 

@@ -35,18 +35,9 @@ from gsbench.runs import layout
 from gsbench.runs.config_hash import config_hash
 from gsbench.runs.freshness import Change, change_of_files, changes, origin_of
 from gsbench.runs.nested import sha256_of
-from gsbench.runs.trial_record import (
-    Building,
-    Configuration,
-    Failure,
-    MadeOf,
-    ResultsFile,
-    Row,
-    TrialRecord,
-    UnfinishedError,
-    read_rows,
-    record_from,
-)
+from gsbench.runs.rows import Row, read_rows
+from gsbench.runs.trial_files import Building, Configuration, Failure, MadeOf, ResultsFile
+from gsbench.runs.trial_record import TrialRecord, UnfinishedError, record_from
 from gsbench.system.locks import is_held
 
 MADE_OF = "made_of"  # the key in results.json

@@ -1,17 +1,16 @@
-"""The types of a trial's files, for writing and for reading.
+"""The types of a trial's results, for writing and for reading.
 
-The files are ``results.json``, the records of stages in the store (``training.json``,
-``metrics.json``), and the JSON lines of a training.
+The files are ``results.json`` and the records of stages in the store (``training.json``,
+``metrics.json``).
 """
 
-import logging
 import reprlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import AfterValidator, Field, ValidationError
+from pydantic import Field, ValidationError
 
 from gsbench.normalization import IDENTITY, Normalization
 from gsbench.parsing import (
@@ -22,17 +21,10 @@ from gsbench.parsing import (
     Number,
     Record,
     Text,
-    Whole,
     adapter,
     describe_misfit,
     fault_of,
-    iterate_rows,
-    one_line,
-    read_bytes,
 )
-from gsbench.settings import FolderName
-
-log = logging.getLogger(__name__)
 
 # ``evaluated_from`` of trials that gsbench did not train: it rendered another program's model, or
 # has only renders.
@@ -304,151 +296,3 @@ def split_text(config: Mapping[str, Any]) -> str:
     elif config.get("scene.match_views"):
         text += ", matched" if text.startswith("sector") else f", matched with {sectors}"
     return f"{text}, validation" if config.get("scene.validation") else text
-
-
-# ---- the other files of a trial's folder
-
-Stamp = tuple[int, ...]  # size in bytes, times of change in ns
-
-
-class NamedGroup(Record):
-    """A group of the configuration that must have a name."""
-
-    name: FolderName
-
-
-class TrackingSettings(Record):
-    """The settings of the group ``tracking`` that later mirroring of a trial needs."""
-
-    uri: str | None
-    flush_seconds: Amount
-    patience_seconds: Amount
-    images: Count
-
-
-class Configuration(Record):
-    """The keys that every usable ``config.yaml`` has; `gsbench.config.schema` checks the others."""
-
-    name: FolderName
-    seed: Count
-    runs: str
-    scene: NamedGroup
-    init: NamedGroup
-    densify: NamedGroup
-    tracking: TrackingSettings
-
-
-class Failure(Record):
-    """``failed.json``: the error's type, its text, its traceback, and the Unix time."""
-
-    error: str = ""
-    message: str = ""
-    traceback: str = field(default="", repr=False)
-    time: Amount = 0.0
-    seed: Count = 0
-    bad_input: bool = False  # the user's files or settings are the cause
-
-    @property
-    def reason(self) -> str:
-        """The first line of the message."""
-        lines = (self.message or self.error).strip().splitlines()
-        return one_line(lines[0]) if lines else "no reason was given"
-
-
-class Building(Record):
-    """``building.json``: the present stage of an unfinished trial, and where it is built."""
-
-    stage: str = ""
-    folder: str = ""
-
-
-class MadeOf(Record):
-    """The inputs of a trial's results: configuration, versions, and files with their stamps.
-
-    ``settings`` is the configuration, ``config`` its hash, ``results`` the hash of the rest of
-    ``results.json``. ``sources`` are the user's files, ``folders`` their folders with times of
-    change. ``entries`` are the stages' results in the store. ``published`` are files in the
-    trial's folder; ``digests`` has the sha256 of those that tables and reports read, and of
-    small ones.
-    """
-
-    results: str
-    config: str
-    stages: dict[str, int]
-    pycolmap: str | None
-    sources: dict[str, Stamp]
-    folders: dict[str, int | None]
-    entries: dict[str, str]
-    published: dict[str, Stamp]
-    digests: dict[str, str]
-    settings: dict[str, Any]
-
-    def __post_init__(self) -> None:
-        if fault := fault_of(self.settings):
-            raise ValueError(f"in settings {fault}")
-
-
-class ResultsFile(Record):
-    """The part of ``results.json`` that this module reads."""
-
-    made_of: MadeOf | None = field(default=None, repr=False)
-
-
-# ---- the JSON lines of a training
-
-STEP = "step"  # the key of the iteration in every row
-Exponent = Annotated[float, Field(ge=-300, le=300)]  # ten to this power is a finite number above 0
-
-
-def _with_step(row: dict[str, bool | int | float]) -> dict[str, bool | int | float]:
-    step = row.get(STEP)
-    if not isinstance(step, int) or isinstance(step, bool) or step < 0:
-        raise ValueError(f"{STEP} is not an iteration")
-    return row
-
-
-Value = bool | Whole | Number
-# a row of ``metrics.jsonl`` or ``events.jsonl``
-Row = Annotated[dict[str, Value], AfterValidator(_with_step)]
-
-
-class RowWithStep(Record):
-    """A row of any of these files; only its iteration is checked."""
-
-    step: Count
-
-
-class Histogram(RowWithStep):
-    """A row of ``volume_histograms.jsonl``: counts between edges, which are log10 of volumes."""
-
-    log10_edges: list[Exponent]
-    counts: list[Amount]
-
-    def __post_init__(self) -> None:
-        if len(self.log10_edges) != len(self.counts) + 1:
-            raise ValueError("the edges are not one more than the counts")
-
-
-def read_rows(path: Path, kind: Any = Row, read: Callable[[Path], bytes] = read_bytes) -> list[Any]:
-    """The rows of a file, each of type ``kind``; [] if there is no such file.
-
-    ``read`` reads the content. With a warning, a file that cannot be read is left out, and so are
-    all rows from a damaged one on.
-    """
-    try:
-        content = read(path)
-    except FileNotFoundError:
-        return []
-    except DamagedError as error:
-        log.warning("left out: %s", error)
-        return []
-    return [row for _, row in iterate_rows(content, kind, path)]
-
-
-def whole_lines(path: Path) -> list[tuple[str, int]]:
-    """The lines of a file such as ``metrics.jsonl`` up to the first damaged one, by iteration."""
-    try:
-        content = read_bytes(path)
-    except FileNotFoundError:
-        return []
-    return [(line, row.step) for line, row in iterate_rows(content, RowWithStep, path)]

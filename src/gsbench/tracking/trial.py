@@ -17,8 +17,9 @@ from gsbench.runs import layout
 from gsbench.runs.keys import TRAIN
 from gsbench.runs.nested import flatten, sha256_of
 from gsbench.runs.plan import PlanFile
+from gsbench.runs.rows import read_rows
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.runs.trial_record import TrialRecord, read_rows
+from gsbench.runs.trial_record import TrialRecord
 
 NOTE = "note"  # the tag that describes a finished trial, in Markdown
 # characters that MLflow refuses in a picture's name

@@ -84,7 +84,9 @@ class TritonAdam:
     ) -> None:
         """Apply Adam; the host does not wait."""
         if updates:
-            numbers = [x for one in updates for x in adam_factors(one.state.rate, one.state.step)]
+            numbers = [
+                x for update in updates for x in adam_factors(update.state.rate, update.state.step)
+            ]
             factors = upload(numbers, updates[0].parameter.device).view(-1, 2)
             self.launch(updates, factors, seen, visible)
 

@@ -30,7 +30,7 @@ from gsbench.raster.base import RenderOutput
 from gsbench.raster.executors import find_executor, lacks
 from gsbench.raster.staged import Readback
 from gsbench.runs.layout import CURVES, EVENTS, HISTOGRAMS
-from gsbench.runs.trial_record import whole_lines
+from gsbench.runs.rows import whole_lines
 from gsbench.scene.types import Scene
 from gsbench.system.device import free_bytes
 from gsbench.system.stopping import deferred, requested

@@ -13,15 +13,15 @@ VERBS = {  # their modules, with their purposes as `gsbench --help` lists them
     "tables": ("results", "Markdown, CSV, LaTeX or HTML tables of an experiment"),
     "report": ("results", "one HTML file with the evidence of an experiment"),
     "check": (
-        "claims",
+        "check",
         "test the claims of a paper, written in a file: supported, refuted or undecided",
     ),
     "gate": ("versions", "for continuous integration: is this version worse than a trusted one?"),
     "bisect": ("versions", "which commit of a trainer made its results worse?"),
     "ledger": ("ledger", "try many ideas under one false discovery rate, and confirm those kept"),
-    "plan": ("claims", "how many scenes and seeds you need to see a difference"),
+    "plan": ("plan", "how many scenes and seeds you need to see a difference"),
     "ablate": (
-        "claims",
+        "ablate",
         "which part of a densifier makes its gain: train all combinations of its switches",
     ),
     "pool": ("exchange", "one answer from many archives of results (export --results)"),

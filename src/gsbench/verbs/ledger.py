@@ -254,7 +254,7 @@ def _answer(
         return rules.end_of(idea, verdict, stamp_now(), tested)
     own = set(book.keys_of(idea).values())
     failed = {key for key, trial in trials.items() if trial.files.has_failed()}
-    measured = {one.key for one in finished_trials(home, trials.values())}
+    measured = {trial.key for trial in finished_trials(home, trials.values())}
     # An idea of which something is known cannot be tried anew as if it were not.
     if tested or own & measured or not {key for key, _ in failed} <= own:
         raise GsbenchError(f"{idea}: {fails}; to go on, give the same command again")

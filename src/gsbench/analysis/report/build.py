@@ -1,18 +1,12 @@
 """The report as one HTML file, readable without network, other files and JavaScript."""
 
 import itertools
-import math
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
-from statistics import fmean
 from types import MappingProxyType
 from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from gsbench.analysis import verdict_words
 from gsbench.analysis.cells import select_trials
@@ -28,7 +22,9 @@ from gsbench.analysis.paper import layout_of, load_paper, paper_tables
 from gsbench.analysis.quantities import COSTS, choose_quantities, relative_change
 from gsbench.analysis.ranks import rank_all
 from gsbench.analysis.report.charts import ForestRow, forest_plot, line_chart, rank_plot
-from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by
+from gsbench.analysis.report.curves import event_charts, event_table, training_charts
+from gsbench.analysis.report.volumes import volume_charts
+from gsbench.analysis.results import Experiment, TrialResult, group_by, trials_of
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry, fill
 from gsbench.analysis.tables import build_table, with_agreement
 from gsbench.analysis.verdicts import PairVerdicts, seeds_to_resolve
@@ -36,27 +32,14 @@ from gsbench.analysis.vote_words import describe_round, disagreements, load_roun
 from gsbench.analysis.votes import RoundVerdict
 from gsbench.errors import InputError
 from gsbench.eval.facts import find_metric
-from gsbench.events import RefineEvent
 from gsbench.parsing import read_if_sound
 from gsbench.runs import layout
 from gsbench.runs.experiments import TuningRecord
 from gsbench.runs.ledger import read_ledger
-from gsbench.runs.trial_record import Histogram
 from gsbench.scene.images import read_image
 from gsbench.words import counted, signed
 
 COSTS_COMPARED = ("gaussians", "train_time")
-EVENT_CAUSES = (*RefineEvent.GROWN, "relocated", *RefineEvent.PRUNED)
-CURVES = (  # key of metrics.jsonl, title, y axis
-    ("num_gaussians", "Gaussians during training", "Gaussians"),
-    ("loss", "Training loss (of single views, averaged over trials)", "loss"),
-    ("psnr", "PSNR of test views during training", "PSNR (dB)"),
-)
-VOLUME_AXES = ("volume (cubed scene units)", "share")
-LOG10_SPHERE = math.log10(4 / 3 * math.pi)
-BIN_WIDTH = 0.25  # decades of volume
-
-Curve = list[tuple[float, float]]
 
 
 def build_report(
@@ -73,7 +56,7 @@ def build_report(
     comparison = compare(experiment, baseline)
     trials = select_trials(comparison.trials, where)
     shown = {trial.arm for trial in trials}
-    judged = [one for one in comparison.answers if {one.first, one.second} <= shown]
+    judged = [answer for answer in comparison.answers if {answer.first, answer.second} <= shown]
     pairs = [pair for pair in comparison.pairs if set(pair) <= shown]
     chosen = ", ".join(f"{key}={values}" for key, values in where.items())
     arms = sorted({trial.arm for trial in trials})
@@ -96,8 +79,10 @@ def build_report(
         votes=[show_votes(one, trials, judged) for one in load_rounds(experiment.folder)],
         declared=texts([*comparison.declared_notes, *verdict_words.families(judged)]),
         unused=[*([CHOSEN.format(chosen)] if where else []), *texts(comparison.remarks)],
-        tables=[_without_verdicts(one) for one in with_agreement(tables)],
-        ranks=[rank_plot(one) for one in rank_all(trials, choose_quantities(trials)) if pairs],
+        tables=[_without_verdicts(table) for table in with_agreement(tables)],
+        ranks=[
+            rank_plot(ranking) for ranking in rank_all(trials, choose_quantities(trials)) if pairs
+        ],
         contradictions=[] if paper_table is None else load_paper().contradictions,
         search=search_summary(experiment.folder),
         say=verdict_words,
@@ -148,12 +133,12 @@ def compare_arms(
     ``older`` are the trials of earlier code.
     """
     first, second = judged.first, judged.second
-    baseline, other = _trials_of(trials, first), _trials_of(trials, second)
+    baseline, other = trials_of(trials, first), trials_of(trials, second)
     views, faults = choose_views(pair_trials(trials, first, second))
     return {
         "judged": judged,
         "title": f"{second} against {first}",
-        "has_like_these": any(one.like_these is not None for one in judged.verdicts),
+        "has_like_these": any(verdict.like_these is not None for verdict in judged.verdicts),
         "caveats": " ".join(
             texts([*caveats(trials, first, second), *limit_notes(trials, [(first, second)])])
         ),
@@ -223,162 +208,6 @@ def _forest(verdict: Verdict) -> str:
     return forest_plot(
         f"{verdict.quantity.name}: {better}", rows, "difference", verdict.quantity.direction
     )
-
-
-def training_charts(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> list[str]:
-    """Curves by arm, averaged over scenes and seeds at the steps that all trials have."""
-    keys = [key for key, _, _ in CURVES]
-    means = {arm: _mean_curves(_trials_of(trials, arm), layout.CURVES, keys) for arm in arms}
-    charts = []
-    for key, title, y_label in CURVES:
-        lines = [(str(arm), curves[key]) for arm, curves in means.items()]
-        charts.append(line_chart(title, lines, "iteration", y_label))
-    return list(filter(None, charts))
-
-
-def event_table(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> Table | None:
-    """A row per cause with the mean number of Gaussians per arm; None if nothing was logged."""
-    rows = []
-    events_by_arm = [[trial.record.events for trial in _trials_of(trials, arm)] for arm in arms]
-    for cause in EVENT_CAUSES:
-        means = [fmean(float(own.get(cause, 0)) for own in events) for events in events_by_arm]
-        if any(means):
-            entries = tuple(TableEntry(f"{mean:,.0f}") for mean in means)
-            rows.append(Row((cause.replace("_", " "),), entries))
-    if not rows:
-        return None
-    columns = tuple(Column("", str(arm), ("events", str(arm))) for arm in arms)
-    return Table("Gaussians by cause, mean of a trial", ("cause",), columns, tuple(rows))
-
-
-def event_charts(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> list[str]:
-    """Events by cause over the iterations of each arm."""
-    means = [_mean_curves(_trials_of(trials, arm), layout.EVENTS, EVENT_CAUSES) for arm in arms]
-    counts = {cause: [dict(own[cause]).values() for own in means] for cause in EVENT_CAUSES}
-    # All arms show the same causes, so that a cause has the same colour in every chart.
-    causes = [cause for cause, by_arm in counts.items() if any(map(any, by_arm))]
-    charts = []
-    for arm, own in zip(arms, means, strict=True):
-        lines = [(cause.replace("_", " "), own[cause]) for cause in causes]
-        title = f"Refinement over time: {arm}"
-        charts.append(line_chart(title, lines, "iteration", "Gaussians"))
-    return list(filter(None, charts))
-
-
-def _trials_of(trials: Sequence[TrialResult], arm: Arm) -> list[TrialResult]:
-    return [trial for trial in trials if trial.arm == arm]
-
-
-def _mean_curves(trials: Sequence[TrialResult], name: str, keys: Sequence[str]) -> dict[str, Curve]:
-    """The mean curve over trials of each key in the file ``name``, each file read once."""
-    curves_by_key: dict[str, list[Curve]] = {key: [] for key in keys}
-    for trial in trials:
-        rows = trial.folder.curves(name)
-        for key, curves in curves_by_key.items():
-            curves.append([(float(row["step"]), float(row[key])) for row in rows if key in row])
-    return {key: mean_by_step(curves) for key, curves in curves_by_key.items()}
-
-
-def mean_by_step(curves: Sequence[Curve]) -> Curve:
-    """The mean curve over the steps that every non-empty curve has."""
-    filled = [dict(curve) for curve in curves if curve]
-    if not filled:
-        return []
-    shared = sorted(set.intersection(*(set(curve) for curve in filled)))
-    return [(step, fmean(curve[step] for curve in filled)) for step in shared]
-
-
-def volume_charts(
-    trials: Sequence[TrialResult], arms: Sequence[Arm]
-) -> tuple[list[str], list[str]]:
-    """(charts, notes): histograms of volumes, for final models and logged iterations."""
-    threshold = _threshold(trials)
-    final: list[tuple[str, Curve]] = []
-    notes = []
-    for arm in arms:
-        try:
-            volumes = np.concatenate([*map(_volumes_in_training, _trials_of(trials, arm))])
-        except InputError as error:
-            notes.append(f"{arm}: no histogram, {error}")
-            continue
-        final.append((str(arm), histogram(volumes)))
-        if threshold:
-            notes.append(
-                f"{arm}: {np.mean(volumes > math.log10(threshold)):.2%} of volumes exceed "
-                f"{threshold:g}."
-            )
-    lines = {"Volumes of the trained Gaussians": final}
-    for arm in arms:
-        histograms = _logged_histograms(_trials_of(trials, arm))
-        logged = [(f"iteration {step}", curve) for step, curve in histograms.items()]
-        lines[f"Volumes during training: {arm}"] = logged
-    charts = [
-        line_chart(title, own, *VOLUME_AXES, log=True, marker=threshold)
-        for title, own in lines.items()
-    ]
-    return list(filter(None, charts)), notes
-
-
-def _volumes_in_training(trial: TrialResult) -> NDArray[np.float64]:
-    """log10 of the volumes [N] of a trial's Gaussians, in its training's cubed units."""
-    return log10_volumes(trial.path / layout.POINT_CLOUD) + 3 * math.log10(
-        trial.record.to_training.scale
-    )
-
-
-def log10_volumes(path: Path) -> NDArray[np.float64]:
-    """log10 of the volumes ``4/3 π s1 s2 s3`` [N] of a 3DGS PLY, whose scales are logs.
-
-    Raises `InputError` for a file that cannot be read as a 3DGS PLY.
-    """
-    from plyfile import PlyData, PlyParseError  # here, since only reports read point clouds
-
-    try:
-        vertices = PlyData.read(path)["vertex"]
-        logs = np.sum(
-            [np.asarray(vertices[f"scale_{axis}"], dtype=np.float64) for axis in range(3)], axis=0
-        )
-    except (OSError, ValueError, KeyError, PlyParseError) as error:
-        raise InputError(f"{path} is not a readable 3DGS PLY ({error})") from None
-    return np.asarray(LOG10_SPHERE + logs / math.log(10))
-
-
-def histogram(volumes: NDArray[np.float64]) -> Curve:
-    """(volume, share) of each filled quarter decade of the finite log10 ``volumes`` [N]."""
-    finite = volumes[np.isfinite(volumes)]
-    bins, counts = np.unique(np.floor(finite / BIN_WIDTH), return_counts=True)
-    centres, shares = 10 ** ((bins + 0.5) * BIN_WIDTH), counts / len(finite)
-    return list(zip(centres.tolist(), shares.tolist(), strict=True))
-
-
-def _logged_histograms(trials: Sequence[TrialResult]) -> dict[int, Curve]:
-    """Logged histograms by iteration, pooled over trials, as (bin's centre, share)."""
-    pooled: dict[int, dict[float, float]] = defaultdict(lambda: defaultdict(float))
-    for trial in trials:
-        for row in trial.folder.curves(layout.HISTOGRAMS, Histogram):
-            bins = itertools.pairwise(row.log10_edges)
-            for (low, high), count in zip(bins, row.counts, strict=True):
-                if count:
-                    pooled[row.step][10 ** ((low + high) / 2)] += count
-    shares = {}
-    for step, filled in sorted(pooled.items()):
-        total = sum(filled.values())
-        shares[step] = [(volume, count / total) for volume, count in sorted(filled.items())]
-    return shares
-
-
-def _threshold(trials: Sequence[TrialResult]) -> float | None:
-    """The absolute volume threshold (cubed scene units) that all arms share, or None."""
-    configs = [group[0].config for group in group_by(trials, lambda trial: trial.arm).values()]
-    thresholds = [
-        config["densify.volume_threshold"]
-        for config in configs
-        if config.get("densify.threshold_mode", "absolute") == "absolute"
-        and "densify.volume_threshold" in config
-    ]
-    # a damaged file may hold anything
-    are_numbers = all(isinstance(value, int | float) for value in thresholds)
-    return float(thresholds[0]) if are_numbers and len(set(thresholds)) == 1 else None
 
 
 def provenance(trials: Sequence[TrialResult]) -> Table:

@@ -106,7 +106,7 @@ def forest_plot(title: str, rows: Sequence[ForestRow], x_label: str, better: int
     ends = [
         0.0,
         *(row.mean for row in rows),
-        *(end for one in intervals for end in (one.low, one.high)),
+        *(end for interval in intervals for end in (interval.low, interval.high)),
     ]
     words = [
         f"{row.label} {short_number(row.mean)}"

@@ -1,0 +1,198 @@
+"""``gsbench plan``: how many scenes and seeds show a difference (docs/claims.md)."""
+
+import argparse
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from gsbench.analysis.comparison import compare
+from gsbench.analysis.designs import Components, Design, estimate_components
+from gsbench.analysis.notes import texts
+from gsbench.analysis.pairing import BASELINE, pair
+from gsbench.analysis.planning import COMMANDS, UNSURE, Plan, Purpose, make_plan
+from gsbench.analysis.quantities import Quantity, quantity
+from gsbench.analysis.results import TrialResult, load_experiment
+from gsbench.analysis.statistics import MIN_SCENES
+from gsbench.claims.ledger import GIVE_UP, IDEAS, RATE, SCREEN, level_of_test
+from gsbench.errors import InputError
+from gsbench.runs.experiments import ERROR_RATE, Question
+from gsbench.verbs.arguments import ArgumentParser, whole_number
+from gsbench.words import counted
+
+MAX_DESIGNS = 5  # combinations of scenes and seeds that `plan` shows
+MOST_QUESTIONS = 10_000
+# the answers of `plan` for each command
+PLANNED = {
+    "sweep": "Planned for a sweep: each question errs in {:.3g} %; all seeds are judged at once.",
+    "looks": "Planned for a sweep that stops when decided: each question errs in {:.3g} %.",
+    "check": "Planned for a check of claims: each claim errs in {:.3g} %. It is shown for each, "
+    "not for all at once.",
+    "gate": "Planned for a gate: it calls a version worse that is worse by the difference.",
+    "ledger": "Planned for a ledger: an idea is kept, at {:.3g} % with both sides, after a quarter "
+    "of the ideas were tested and none was kept.",
+}
+NEW_TRIALS = (
+    "Train all of them with seeds that the pilot does not have (it has {}), under another name: "
+    "what was seen is not declared beforehand."
+)
+
+
+def _parser() -> ArgumentParser:
+    parser = ArgumentParser(
+        "plan",
+        "It estimates from an experiment's trials how many scenes and seeds show a difference of "
+        "one arm in 80 of 100 cases. The seeds are new ones: those of the trials are seen "
+        "(docs/verdict.md). How many ideas will be found, it cannot say.",
+    )
+    parser.add_argument("experiment")
+    parser.add_argument(
+        "--for",
+        dest="command",
+        choices=COMMANDS,
+        default=COMMANDS[0],
+        help="what is planned: a sweep (the default), a sweep that stops when decided (looks), a "
+        "check of claims, a gate, or a ledger of ideas",
+    )
+    parser.add_argument(
+        "--questions",
+        type=whole_number(MOST_QUESTIONS),
+        help="pairs of arms, claims, or planned ideas that share the error rate (1; ledger: 40)",
+    )
+    parser.add_argument(
+        "--metric", default="psnr", help="such as psnr (the default), ssim, lpips_squeeze"
+    )
+    parser.add_argument(
+        "--difference",
+        type=_above_zero,
+        help="to be seen; default: what papers count as an improvement",
+    )
+    parser.add_argument(
+        "--baseline", default=BASELINE, help=f"the densifier to compare with ({BASELINE})"
+    )
+    parser.flag("--json", "print JSON")
+    return parser
+
+
+def plan(argv: Sequence[str], runs: Path) -> int:
+    """Run the verb; raises InputError for bad input."""
+    options = _parser().parse_args(argv)
+    experiment = load_experiment(runs, options.experiment)
+    comparison = compare(experiment, options.baseline)
+    trials = comparison.trials
+    metric = quantity(options.metric, trials)
+    if metric.cost:
+        raise InputError(
+            f"--metric {options.metric}: only metrics can be planned for, not counts and times"
+        )
+    difference = options.difference or metric.worthwhile
+    if difference is None:
+        raise InputError(
+            f"--difference is needed: {metric.name} has no usual least difference that matters"
+        )
+    if not comparison.pairs:
+        raise InputError(
+            f"{options.experiment} has one arm, and planning needs pairs of trials of two"
+        )
+    purpose, plans = purpose_of(options.command, options.questions), list[dict[str, Any]]()
+    lines = [*comparison.sentences, *texts(comparison.remarks), *experiment.warnings]
+    for baseline, arm in comparison.pairs:
+        plans.append({"arm": str(arm), "baseline": str(baseline)})
+        question = Question(metric=metric.key, baseline=baseline, arm=arm)
+        try:
+            components = _components(trials, question, metric)
+        except InputError as error:
+            if len(comparison.pairs) == 1:
+                raise
+            lines.append(str(error))
+            plans[-1]["no_plan"] = str(error)
+            continue
+        planned = make_plan(components, difference, purpose, MAX_DESIGNS)
+        lines += [f"{arm} against {baseline}", *_lines(planned, metric, difference)]
+        if purpose.screen:
+            lines.append("  an idea that looks better takes as many new seeds, its baseline too")
+        plans[-1] |= planned.to_json()
+    seeds = sorted({trial.seed for trial in trials})
+    lines.append(PLANNED[options.command].format(100 * purpose.rate))
+    lines.append(NEW_TRIALS.format(", ".join(map(str, seeds))))
+    if options.json:
+        asked = {"metric": metric.key, "difference": difference, "for": options.command}
+        asked |= {"error_rate": purpose.rate, "pilot_seeds": seeds}
+        found = asked | comparison.to_json() | {"plans": plans}
+        lines = [json.dumps(found, indent=1)]
+    print("\n".join(lines))
+    return 0
+
+
+def _components(trials: Sequence[TrialResult], question: Question, metric: Quantity) -> Components:
+    """The variation of a question's differences; raises InputError if its trials cannot tell."""
+    paired = pair(trials, question)
+    arms = f"{question.baseline} and {question.arm}"
+    if not paired.rows:
+        reason = next(map(str, paired.left_out), "they share no scene and seed")
+        raise InputError(f"no trials of {arms} can be paired in {metric.name}: {reason}")
+    try:
+        components = estimate_components([row.arm - row.baseline for row in paired.rows])
+    except InputError as error:
+        raise InputError(f"{arms}: {error}") from None
+    if not components.within:
+        raise InputError(
+            f"{arms}: differences in {metric.name} do not vary between seeds, so nothing tells how "
+            "many would show one"
+        )
+    return components
+
+
+def purpose_of(command: str, questions: int | None) -> Purpose:
+    """The purpose of a command's trials; each idea takes one side of its level.
+
+    A ledger is planned for the test after a quarter of the ideas were tested and none kept: no more
+    pass on where few are good (findings/simulations.md).
+    """
+    if command == "ledger":
+        ideas = questions or IDEAS
+        level = level_of_test(RATE, ideas, math.ceil(ideas / 4), 0)
+        return Purpose(2 * level, looks=True, give_up=GIVE_UP, screen=2 * SCREEN)
+    return Purpose(ERROR_RATE / (questions or 1), looks=command != "sweep")
+
+
+def _lines(planned: Plan, metric: Quantity, difference: float) -> list[str]:
+    components, digits = planned.components, f".{metric.decimals + 1}f"
+    between = ""
+    if components.between is not None:
+        between = f", between scenes by {components.between:{digits}}"
+    lines = [
+        f"  differences in {metric.name} vary between seeds by "
+        f"{components.within:{digits}}{between} (from {counted(components.trials, 'pair')} on "
+        f"{counted(components.scenes, 'scene')})",
+        _designs_line("these scenes", planned.these, difference),
+    ]
+    if planned.powers is not None:
+        (low, high), first = planned.factors, planned.these[0]
+        least, most = (100 * power for power in planned.powers)
+        lines.append(
+            f"  the pilot knows the variation between seeds only within {low:.2f} to {high:.2f} "
+            f"times ({100 * UNSURE:.0f} % of pilots): so {first.scenes} × {first.seeds} sees it in "
+            f"{least:.0f} to {most:.0f} of 100 cases"
+        )
+    group = f"scenes like these (from {MIN_SCENES} scenes on)"
+    if planned.like_these is None:
+        return [*lines, f"  for {group}: run pilot trials on a second scene"]
+    return [*lines, _designs_line(group, planned.like_these, difference)]
+
+
+def _designs_line(group: str, designs: Sequence[Design], difference: float) -> str:
+    shown = [f"{design.scenes} × {design.seeds} ({design.trials} trials)" for design in designs]
+    what = f"  to see {difference:g} on {group}, scenes × seeds"
+    return f"{what}: {', '.join(shown) or 'none that can be run'}"
+
+
+def _above_zero(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not value > 0 or not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"must be a number above 0, got {text!r}")
+    return value
