@@ -42,7 +42,7 @@ def place(tmp_path, monkeypatch):
     (tmp_path / "hydra_plugins").mkdir()  # Hydra imports whatever it finds below this name
     (tmp_path / "hydra_plugins/bomb.py").write_text(BOMB)
     yield tmp_path
-    for module in ("bomb", "bombs", "mine", "helper"):
+    for module in split("bomb bombs mine helper"):
         sys.modules.pop(module, None)
     allowed_modules().clear()
 

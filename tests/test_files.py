@@ -6,6 +6,7 @@ import os
 import socket
 from collections import namedtuple
 from contextlib import suppress
+from shlex import split
 
 import pytest
 
@@ -151,7 +152,7 @@ def test_links_are_found_on_the_way_and_only_if_asked_below(special):
 
 
 def test_a_users_pipe_or_socket_is_refused_and_a_link_is_not(special):
-    for name in ("file", "folder", "link", "linked", "dangling"):
+    for name in split("file folder link linked dangling"):
         require_regular(special[name])
     with socket.socket(socket.AF_UNIX) as server:
         address = special["file"].with_name("s")
@@ -162,7 +163,7 @@ def test_a_users_pipe_or_socket_is_refused_and_a_link_is_not(special):
 
 
 def test_the_remains_of_killed_writers_are_removed_and_no_other_files(tmp_path):
-    kept = [".a.tmp-", ".a.tmp-1x", "a.tmp-1", ".tmp", ".hidden", "a"]
+    kept = split(".a.tmp- .a.tmp-1x a.tmp-1 .tmp .hidden a")
     for name in (".a.json.tmp-17", ".a.tmp", *kept):
         (tmp_path / name).touch()
     write(tmp_path / "below/.b.tmp-1", b"")

@@ -86,7 +86,7 @@ def test_settings_can_read_hydras_node():
 
     choice = "name=x-${hydra:runtime.choices.densify}"
     jobs = names(f"{choice}-${{hydra:job.num}}", "densify=adc,none", "seed=0,1")
-    assert jobs == ["x-adc-0", "x-adc-1", "x-none-2", "x-none-3"]
+    assert jobs == split("x-adc-0 x-adc-1 x-none-2 x-none-3")
     assert names(choice) == ["x-volumetric"]
     without_name = "+hydra.job.config.override_dirname.exclude_keys=[name]"
     found = names(without_name, "seed=0,1", "name='${hydra:job.override_dirname}'")

@@ -204,9 +204,7 @@ def test_settings_make_arms_and_the_report_opens_with_the_looks(sweep, runs, sai
 @pytest.mark.parametrize(
     "words, message",
     [
-        ("eval.primary=null", "needs the metric that decides"),
         ("seed=3", "at least 2 seeds"),
-        ("densify=adc", "this sweep has one"),
         ("launch=slurm launch.wait=false", "launch.wait must be true"),
         ("launch.least_difference=0", "launch.least_difference"),
         ("launch.stop_when_decided=maybe", "launch.stop_when_decided"),

@@ -187,17 +187,3 @@ def test_bad_words_of_ablate_are_refused_in_one_line(runs, words, message, refus
         "ablate", *(word for word in TINY if word != "densify=none"), *split(words)
     )
     assert not (runs).exists()
-
-
-@pytest.mark.slow
-def test_ablate_trains_each_run_once_and_judges_it(runs, said):
-    words = [
-        *(word for word in TINY if word != "densify=none"),
-        "densify=adc",
-        "seed=0,1",
-        "name=parts",
-    ]
-    words += ["+densify.switches.size.off.split_size=0.5", "--switches", "size"]
-    out = said("ablate", *words)
-    assert "adc: 1 part (size), 2 runs, 4 trials" in out
-    assert "| without size | " in out

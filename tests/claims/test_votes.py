@@ -465,7 +465,7 @@ def test_a_person_who_always_answers_left_is_inconsistent():
 
 def test_several_arms_share_the_error_rate_and_are_ranked():
     key = made_up(["sfm-a", "sfm-b", "sfm-c"], scenes=2, views=2)
-    order = ["sfm-a", "sfm-c", "sfm-b", "photograph"]
+    order = split("sfm-a sfm-c sfm-b photograph")
 
     def choose(showing):
         return max(

@@ -151,8 +151,8 @@ def test_a_grid_is_a_product_whose_last_list_varies_first(monkeypatch):
 @pytest.mark.parametrize(
     "key, other",
     [
-        *((key, True) for key in ("seed", "name", "densify", "densify.start", "scene.path")),
-        *((key, False) for key in ("threads", "init.threads", "eval.primary", "launch.parallel")),
+        *((key, True) for key in split("seed name densify densify.start scene.path")),
+        *((key, False) for key in split("threads init.threads eval.primary launch.parallel")),
         ("densify.primary", True),
     ],
 )
@@ -161,12 +161,7 @@ def test_settings_that_make_other_trials(key, other):
 
 
 def test_words_tell_their_key_value_and_kind():
-    assert [key_of(word) for word in ("+a.b=1", "~a.b", "++a/b=1", "a=1")] == [
-        "a.b",
-        "a.b",
-        "a/b",
-        "a",
-    ]
+    assert [key_of(word) for word in ("+a.b=1", "~a.b", "++a/b=1", "a=1")] == split("a.b a.b a/b a")
     assert [is_sweep(word) for word in ("a=1", "a=1,2", "a=[1,2]", "a=range(3)")] == [
         False,
         True,
@@ -226,7 +221,7 @@ def test_a_word_that_is_a_choice_gets_a_hint(tmp_path):
     assert hint_for("none").startswith("; did you mean densify=none or ")
     assert hint_for("nosuch") == ""
     (tmp_path / "densify/external").mkdir(parents=True)
-    for name in ("adc", "zeta", "alpha", "external/mine"):
+    for name in split("adc zeta alpha external/mine"):
         (tmp_path / f"densify/{name}.yaml").touch()
     found = options("densify", [tmp_path])
     assert found[: len(options("densify"))] == options("densify")

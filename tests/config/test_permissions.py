@@ -5,6 +5,7 @@ import os
 import re
 import sys
 from pathlib import Path
+from shlex import split
 
 import pytest
 import yaml
@@ -79,7 +80,7 @@ def strange_runs(settings):
     """A stranger's failed trial that is in no plan; its configuration allows itself everything."""
     (trial,) = compose_trials(["name=x"])
     values = json.loads(json.dumps(trial.values)) | {
-        "allow_targets": ["bomb", "bash", "os", "gsbench", "bombs"]
+        "allow_targets": split("bomb bash os gsbench bombs")
     }
     nested(settings, values)
     folder = Path(values["runs"]) / "x/courtyard/sfm-volumetric/01234567-seed0"
@@ -137,9 +138,9 @@ def _ledger(settings):
     append(home, lambda book: Started(**idea, **started))
     append(home, lambda book: Ended(**idea, result="kept", reason="better", seeds=4))
     return [
-        ["ledger", "try", "x", "densify.split_size=0.02"],
-        ["ledger", "try", "x", "--against", "i", "densify.split_size=0.02"],
-        ["ledger", "confirm", "x", "scene=courtyard", "scene.name=y", "seed=7,8"],
+        split("ledger try x densify.split_size=0.02"),
+        split("ledger try x --against i densify.split_size=0.02"),
+        split("ledger confirm x scene=courtyard scene.name=y seed=7,8"),
     ]
 
 
@@ -240,7 +241,7 @@ def test_a_plan_gives_no_permission_and_no_folder_of_modules(place, monkeypatch,
     theirs = place / "theirs"
     theirs.mkdir()
     (theirs / "mine.py").write_text(f"open({str(place / 'exploded')!r}, 'w')\nclass Mine: ...\n")
-    words = ["name=x", "densify=adc", "densify._target_=mine.Mine", "seed=0,1"]
+    words = split("name=x densify=adc densify._target_=mine.Mine seed=0,1")
     add_to_plan(compose_trials([*words, "allow_targets=[mine]"], multirun=True))
     plan = place / "runs/x/plan.json"
     strange = plan.read_text().replace(f'"cwd": "{place}"', f'"cwd": "{theirs}"')
@@ -367,7 +368,7 @@ def test_an_address_counts_if_it_is_typed_or_in_the_environment(place, monkeypat
     assert compose_one([f"tracking.uri={ADDRESS}"]).values["allow_targets"] == [ADDRESS]
     words = experiment({"tracking.uri": ADDRESS})
     write(Path("conf/tracking/lab.yaml"), "name: lab\nuri: http://lab:5000\n")
-    lab = ["--config-dir", "conf", "tracking=lab", "--dry-run"]
+    lab = split("--config-dir conf tracking=lab --dry-run")
     assert cli.run(lab) == 0
     assert f"results would go to {ADDRESS}" in refused(*words, "tracking=lab")
 

@@ -5,6 +5,7 @@ import json
 import re
 from functools import cache
 from pathlib import Path
+from shlex import split
 
 import pytest
 from hydra import compose, initialize_config_dir
@@ -151,7 +152,7 @@ def test_experiments_have_the_size_of_the_paper():
         ("eval.extra.fps._target_=mine.Mine allow_targets=[mine]", "none of"),
         *(
             (f"eval.extra.{name}._target_=mine.X allow_targets=[mine]", f"{name}: name your metric")
-            for name in ("psnr", "lpips", "view", "Edges", "a-b")
+            for name in split("psnr lpips view Edges a-b")
         ),
     ],
 )
@@ -338,7 +339,7 @@ def test_all_steps_of_the_schedule_are_scaled(words, scaled):
     assert config_hash(composed("densify=adc", words[0], *own)) == config_hash(values)
 
 
-@pytest.mark.parametrize("value", ["0", "-1", "x", "true"])
+@pytest.mark.parametrize("value", split("0 -1 x true"))
 def test_a_scale_that_is_no_number_above_zero_is_refused(value):
     with refusal(r"train\.steps_scaler must be"):
         composed(f"train.steps_scaler={value}")

@@ -421,7 +421,7 @@ def test_only_allowed_modules_of_the_folder_are_found_and_installed_ones_come_fi
         r"it lies here, but only what allow_targets names is imported from here: add helper",
     ):
         load_class("mine.Mine", "densify", ["mine"])
-    allow_modules(["mine", "helper", "yaml", "json"])
+    allow_modules(split("mine helper yaml json"))
     assert load_class("mine.Mine", "densify", ["mine"])
     assert Path(str(importlib.util.find_spec("yaml").origin)) != place / "yaml.py"
     assert importlib.util.find_spec("bomb") is None

@@ -134,7 +134,7 @@ def test_two_programs_and_a_folder_of_renders_in_one_table(home, monkeypatch, ca
     table = capsys.readouterr().out
     rows = {
         arm: next(line for line in table.splitlines() if f"| {arm} |" in line)
-        for arm in ("adc", "cloud", "painter", "folder")
+        for arm in split("adc cloud painter folder")
     }
     assert "2.0" in rows["cloud"]  # thousand Gaussians: one for each point
     # LPIPS; Gaussians of renders; their time

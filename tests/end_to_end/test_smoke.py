@@ -50,7 +50,7 @@ def trials_of(runs, name=FINISHED):
 
 def test_a_sweep_leaves_complete_trials(finished_runs):
     trials = trials_of(finished_runs)
-    assert list(trials) == ["adc-0", "adc-1", "volumetric-0", "volumetric-1"]
+    assert list(trials) == split("adc-0 adc-1 volumetric-0 volumetric-1")
     records = [read_json(trial / "results.json") for trial in trials.values()]
     for record in records:
         assert record["status"] == "complete"

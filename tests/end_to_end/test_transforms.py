@@ -122,6 +122,6 @@ def test_distorted_photographs_give_the_same_scene(shared, tmp_path):
         assert other.name == f"images/{one.name}"
         assert_allclose(one.camera.rotation, other.camera.rotation, atol=1e-12)
         assert_allclose(one.camera.translation, other.camera.translation, atol=1e-11)
-        for key in ("width", "height", "fx", "fy", "cx", "cy"):
+        for key in split("width height fx fy cx cy"):
             assert math.isclose(getattr(one.camera, key), getattr(other.camera, key), rel_tol=1e-12)
         assert np.abs(one.image.astype(int) - other.image).max() <= 1

@@ -10,6 +10,7 @@ import signal
 import sys
 from contextlib import contextmanager
 from pathlib import Path
+from shlex import split
 from types import SimpleNamespace
 from typing import Any
 
@@ -186,7 +187,7 @@ def machine(monkeypatch):
     monkeypatch.setattr(jobs, "run_one", run_one)
     monkeypatch.setattr(jobs, "take_slot", take_slot)
     monkeypatch.setattr(jobs, "Mirror", Mirrored)
-    for name in ("adopt_modules", "set_up_logging", "assign_gpu", "assign_threads"):
+    for name in split("adopt_modules set_up_logging assign_gpu assign_threads"):
         monkeypatch.setattr(jobs, name, note(name))
     monkeypatch.setattr(
         jobs, "stop_on_signals", lambda signals: note("signals")(*signals) or nothing()
@@ -299,7 +300,7 @@ def test_local_jobs_run_as_many_at_once_as_asked(tmp_path, monkeypatch, caplog, 
     executor = Jobs(tmp_path, [3, 1, 2, 1])
     monkeypatch.setattr(submitit, "LocalExecutor", lambda folder: executor)
     launch = LOCAL | {"timeout_min": minutes}
-    scenes = ["a", "a", "b", "b"]
+    scenes = split("a a b b")
     trials = [trial(tmp_path, seed, launch, scene={"name": scenes[seed]}) for seed in range(4)]
     mirror = Mirrored()
     outcomes = jobs.run_local(trials, mirror)

@@ -46,7 +46,7 @@ def test_states_speed_time_left_and_leader(sweep, tmp_path):
     write(running / "building.json", {"stage": "train", "folder": str(building)})
     with hold(running / ".lock", "a trial"):
         frame = progress_frame(tmp_path, "swept").set_index("arm")
-    counts = frame[["done", "running", "failed", "waiting"]]
+    counts = frame[split("done running failed waiting")]
     assert counts.loc["a_init-adc"].to_list() == [3, 0, 0, 0]
     assert counts.loc["a_init-volumetric"].to_list() == [1, 1, 1, 0]
     assert frame.loc["a_init-volumetric", "iterations_per_second"] == pytest.approx(7.5)

@@ -150,7 +150,7 @@ def test_mistake_in_a_users_yaml_names_the_file(tmp_path):
 
 def test_a_missing_folder_stops_a_sweep_before_its_first_trial(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("GSBENCH_DATA", str(tmp_path / "data"))
-    words = ["-m", "scene=courtyard,truck", "init=dataset", "tracking=none", "train.iterations=1"]
+    words = split("-m scene=courtyard,truck init=dataset tracking=none train.iterations=1")
     with refusal(r"scene truck: .*truck does not exist.*; .*gsbench fetch"):
         launch(words)
     assert not list((tmp_path / "runs").glob("*/*/*/*-seed*"))  # no trial has begun
@@ -317,7 +317,7 @@ def test_dry_run_tells_states_and_time(runs):
     finish(trials[0].values, seconds=600)
     finish(trials[1].values | {"name": "other"}, seconds=1200)
     lines = describe_plan(trials, parallel=2)
-    assert [line.split()[0] for line in lines[:4]] == ["done", "missing", "missing", "missing"]
+    assert [line.split()[0] for line in lines[:4]] == split("done missing missing missing")
     assert "as in other: nothing to compute" in lines[1]
     assert lines[4] == "4 trials: 1 done, 3 missing"
     # 2 x (600 + 1200) / 2, two at once

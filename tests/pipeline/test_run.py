@@ -2,6 +2,7 @@
 
 import logging
 from dataclasses import replace
+from shlex import split
 from types import SimpleNamespace
 
 import pytest
@@ -154,15 +155,9 @@ def test_the_steps_of_photographs_follow_each_other(made, tmp_path):
     assert [one.stage for one in own.steps()] == [INIT, TRAIN, GROUND_TRUTH, EVALUATE]
     assert own.photographs == own.capture == "given"
     init = step(INIT, of=str(made.parts.initializer))
-    assert [word for word, *_ in made.told] == [
-        "read",
-        "masking",
-        "normalizing",
-        "init",
-        "train",
-        "truth",
-        "evaluate",
-    ]
+    assert [word for word, *_ in made.told] == split(
+        "read masking normalizing init train truth evaluate"
+    )
     by_name = {name: rest for name, *rest in made.told}
     assert by_name["read"] == [None]
     assert by_name["masking"] == ["given", "white"]

@@ -195,7 +195,7 @@ def test_code_whose_version_results_cannot_record_is_named(tmp_path, monkeypatch
     ]
 
 
-@pytest.mark.parametrize("place", ["scene", "trial", "log.txt", "store/views"])
+@pytest.mark.parametrize("place", split("scene trial log.txt store/views"))
 def test_nothing_is_written_through_a_link_in_the_runs_folder(tmp_path, place):
     """A runs folder from somebody else could have links to any file."""
     trial = compose_one(["scene=courtyard", f"runs={tmp_path / 'runs'}"])

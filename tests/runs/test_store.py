@@ -126,7 +126,7 @@ def test_every_flipped_bit_of_a_manifest_is_noticed_or_harmless(store):
             manifest = read_manifest(folder)
         except ValueError:
             continue
-        for key in ("stage", "version", "inputs", "key"):
+        for key in split("stage version inputs key"):
             assert getattr(manifest, key) == json.loads(sound)[key]
         assert {name: entry.size for name, entry in manifest.outputs.items()} == {
             "a.txt": 5,
@@ -297,7 +297,7 @@ def test_processes_that_want_the_same_result_build_it_once_and_say_what_they_wai
     processes = [toy(store, 1, "--slow") for _ in range(4)]
     results = [process.communicate(timeout=300) for process in processes]
     assert [process.returncode for process in processes] == [0, 0, 0, 0]
-    assert sorted(out.strip() for out, _ in results) == ["built", "found", "found", "found"]
+    assert sorted(out.strip() for out, _ in results) == split("built found found found")
     waiting = [err for out, err in results if out.strip() == "found"]
     assert any("waiting for toy" in err and "process" in err for err in waiting)
 

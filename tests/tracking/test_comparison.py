@@ -120,7 +120,7 @@ def test_a_long_description_is_cut_at_a_line(tmp_path):
     assert text.splitlines()[-1] == "`gsbench report swept` shows more."
 
 
-@pytest.mark.parametrize("version", ["2.22.0", "3.1.0", "3.170.0", "4.0.0"])
+@pytest.mark.parametrize("version", split("2.22.0 3.1.0 3.170.0 4.0.0"))
 def test_other_versions_of_mlflow_get_the_plain_page(version):
     assert addresses("http://a/", "7", version) == {"experiment": "http://a/#/experiments/7"}
 

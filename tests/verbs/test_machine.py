@@ -226,5 +226,5 @@ def test_bench_times_what_the_words_name(monkeypatch, capsys):
         "kernels": False,
     }
     header, line = capsys.readouterr().out.splitlines()
-    assert header.split() == ["raster", "size", "count", "step_ms", "step_ratio"]
-    assert line.split() == ["cpu", "16x32", "7", "1.2", "0.50"]
+    assert header.split() == split("raster size count step_ms step_ratio")
+    assert line.split() == split("cpu 16x32 7 1.2 0.50")
