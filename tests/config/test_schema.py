@@ -19,7 +19,7 @@ from gsbench.config.schema import checked_values, plain, register_schemas
 from gsbench.pipeline.parts import build_metrics
 from gsbench.runs.config_hash import config_hash
 from gsbench.system.install import conf_dir
-from gsbench.train.options import STEPS, TrainConfig
+from gsbench.train.options import STEPS
 from tests.helpers import refusal
 
 GROUPS = ("scene", "init", "densify", "raster", "train", "eval", "tracking", "launch")
@@ -78,14 +78,12 @@ def test_every_option_composes(group, option):
 
 
 @pytest.mark.parametrize("option", options("densify"))
-def test_every_densifier_can_be_built_and_matches_its_class(option):
+def test_every_densifier_can_be_built_and_shows_all_its_options(option):
     values = composed(f"densify={option}", "train=paper")["densify"]
     densifier = build("densify", values, [])
     if dataclasses.is_dataclass(densifier):
         names = {field.name for field in dataclasses.fields(densifier) if field.init}
         assert names == set(values) - {"_target_", "name"}  # the YAML shows every option
-    if option not in ("absgrad", "revised", "volumetric_once", "mrnf", "none"):
-        assert densifier == type(densifier)()  # and the values of the class
 
 
 @pytest.mark.parametrize("option", options("init"))
@@ -98,23 +96,6 @@ def test_every_initialiser_shows_all_its_options(option, tmp_path):
     assert names == set(values) - {"_target_", "name"}
 
 
-def test_the_paper_schedule_is_the_class_default():
-    defaults = dataclasses.asdict(TrainConfig(name="paper"))
-    assert plain(defaults) == plain(composed("train=paper")["train"])
-
-
-def sweep_size(experiment):
-    register_schemas()
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        config = compose(
-            "config", overrides=[f"+experiment={experiment}"], return_hydra_config=True
-        )
-    size = 1
-    for value in OmegaConf.to_container(config.hydra.sweeper.params).values():
-        size *= len(str(value).split(","))
-    return size
-
-
 def test_the_demo_downloads_little_and_declares_what_it_measures():
     trials = compose_trials(["+experiment=demo"], multirun=True)
     asked = {
@@ -122,13 +103,6 @@ def test_the_demo_downloads_little_and_declares_what_it_measures():
     }
     # FLIP needs no weights; LPIPS is measured where its weights are
     assert asked == {(("squeeze",), "flip")}
-
-
-def test_experiments_have_the_size_of_the_paper():
-    assert sweep_size("table1") == 13 * 2 * 3
-    assert sweep_size("table2") == 12 * 2 * 2 * 3
-    assert sweep_size("demo") == 6
-    assert {"table1", "table2", "threshold", "budget"} <= {*options("experiment")}
 
 
 @pytest.mark.parametrize(

@@ -156,10 +156,7 @@ STRANGE = {
         },
         "allow_targets=[hydra.job_logging]",
     ),
-    "a densifier": ({"densify._target_": "bomb.Bomb"}, "allow_targets=[bomb]"),
     "a package": ({"densify._target_": "bombs.Bomb"}, "allow_targets=[bombs]"),
-    "a tracker": ({"tracking._target_": "bomb.Bomb"}, "allow_targets=[bomb]"),
-    "a reader": ({"scene": {"kind": "reader", "_target_": "bomb.Bomb"}}, "allow_targets=[bomb]"),
     "a module of a package": ({"densify._target_": "bombs.one.Bomb"}, "allow_targets=[bombs]"),
     "a densifier that allows itself": (
         {"allow_targets": ["bomb"], "densify._target_": "bomb.Bomb"},
@@ -177,7 +174,6 @@ STRANGE = {
         {"densify._target_": "gsbench.densify.adc.torch.load"},
         "cannot be imported",
     ),
-    "a metric": ({"eval.extra.mine._target_": "bomb.Bomb"}, "allow_targets=[bomb]"),
     "below a metric": (
         {"eval.extra.mine": {"_target_": "gsbench.eval.X", "in": {"_target_": "bomb.Bomb"}}},
         "[bomb]",
@@ -185,14 +181,6 @@ STRANGE = {
     "a place that nobody reads": (
         {"launch.sbatch._target_": "bomb.Bomb"},
         "allow_targets=[bomb]",
-    ),
-    "lines of a shell": (
-        {"launch": {"name": "slurm", "setup": ["touch exploded"]}},
-        "allow_targets=[bash]",
-    ),
-    "an option of sbatch": (
-        {"launch": {"name": "slurm", "sbatch": {"task-prolog": "x"}}},
-        "allow_targets=[sbatch]",
     ),
     "a line break for sbatch": (
         {"launch": {"name": "slurm", "qos": "x\ntouch exploded\n"}},
