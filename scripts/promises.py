@@ -39,7 +39,7 @@ from gsbench.analysis.votes import judge_votes
 from gsbench.claims import gate as gates
 from gsbench.claims import ledger as rules
 from gsbench.claims.pooling import Study, pool
-from gsbench.claims.stopping import Asked, KeyAndSeed
+from gsbench.claims.stopping import KeyAndSeed, SequentialTest
 from gsbench.runs import ledger as records
 from gsbench.runs.experiments import Declaration, Question, trial_key
 from gsbench.runs.trial_record import TrialRecord
@@ -250,7 +250,7 @@ def in_looks(declaration: Declaration, made: Sequence[TrialResult]) -> list[Verd
     def run(planned: Iterable[KeyAndSeed]) -> None:
         done.update({key: by_key[key] for key in planned})
 
-    return Asked(declaration, done.values).answer(run)
+    return SequentialTest(declaration, done.values).answer(run)
 
 
 def check(scenes: int, seeds: int, ratio: float, effect: float, claims: int) -> Draw:
@@ -612,7 +612,7 @@ def promises() -> Iterator[Promise]:
         name = (
             f"a false sign of four claims in looks, {scenes} × {seeds}, one scene {ratio:g} × noise"
         )
-        yield Promise(name, "`run_looks`", 0.05, 1000, check(scenes, seeds, ratio, 0.0, 4))
+        yield Promise(name, "`SequentialTest`", 0.05, 1000, check(scenes, seeds, ratio, 0.0, 4))
     for finish, how in ((True, "finishes, far worse"), (False, "fails")):
         name = f"better, although a training in ten of one arm {how}, 3 × 3"
         yield Promise(name, judged, ONE_ARM_LIMIT, 4000, failing(finish))

@@ -145,7 +145,7 @@ REFUSED = {  # command line: a part of the line that refuses it
     "tables nosuch": "no experiment 'nosuch'",
     "report x --out ''": "is not a path",
     "retry x foo": "no experiment 'x'",
-    "view x --port 99999": "from 0 to 65535",
+    "view x --port 99999": "a whole number in [0, 65535]",
     "view .": "is not a trial's folder",
     "ui --uri nosuch": "is not an address",
     "bench --size 999999999x999999999": "a size is WIDTHxHEIGHT",

@@ -134,7 +134,8 @@ def _help(words: list[str]) -> int:
 
     folders: list[Path] = []
     if words:  # the choices in the user's folders are listed too
-        from gsbench.config.command_words import parse, searched_folders
+        from gsbench.config.command_words import parse
+        from gsbench.config.search_path import searched_folders
 
         folders = searched_folders(parse(words)[0])
     print(USAGE)

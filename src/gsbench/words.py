@@ -2,6 +2,7 @@
 
 import difflib
 import re
+import shlex
 import string
 import unicodedata
 from collections.abc import Iterable, Sequence
@@ -146,6 +147,16 @@ def printable(text: str) -> str:
     return CONTROL_CHARACTERS.sub(
         lambda found: found[0].encode("unicode_escape").decode("ascii"), text.replace("\r\n", "\n")
     )
+
+
+def command(*words: str) -> str:
+    """A command of gsbench to type: a stranger's name in it is no word of the shell.
+
+    Examples:
+        >>> command("retry", "x; rm y")
+        "gsbench retry 'x; rm y'"
+    """
+    return shlex.join(["gsbench", *words])
 
 
 def listed(names: Sequence[str]) -> str:

@@ -25,7 +25,7 @@ def code(digest=None, **stages):
 
 
 def of_gsbench(**packages):
-    return code() | {"rooms": packages}
+    return code() | {"packages": packages}
 
 
 def table_of(runs):
@@ -83,8 +83,8 @@ def test_older_trials_with_other_settings_still_count(tmp_path):
     [
         ({"_code": code()}, {"_code": code(train=2)}, "stage train"),
         (
-            {"_code": {**code(), "rooms": {"train": "released"}}},
-            {"_code": {**code(), "rooms": {"train": "c" * 16}}},
+            {"_code": {**code(), "packages": {"train": "released"}}},
+            {"_code": {**code(), "packages": {"train": "c" * 16}}},
             "gsbench's train",
         ),
     ],

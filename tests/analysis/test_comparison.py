@@ -36,7 +36,7 @@ from gsbench.verbs.plan import plan
 from gsbench.verbs.results import explain_cell, tables
 from tests.analysis.helpers import loaded, page_of, table_of, write_declared
 from tests.conftest import script
-from tests.helpers import change_json, read_json
+from tests.helpers import change_json, read_json, refusal
 from tests.helpers import write as write_file
 from tests.trials import write_trial
 
@@ -254,6 +254,28 @@ def test_a_baseline_that_is_chosen_later_declares_no_other_pairs(tmp_path, looks
     assert turned.beforehand
 
 
+@pytest.mark.parametrize("case", ["three arms", "edited", "late", "late baseline"])
+def test_a_question_that_is_turned_has_the_same_answer(tmp_path, case):
+    """``report --baseline`` may be chosen by what was seen."""
+    days = {"late": (4, 2), "late baseline": (2, 4)}.get(case, (4, 4))
+    adc, mine = (grid(name, 4, day) for name, day in zip(("adc", "mine"), days, strict=True))
+    others = {
+        "three arms": grid("more", 4, 4),
+        "edited": [replace(one, code=OLD) for one in mine],
+    }.get(case, [])
+    mine = [replace(one, code=NEW, day=5) for one in mine] if case == "edited" else mine
+    trials = [*adc, *mine, *others]
+    write(tmp_path, trials)
+    declare(tmp_path, (3, trials))
+    (asked, *_), (turned, *_) = answer(tmp_path).answers, answer(tmp_path, "mine").answers
+    assert (asked.first, asked.second) == (turned.second, turned.first)
+    assert (asked.beforehand, asked.versions) == (turned.beforehand, turned.versions)
+    for one, other in zip(asked.verdicts, turned.verdicts, strict=True):
+        assert other.mean == pytest.approx(-one.mean)
+        assert other.p == pytest.approx(one.p)
+        assert (other.answer.level, other.family) == (one.answer.level, one.family)
+
+
 def gain(runs, trials, by=5.0):
     """Raise the PSNR of trials of one view."""
     for one in trials:
@@ -301,7 +323,10 @@ def test_an_arm_gains_nothing_by_a_trial_without_a_value(tmp_path, declared):
     found = answer(tmp_path)
     (verdict,) = [one for one in found.answers[0].verdicts if one.question.metric == "psnr"]
     assert verdict.favours_lacking
-    assert "1 trial of one arm alone failed, stopped or gave no value" in found.sentences[0]
+    assert (
+        "1 trial of one arm alone failed, stopped, went missing or gave no value"
+        in found.sentences[0]
+    )
     line = "PSNR (dB): a seed 1 not compared: it is not a number"
     left_out = found.to_json()["left_out"]
     for told in (remarks(tmp_path), left_out, table_of(tmp_path).notes, page_of(tmp_path)):
@@ -309,6 +334,47 @@ def test_an_arm_gains_nothing_by_a_trial_without_a_value(tmp_path, declared):
     for one in (mine[0], mine[2], mine[3]):
         drop_psnr(tmp_path, one)
     assert "PSNR (dB): sfm-mine not compared: it is not a number" in remarks(tmp_path)
+
+
+@pytest.mark.parametrize("swept", [False, True])
+@pytest.mark.parametrize("gone", ["adc", "mine", "adc mine"])
+def test_no_arm_gains_by_declared_trials_whose_folders_are_gone(tmp_path, gone, swept):
+    """Whoever deletes failed trials, or stops a sweep between two, does not help an arm."""
+    arms = {"adc": grid("adc", seeds=4), "mine": grid("mine", seeds=4, decay=1)}
+    trials = [*arms["adc"], *arms["mine"], *(grid("mine", seeds=4, decay=2) if swept else [])]
+    write(tmp_path, trials)
+    declare(tmp_path, (1, trials))
+    names = gone.split()
+    gain(tmp_path, arms[names[0]])
+    for name in names:
+        shutil.rmtree(arms[name][3].results(tmp_path).parent)
+    verdict = answer(tmp_path).answers[0].verdicts[0]
+    assert (bool(verdict.lacking), verdict.favours_lacking) == (len(names) == 1,) * 2
+
+
+def test_a_failed_trial_without_settings_may_be_of_any_arm_that_lacks_it(tmp_path):
+    adc, mine, other = grid("adc"), grid("mine", decay=1), grid("mine", decay=2)
+    write(tmp_path, [*adc, *mine, *other])
+    gain(tmp_path, [*mine, *other])
+    mine[2].results(tmp_path).unlink()
+    write_file(mine[2].results(tmp_path).with_name("config.yaml"), "")
+    lacking, whole = answer(tmp_path).answers
+    assert lacking.verdicts[0].favours_lacking
+    assert not whole.verdicts[0].lacking
+    assert whole.verdicts[0].outcome == "supported"
+
+
+@pytest.mark.parametrize("seconds, answered", [(60.0, True), (None, False)])
+def test_trainings_that_a_time_limit_ended_are_compared(tmp_path, seconds, answered):
+    """Each ends at another iteration; without a limit that is another training."""
+    trials = [*grid("adc"), *grid("mine")]
+    write(tmp_path, trials)
+    for number, one in enumerate(trials):
+        budget = {"max_gaussians": None, "cap": None, "seconds": seconds}
+        change_json(one.results(tmp_path), iterations=1000 + number, budget=budget)
+    assert bool(answer(tmp_path).answers[0].verdicts) == answered
+    with refusal(None if answered else "would average trials that differ in iterations"):
+        page_of(tmp_path)
 
 
 def test_a_metric_without_a_direction_is_named(tmp_path):

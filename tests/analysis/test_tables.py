@@ -5,6 +5,7 @@ import io
 import re
 import shutil
 import statistics
+from dataclasses import replace
 from shlex import split
 
 import pandas as pd
@@ -18,6 +19,7 @@ from gsbench.analysis.quantities import (
     relative_change,
 )
 from gsbench.analysis.table_formats import (
+    FORMATS,
     Column,
     Row,
     Table,
@@ -30,6 +32,7 @@ from gsbench.analysis.table_formats import (
     to_markdown,
 )
 from gsbench.analysis.tables import build_table, with_agreement
+from gsbench.words import printable
 from tests.analysis.helpers import page_of, rows_of, table_of, trials_of
 from tests.helpers import refusal
 from tests.markup import Page
@@ -296,6 +299,18 @@ def test_a_strangers_text_is_text_in_every_format():
     latex = to_latex(Table("\\input{x}\n\n^^5cinput%", ("scene",), (column,), rows[1:]))
     assert "\\input" not in latex
     assert "\\textasciicircum{}\\textasciicircum{}5cinput\\%" in latex
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_no_character_of_a_text_acts_on_a_terminal_or_turns_a_line_around(name):
+    strange = "a\x1b[31m\u202eb"
+    entries = (TableEntry(strange),)
+    table = Table(
+        strange, (strange,), (Column(strange, strange, (strange, "")),), (Row((strange,), entries),)
+    )
+    text = FORMATS[name][1](replace(table, notes=(strange,)))
+    assert text == printable(text)
+    assert "u202eb" in text
 
 
 def test_html_is_well_formed_and_escaped(make_experiment):

@@ -8,12 +8,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from gsbench.app import command, plugins
-from gsbench.app.plugins import (
-    Objective,
-    best_line,
-    prepare_other_sweeper,
-    words_without_sweeper,
-)
+from gsbench.app.plugins import Objective, best_line, prepare_other_sweeper, words_without_sweeper
 from gsbench.errors import InputError
 from tests.app.stand_ins import trial
 from tests.helpers import refusal

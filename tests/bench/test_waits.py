@@ -23,15 +23,6 @@ WAITING = {
     "numbers for a device": (lambda: torch.tensor([1.0, 2.0]), {"lift_fresh": 1}),
     "a copy to another device": (lambda: ONE.to("meta"), {"_to_copy": 1}),
 }
-FREE = {
-    "arithmetic": lambda: (ONE * 2 + 1).exp().sum(),
-    "a choice": lambda: torch.where(ONE > 0, ONE, 0.0),
-    "an index": lambda: ONE[torch.arange(2)],
-    "a sort": lambda: torch.sort(ONE, stable=True),
-    "repeats of known sum": lambda: torch.repeat_interleave(torch.arange(2), output_size=1),
-    "an asynchronous copy": lambda: ONE.to("meta", non_blocking=True),
-    "a conversion": lambda: ONE.double(),
-}
 
 
 @pytest.mark.parametrize("what", list(WAITING))
@@ -40,19 +31,6 @@ def test_operations_that_wait_are_counted(what):
     with counting_waits(pretend=True) as counts:
         work()
     assert counts == expected
-
-
-@pytest.mark.parametrize("what", list(FREE))
-def test_operations_that_do_not_wait_are_not_counted(what):
-    with counting_waits(pretend=True) as counts:
-        FREE[what]()
-    assert counts == {}
-
-
-def test_python_numbers_for_the_cpu_do_not_wait():
-    with counting_waits() as counts:
-        torch.tensor([1.0])
-    assert counts == {}
 
 
 def test_waits_in_the_backward_pass_are_counted():
@@ -83,7 +61,10 @@ def test_a_readback_waits_only_if_it_has_not_arrived(monkeypatch):
 
 @pytest.mark.parametrize("raster", ["triton", "reference"])
 def test_a_training_step_with_triton_waits_once(raster):
-    """It reads how much there is to composite. The reference shows that more waits are counted."""
+    """It reads how much there is to composite. Its other operations are not taken for waits.
+
+    The reference shows that more waits are counted.
+    """
     pytest.importorskip("triton")
     environment = os.environ | {
         "TRITON_INTERPRET": "1",

@@ -6,21 +6,24 @@ import os
 import re
 import shutil
 import zipfile
+from dataclasses import replace
 from shlex import split
 
 import pytest
 import yaml
 
 from gsbench.analysis.comparison import compare
+from gsbench.analysis.fairness import fairness_table
 from gsbench.analysis.images import textured_error
-from gsbench.analysis.results import read_views
+from gsbench.analysis.results import load_experiment, read_views
+from gsbench.analysis.table_formats import to_markdown
 from gsbench.claims.archive import unpack_archive
 from gsbench.claims.export import write_archive
 from gsbench.errors import InputError
 from gsbench.runs.experiments import Declaration, Question
-from tests.analysis.helpers import loaded, write_declared
+from tests.analysis.helpers import ADC, VOLUMETRIC, loaded, write_declared
 from tests.helpers import read_json, refusal, write
-from tests.trials import write_runs
+from tests.trials import search_record, write_runs
 
 # as many trials as Table 1 has
 UNSIGNED = ("archive.json", "ro-crate-metadata.json")
@@ -68,7 +71,8 @@ def test_results_settings_and_views_are_read_back(tmp_path):
     back = unpack_archive(file, tmp_path / "other")
     assert [one.label for one in back.trials] == [one.label for one in there.trials]
     for one, other in zip(there.trials, back.trials, strict=True):
-        assert other.record == one.record
+        assert replace(other.record, measured=None) == one.record
+        assert other.measured == one.measured
         assert other.config == one.config
         assert read_views(other) == read_views(one)
     assert (back.folder / "declared.jsonl").read_text() == (
@@ -171,6 +175,13 @@ def with_unfinished(folder):
     return lambda file: rewrite(file, lambda content: content.update(added), resigned=True)
 
 
+def with_search(name, **changes):
+    """An archive by somebody who adds a search with this name."""
+    line = {"experiment": name, "search": search_record([]) | changes}
+    added = {"searches.jsonl": json.dumps(line).encode()}
+    return lambda file: rewrite(file, lambda content: content.update(added), resigned=True)
+
+
 def flip_a_bit(file):
     data = bytearray(file.read_bytes())
     data[len(data) // 2] ^= 0x40
@@ -215,6 +226,8 @@ def flip_a_bit(file):
         ),
         (resigned("per_view.csv", b"-seed1,", b"-seed9,"), "per_view.csv"),
         (edit("archive.json", b"{", b"[" * 200_000), "not JSON"),
+        (with_search("../up"), "cannot be the name of an experiment"),
+        (with_search("up", points=3), "searches.jsonl is damaged: points is 3"),
         (with_unfinished("../../up"), "cannot be the folder of a trial"),
         (with_unfinished("yard/sfm-adc/strange"), "strange: unfinished"),
         (with_unfinished("x"), "cannot be the folder of a trial"),
@@ -312,3 +325,32 @@ def test_a_pipe_is_no_archive(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     with refusal("it is not a regular file"):
         unpack_archive(tmp_path / "pipe", tmp_path / "other")
+
+
+def test_a_search_stays_a_search_and_a_tuned_arm_stays_tuned(runs, tmp_path, said, refused):
+    """Points of a search were chosen by their results: no page of its archive tests them."""
+    points = [{"settings": {"densify.volume_threshold": 0.03}, "value": 26.0}]
+    for name in ("vth", "search"):
+        write_runs(runs, experiment=name)
+    write(runs / "search" / "tuning.json", search_record(points))
+    for name in ("vth", "search"):
+        said("export --results", name, "--out", tmp_path / f"{name}.zip")
+    opened = {
+        one: unpack_archive(tmp_path / f"{one}.zip", tmp_path / one) for one in ("vth", "search")
+    }
+    assert compare(opened["search"]).pairs == ()
+    assert "of a search" in refused("pool --arm volumetric", tmp_path / "search.zip")
+    for one in (load_experiment(runs, "vth"), opened["vth"]):
+        sheet = to_markdown(fairness_table(one.trials, ADC, VOLUMETRIC))
+        assert "the best of 1 point by psnr" in sheet
+
+
+def test_a_time_that_only_a_file_knew_stays_the_time_of_measuring(tmp_path):
+    """Results that were there before their declaration are not declared by the journey."""
+    file = export(tmp_path)
+    for path in (tmp_path / "runs").glob("exp/*/*/*/results.json"):
+        os.utime(path, (1e9, 1e9))
+    write_archive(loaded(tmp_path / "runs"), file)
+    back = unpack_archive(file, tmp_path / "other")
+    assert {trial.measured for trial in back.trials} == {1e9}
+    assert compare(back).sentences == compare(loaded(tmp_path / "runs")).sentences

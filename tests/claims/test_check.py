@@ -80,7 +80,7 @@ def looked(check, runner):
             runner(left)
 
     check = replace(check, declaration=replace(check.declaration, time="2020-01-01T00:00:00Z"))
-    return list(check.checked(check.asked.answer(run)).verdicts)
+    return list(check.checked(check.test.answer(run)).verdicts)
 
 
 def test_a_clear_effect_ends_at_the_first_look_and_a_repeated_check_runs_nothing(tmp_path):

@@ -21,7 +21,7 @@ from gsbench.claims import stopping
 from gsbench.claims.check import Checked, claim_verdicts
 from gsbench.claims.check_page import make_page, to_html, to_text
 from gsbench.claims.file import parse_claims
-from gsbench.claims.stopping import Asked
+from gsbench.claims.stopping import SequentialTest
 from gsbench.runs.experiments import Arm, Declaration, Question
 from gsbench.runs.ledger import Ledger, Opened, Promoted, Started
 from gsbench.tracking.comparison import description
@@ -76,7 +76,7 @@ def by_check(scenes, seeds, trials):
     file = parse_claims(own | {"scenes": {name: {"scene": "courtyard"} for name in scenes}})
     question = file.question(file.claims[0], {scene: keys(scene) for scene in scenes})
     declared = Declaration(time=EARLY, questions=(question,), looks=file.looks)
-    judged = Asked(declared, lambda: trials).judged()
+    judged = SequentialTest(declared, lambda: trials).verdicts()
     verdicts = claim_verdicts(file, declared, judged)
     checked = Checked(file, verdicts, declared, [declared], unused_trials(trials, judged))
     page = make_page(checked)
@@ -94,7 +94,7 @@ def by_gate(scenes, seeds, trials):
     sides = ([one for one in trials if one.densify == arm] for arm in ("adc", "mine"))
     old, new = (lambda own=own: own for own in sides)
     asked = gates.ask_gate(Declaration(**vars(declared) | {"time": EARLY}), old, new)
-    (verdict,) = asked.judged()
+    (verdict,) = asked.verdicts()
     left_out = texts(unused_trials([*asked.read()], [verdict]))
     return verdict, {"text": "\n".join([gates.describe(verdict), *left_out])}
 
@@ -117,7 +117,7 @@ def by_ledger(scenes, seeds, trials):
     test = Promoted(time=EARLY, idea="mine", level=0.025, seeds=tuple(range(seeds)))
     book = Ledger((opened, started, test), "")
     asked = rules.ask_idea(rules.test_of(book, "mine"), lambda: trials)
-    (verdict,) = asked.judged()
+    (verdict,) = asked.verdicts()
     ended = rules.end_of("mine", verdict, EARLY)
     return verdict, {"text": "\n".join([ended.reason, *texts(rules.unused(book, trials))])}
 

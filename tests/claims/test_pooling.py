@@ -167,6 +167,14 @@ def test_different_budgets_are_named(tmp_path, said):
     assert sentence in said(*POOL, steered, growing)
 
 
+def test_an_archive_whose_arm_lacks_failed_trials_is_named(tmp_path):
+    write_runs(tmp_path)
+    (tmp_path / "exp/garden/sfm-volumetric/c0ffee00-seed2/results.json").unlink()
+    write_archive(loaded(tmp_path), tmp_path / "a.zip")
+    _, notes, _ = read_studies(tmp_path / "a.zip", WANTED, "a")
+    assert any("caution, 1 trial of one arm alone failed, stopped" in line for line in notes)
+
+
 def test_two_protocols_have_no_mean_and_one_can_be_chosen(tmp_path, said):
     """The protocols differ between archives or within one; every study is shown."""
     protocols = {"a": "paper-1", "b": "both", "c": "paper-1"}

@@ -9,7 +9,7 @@ from gsbench.analysis.judgement import Verdict
 from gsbench.analysis.looks import plan_looks
 from gsbench.analysis.pairing import Pairs
 from gsbench.analysis.quantities import asked_quantity
-from gsbench.claims.stopping import plan_sweep, run_looks, trials_of_look
+from gsbench.claims.stopping import SequentialTest, plan_sweep, trials_of_look
 from gsbench.runs.experiments import Arm, Declaration, Question
 from tests.composed import composed
 from tests.helpers import refusal
@@ -51,12 +51,13 @@ def test_trials_of_a_look_are_ordered_by_seed_and_each_is_listed_once():
         ([(False, False)] * 3, [6]),
     ],
 )
-def test_looks_end_when_nothing_can_be_decided(finals, looked):
+def test_looks_end_when_nothing_can_be_decided(finals, looked, monkeypatch):
     batches = []
     answers = iter(finals)
-    verdicts = run_looks(
-        DECLARATION, lambda: [verdict(final) for final in next(answers)], batches.append
+    monkeypatch.setattr(
+        "gsbench.claims.stopping.judge", lambda *_: [verdict(final) for final in next(answers)]
     )
+    verdicts = SequentialTest(DECLARATION, list).answer(batches.append)
     assert [len(batch) for batch in batches] == looked
     assert [one.final for one in verdicts] == list(finals[min(len(looked), len(finals) - 1)])
 

@@ -239,7 +239,7 @@ def test_a_round_is_declared_apart_from_metrics_and_claims(made, runs, tmp_path)
             "make exp --out new --arms adc,mcmc",
             "'mcmc' names 0 arms; choose one of sfm-adc",
         ),
-        ("make exp --out new --pairs 0", "from 1 to 1000"),
+        ("make exp --out new --pairs 0", "in [1, 1000]"),
         ("make exp x.json --out new", "takes no files"),
         ("judge exp absent.json", "absent.json is not there"),
         ("judge exp --arms adc", "files of votes alone"),

@@ -8,22 +8,17 @@ import pytest
 
 from gsbench.config import command_words
 from gsbench.config.command_words import (
-    check_search_path,
     check_single,
     check_text,
     check_words,
     grid_points,
     is_interval,
-    is_sweep,
-    key_of,
     makes_other_trials,
     parse,
-    parse_word,
-    search_path,
-    searched_folders,
-    value_text,
 )
 from gsbench.config.groups import hint_for, options
+from gsbench.config.overrides import is_sweep, key_of, parse_word, value_text
+from gsbench.config.search_path import check_search_path, search_path, searched_folders
 from tests.helpers import refusal
 
 

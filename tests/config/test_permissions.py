@@ -13,8 +13,10 @@ import yaml
 from gsbench import cli
 from gsbench.app.command import compose_trials
 from gsbench.config.build import build
-from gsbench.config.command_words import value_text
+from gsbench.config.command_words import typed_permissions
 from gsbench.config.compose import Trial, compose_one
+from gsbench.config.overrides import value_text
+from gsbench.config.permissions import permission_advice
 from gsbench.config.trust import ADDRESS_VARIABLES, check_permissions, foreign_address
 from gsbench.errors import InputError
 from gsbench.launch.record import add_to_plan
@@ -22,6 +24,7 @@ from gsbench.runs.ledger import Ended, Opened, Started, append, begin_ledger
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.install import conf_dir
 from tests.helpers import read_json, refusal, write
+from tests.processes import completed
 from tests.strange import experiment, nested, no_trial
 from tests.strange import place as place
 
@@ -390,3 +393,16 @@ def test_addresses_of_any_tracker_are_found(tracking, allowed, found, monkeypatc
     for variable in ADDRESS_VARIABLES:
         monkeypatch.delenv(variable, raising=False)
     assert foreign_address(tracking, allowed) == found
+
+
+@pytest.mark.parametrize(
+    "name", ["mine", "a b", "it's", "$(touch exploded)", "`touch exploded`'", 'a"b', "a;b", "!x"]
+)
+def test_the_advice_can_be_typed_in_a_shell_and_runs_nothing_there(name, tmp_path):
+    word = permission_advice([name], ["other"]).removeprefix("add ").partition(" to the command")[0]
+    done = completed(["sh", "-c", f"printf %s {word}"], cwd=tmp_path)
+    if "$" in name:  # never a permission
+        assert name in done.stdout
+    else:
+        assert typed_permissions([done.stdout]) == ("other", name)
+    assert not (tmp_path / "exploded").exists()

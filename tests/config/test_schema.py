@@ -13,8 +13,9 @@ from omegaconf import OmegaConf
 
 from gsbench.app.command import compose_trials
 from gsbench.config.build import build
-from gsbench.config.command_words import check_words, key_of, parse_word
+from gsbench.config.command_words import check_words
 from gsbench.config.compose import compose_one
+from gsbench.config.overrides import key_of, parse_word
 from gsbench.config.schema import checked_values, plain, register_schemas
 from gsbench.pipeline.parts import build_metrics
 from gsbench.runs.config_hash import config_hash

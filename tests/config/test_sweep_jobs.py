@@ -10,9 +10,9 @@ from omegaconf import OmegaConf
 
 from gsbench.app.command import compose_trials
 from gsbench.config import compose
-from gsbench.config.command_words import parse_word
 from gsbench.config.compose import compose_one
 from gsbench.config.explain import explained
+from gsbench.config.overrides import parse_word
 from gsbench.launch.jobs import job_of
 from tests.helpers import refusal
 

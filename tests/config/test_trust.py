@@ -275,6 +275,61 @@ def test_a_launcher_in_a_strangers_file_is_not_run(capsys, monkeypatch):
     assert not Path("exploded").exists()
 
 
+SECRET = "${oc.env:KEY}"
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        SECRET,
+        "a${oc.env:'KEY'}",
+        "${oc.env:NO,${oc.env:KEY}}",
+        "${oc.env:GSBENCH_NO,${oc.env: KEY,b}}",
+        "${oc.select:no,${oc.env:KEY}}",
+        "${oc.env:${init.name}}",
+    ],
+)
+@pytest.mark.parametrize("how", ["experiment", "params", "job"])
+def test_no_file_reads_a_variable_into_results(value, how, capsys, monkeypatch):
+    monkeypatch.setenv("KEY", "secret")
+    settings = {
+        "experiment": {"scene.name": value},
+        "params": {"hydra": {"mode": "MULTIRUN", "sweeper": {"params": {"scene.name": value}}}},
+        "job": {"hydra.job.name": value},
+    }
+    said = ask(experiment(settings[how]), capsys, monkeypatch)
+    assert "which may be secret; if you want its value in results, add " in said
+    assert "secret/" not in said
+
+
+@pytest.mark.parametrize(
+    "value, name",
+    [
+        (SECRET, None),
+        ("${oc.env:GSBENCH_X}", "own"),
+        ("${oc.env:NO,b}", None),
+        ("${oc.env:USER}", "me"),
+    ],
+)
+def test_variables_of_places_and_those_that_are_typed_are_read(value, name, monkeypatch):
+    """What a typed word reads, and what ``allow_targets`` names, every file may read."""
+    for variable, text in {"KEY": "secret", "GSBENCH_X": "own", "USER": "me"}.items():
+        monkeypatch.setenv(variable, text)
+    words = experiment({"scene.name": value})
+    words = ["hydra.searchpath=[conf]", *words[2:]]
+    if name is None:
+        with refusal("reads the variable"):
+            compose_one(words)
+        variable, name = ("KEY", "secret") if value == SECRET else ("NO", "b")
+        assert (
+            compose_one([*words, f"allow_targets=[env:{variable}]"]).values["scene"]["name"] == name
+        )
+        with refusal("reads the variable"):
+            compose_one([*words, f"allow_targets=[{variable}]"])
+        words.append(f"init.name=a${{oc.env:{variable},b}}")
+    assert compose_one(words).values["scene"]["name"] == name
+
+
 VARIABLES = """
 PATH PYTHONPATH PYTHONSTARTUP PYTHONHOME PYTHONUSERBASE PYTHONINSPECT LD_PRELOAD LD_LIBRARY_PATH LD_AUDIT
 DYLD_INSERT_LIBRARIES GIT_SSH_COMMAND GIT_CONFIG_GLOBAL GIT_EXTERNAL_DIFF BASH_ENV ENV NUMBA_CACHE_DIR MPLBACKEND

@@ -3,43 +3,36 @@
 import re
 import threading
 import time
-from collections.abc import Callable
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
+from types import MappingProxyType, SimpleNamespace
 
 RANGE = re.compile(r"bytes=(\d*)-(\d*)")
 
 
-@dataclass
 class Manners:
     """How the server behaves. ``cut_every`` and ``stall_every`` count the bytes of a body."""
 
-    ranges: bool = True
-    cut_every: int | None = None
-    cuts: int = 1_000_000  # how many bodies are cut or stalled
-    stall_every: int | None = None
-    claimed_size: int | None = None  # a wrong length of the file, sent in headers
-    damage: Callable[[str, int, bytes], bytes] | None = None  # (path, offset, body) -> body
-    status: dict[str, int] = field(default_factory=dict)  # path -> error status instead of the file
-    fail_first: int = 0  # number of requests that get 503 first
-    redirect: bool = False
-    shift: int = 0  # bytes by which the start of a range is wrong
+    ranges = True
+    cut_every = stall_every = None
+    cuts = 1_000_000  # how many bodies are cut or stalled
+    claimed_size = None  # a wrong length of the file, sent in headers
+    damage = None  # (path, offset, body) -> body
+    status = MappingProxyType({})  # path -> error status instead of the file
+    fail_first = 0  # number of requests that get 503 first
+    redirect = False
+    shift = 0  # bytes by which the start of a range is wrong
 
-
-@dataclass
-class Server:
-    folder: Path
-    url: str
-    manners: Manners
-    requests: list[tuple[str, str]] = field(default_factory=list)  # path, range
-    sent: int = 0
+    def __init__(self, **changes):
+        vars(self).update(changes)
 
 
 @contextmanager
 def serve(folder):
-    """Serve the files of ``folder`` while the block runs."""
+    """Serve the files of ``folder`` while the block runs.
+
+    Yields its ``url``, its ``manners``, the ``requests`` as (path, range), and the bytes ``sent``.
+    """
 
     class Handler(BaseHTTPRequestHandler):
         protocol_version = "HTTP/1.1"
@@ -121,7 +114,8 @@ def serve(folder):
 
     server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
     server.daemon_threads = True
-    state = Server(folder, f"http://127.0.0.1:{server.server_port}", Manners())
+    state = SimpleNamespace(folder=folder, manners=Manners(), requests=[], sent=0)
+    state.url = f"http://127.0.0.1:{server.server_port}"
     threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True).start()
     try:
         yield state

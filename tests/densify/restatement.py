@@ -67,6 +67,27 @@ def split_all(rows, chosen, noise, scales=None):
     return [row for i, row in enumerate(rows) if i not in chosen] + children
 
 
+def half(row, side, place, along, across):
+    """A child on one ``side`` of its parent, ``place`` scales away along the longest axis.
+
+    The scale of that axis is multiplied by ``along``, the others by ``across``, and the opacity by
+    0.6.
+    """
+    scales = np.exp(row["log_scales"])
+    longest = int(np.argmax(scales))
+    new = scales * across
+    new[longest] = along * scales[longest]
+    offset = side * place * scales[longest] * rotation(row["quaternions"])[:, longest]
+    child = newborn(row, means=row["means"] + offset, log_scales=np.log(new))
+    return with_logit(child, logit(0.6 * opacity(row)))
+
+
+def halve_all(rows, chosen, child):
+    """Replace each chosen row by ``child(i, side)`` on both sides: all first ones, then all second."""
+    children = [child(i, side) for side in (1, -1) for i in chosen]
+    return [row for i, row in enumerate(rows) if i not in chosen] + children
+
+
 def adc_growth(rows, mean_gradient, extent, noise, events):
     clones = []
     chosen = []

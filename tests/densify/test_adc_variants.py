@@ -232,17 +232,17 @@ def steep_gs_growth(rows, gradient, matrices, noise, rate, threshold=-1e-6, shar
         for i in range(len(rows))
         if gradient[i] >= 0.0002 and least(matrices[i])[0] * EXTENT * EXTENT < threshold
     ]
-    children = []
-    for side in (1, -1):
-        for i in chosen:
-            scales, draw = np.exp(rows[i]["log_scales"]), next(noise)
-            large = scales.max() > 0.01 * EXTENT
-            length = np.sqrt(((draw * scales) ** 2).sum()) if large else rate
-            new = np.log(scales / 1.6) if large else rows[i]["log_scales"]
-            mean = rows[i]["means"] + side * length * least(matrices[i])[1]
-            child = restatement.newborn(rows[i], means=mean, log_scales=new)
-            children.append(restatement.with_logit(child, logit(share * opacity(rows[i]))))
-    return [row for i, row in enumerate(rows) if i not in chosen] + children, len(chosen)
+
+    def half(i, side):
+        scales, draw = np.exp(rows[i]["log_scales"]), next(noise)
+        large = scales.max() > 0.01 * EXTENT
+        length = np.sqrt(((draw * scales) ** 2).sum()) if large else rate
+        new = np.log(scales / 1.6) if large else rows[i]["log_scales"]
+        mean = rows[i]["means"] + side * length * least(matrices[i])[1]
+        child = restatement.newborn(rows[i], means=mean, log_scales=new)
+        return restatement.with_logit(child, logit(share * opacity(rows[i])))
+
+    return restatement.halve_all(rows, chosen, half), len(chosen)
 
 
 def given(densifier, seed, count=60):

@@ -113,47 +113,35 @@ def test_targets_follow_the_curve_and_the_last_one_is_the_limit(kind):
     assert densifier.target(at(600, range(100))) == 100 + round(1000 * (1 - (8 / 8.5) ** 2))
 
 
-@pytest.mark.parametrize("kind", [ADC, Volumetric])
-def test_a_governed_round_ends_at_its_target(kind):
-    """One strictness multiplies every threshold; the event records it."""
-    densifier = kind(max_gaussians=450, cap="governor", stop=1200)
+@pytest.mark.parametrize(
+    "kind, own",
+    [(ADC, {}), *((Volumetric, {"governor_dimension": dimension}) for dimension in (1, 3))],
+)
+def test_a_governed_round_ends_at_its_target(kind, own):
+    """One factor gives all thresholds, and the event records it; the test counts what is above."""
+    densifier = kind(max_gaussians=450, cap="governor", stop=1200, **own)
     trainable, gradient = prepared(densifier, 2, count=300)
-    scales = np.array([row["log_scales"] for row in to_rows(trainable)])
+    sizes = np.exp(np.array([row["log_scales"] for row in to_rows(trainable)]))  # [N, 3]
     opacities = trainable.values.opacities.detach().numpy()
     ungoverned = densifier.forecast(at(900, trainable))
     event = densifier.refine(900, trainable, generator())
+    factor = event.strictness
+    assert factor != 1
+    assert event.cull == 1
     assert event.blocked_by_cap == max(0, ungoverned - event.after)
     assert event.target == 300 + round(150 * (1 - (2 / 3) ** 2))
     assert abs(event.after - event.target) <= 2
     assert event.balances()
-    assert event.cull == 1
-    cloned = (gradient >= 2e-4 * event.strictness) & (np.exp(scales.max(-1)) <= 0.01 * EXTENT)
-    assert event.cloned == cloned.sum()
-    assert event.pruned_opacity >= (opacities < 0.005).sum()
-    if kind is Volumetric:
-        assert event.volume_threshold == pytest.approx(0.03 * event.strictness**3)
-    json.loads(json.dumps(event.as_dict(), allow_nan=False))
-
-
-@pytest.mark.parametrize("dimension", [1, 3])
-def test_the_governor_scales_the_volume_threshold_or_its_size(dimension):
-    """One factor gives both thresholds; the test counts the Gaussians above them."""
-    densifier = Volumetric(
-        max_gaussians=450, cap="governor", stop=1200, governor_dimension=dimension
-    )
-    trainable, gradient = prepared(densifier, 2, count=300)
-    sizes = np.exp(np.array([row["log_scales"] for row in to_rows(trainable)]))  # [N, 3]
-    event = densifier.refine(900, trainable, generator())
-    factor = event.strictness
-    assert factor != 1
     over, large = gradient >= 2e-4 * factor, sizes.max(-1) > 0.01 * EXTENT
     assert (event.cloned, event.split_gradient) == ((over & ~large).sum(), (over & large).sum())
-    # radius of a sphere of volume V_th
-    size = np.cbrt(0.03 / (4 / 3 * np.pi)) * (factor if dimension == 3 else np.cbrt(factor))
-    geometric_mean = np.cbrt((sizes / np.where(over & large, 1.6, 1)[:, None]).prod(-1))
-    # A Gaussian and its clone have the same volume, and so have the children of a split.
-    assert event.split_volume == np.where(over, 2, 1)[geometric_mean > size].sum() > 0
-    assert abs(event.after - event.target) <= 2
+    assert event.pruned_opacity >= (opacities < 0.005).sum()
+    if own:  # the factor scales the volume threshold or its size
+        threshold = 0.03 * factor ** own["governor_dimension"]
+        assert event.volume_threshold == pytest.approx(threshold)
+        # A Gaussian and its clone have the same volume, and so have the children of a split.
+        volumes = 4 / 3 * np.pi * (sizes / np.where(over & large, 1.6, 1)[:, None]).prod(-1)
+        assert event.split_volume == np.where(over, 2, 1)[volumes > threshold].sum() > 0
+    json.loads(json.dumps(event.as_dict(), allow_nan=False))
 
 
 def faint_and_governed(count, target):

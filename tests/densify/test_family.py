@@ -21,8 +21,8 @@ from gsbench.densify import (
     Taming,
     Volumetric,
 )
-from gsbench.densify.base import faded, quantile, revised_logits
 from gsbench.densify.budget import Budgeted
+from gsbench.densify.formulas import faded, quantile, revised_logits
 from gsbench.densify.mcmc import shared_opacity, spread_out
 from gsbench.raster.base import Footprint
 from tests.densify.helpers import generator, rendered, trained

@@ -15,10 +15,9 @@ from tests.densify.helpers import (
     at,
     gathered,
     generator,
-    rendered,
     to_rows,
 )
-from tests.densify.restatement import logit, opacity
+from tests.densify.restatement import opacity
 from tests.densify.test_rounds import observe, prepared
 from tests.densify.test_scores import COUNT, Room, alphas, find_edges, over_mean, started
 from tests.gaussians.helpers import random_gaussians
@@ -31,18 +30,10 @@ def halves(rows, mean_gradient):
     the others by sqrt(1 - 0.2025).
     """
     chosen = [i for i in range(len(rows)) if mean_gradient[i] >= 0.0008]
-    children = []
-    for side in (1, -1):
-        for i in chosen:
-            scales = np.exp(rows[i]["log_scales"])
-            longest = int(np.argmax(scales))
-            axis = restatement.rotation(rows[i]["quaternions"]) @ np.eye(3)[longest]
-            new = scales * 0.7975**0.5
-            new[longest] = 0.55 * scales[longest]
-            mean = rows[i]["means"] + side * 1.35 * scales[longest] * axis
-            child = restatement.newborn(rows[i], means=mean, log_scales=np.log(new))
-            children.append(restatement.with_logit(child, logit(0.6 * opacity(rows[i]))))
-    return [row for i, row in enumerate(rows) if i not in chosen] + children
+    sizes = 1.35, 0.55, 0.7975**0.5
+    return restatement.halve_all(
+        rows, chosen, lambda i, side: restatement.half(rows[i], side, *sizes)
+    )
 
 
 @pytest.mark.parametrize("step", [600, 3100])
@@ -209,11 +200,6 @@ def begun(**options):
     return densifier, gaussians
 
 
-def seen(densifier, step):
-    nothing = torch.zeros(50, 2, dtype=torch.float64)
-    densifier.observe(step, rendered(nothing, absolute=nothing))
-
-
 def restated(densifier, logits, weight, soft):
     if not soft:
         return 3 * weight * (logits.mean() + 20) ** 2
@@ -338,19 +324,3 @@ def test_the_pressure_lasts_at_least_one_round():
     usual = GNS()
     assert (usual.pressure_interval, usual.pressure_time) == (50, 8000)
     assert [usual.in_first_part(step) for step in (15_999, 16_000)] == [True, False]
-
-
-def test_the_selection_continues_after_saving_and_loading():
-    densifier, gaussians = begun(max_gaussians=20)
-    for step in range(15_000, 15_200):
-        densifier.regularizer(gaussians)
-        seen(densifier, step)
-    twin, _ = begun(max_gaussians=20)
-    twin.load_state_dict(densifier.state_dict(), DensifyContext(4.0))
-    for step in range(15_200, 15_400):
-        first, second = (d.regularizer(gaussians) for d in (densifier, twin))
-        assert (first is None) == (second is None) == ((step - 1) % 50 != 0)
-        assert first is None or float(first) == float(second)
-        seen(densifier, step)
-        seen(twin, step)
-    assert twin.weight == densifier.weight != 2e-4

@@ -10,11 +10,10 @@ from torch.testing import assert_close
 from gsbench.densify import ADC, MCMC, MRNF, DensifyContext
 from gsbench.densify.mcmc import bounds
 from gsbench.densify.scores import draw
-from gsbench.raster.reference import ReferenceRasterizer
 from tests.densify import restatement
 from tests.densify.helpers import EXTENT, assert_same, at, generator, to_rows, trained, with_moments
 from tests.densify.restatement import logit, opacity
-from tests.densify.test_scores import BLACK, COUNT, Room, alphas, find_edges, over_median, started
+from tests.densify.test_scores import COUNT, Room, find_edges, over_median, started
 from tests.gaussians.helpers import random_gaussians
 
 
@@ -95,29 +94,11 @@ def scored(values):
     The factor is 1 + 0.25 times the mean edge score divided by its median.
     """
     room, weight, edge = Room(), np.zeros(COUNT), np.zeros(COUNT)
-    for view, camera in enumerate(room.cameras):
-        image = ReferenceRasterizer().render(values, camera, 0, BLACK).image.detach()
+    for view, image, blended in room.shown(values):
         error = room.dissimilarity(view, image).numpy()
-        blended = alphas(values, camera)
         weight = np.maximum(weight, (blended * error / error.mean()).sum((1, 2)))
         edge += over_median((blended * find_edges(room.images[view])).sum((1, 2))) / 3
     return weight, 1 + 0.25 * over_median(edge)
-
-
-def half(row, side):
-    """A child, moved by half a standard deviation along the longest axis to one ``side``.
-
-    The scale of that axis is halved; the other scales are multiplied by 0.85.
-    """
-    scales = np.exp(row["log_scales"])
-    longest = int(np.argmax(scales))
-    axis = restatement.rotation(row["quaternions"])[:, longest]
-    new = scales * 0.85
-    new[longest] = 0.5 * scales[longest]
-    child = restatement.newborn(
-        row, means=row["means"] + side * 0.5 * scales[longest] * axis, log_scales=np.log(new)
-    )
-    return restatement.with_logit(child, logit(0.6 * opacity(row)))
 
 
 def decayed(row, left):
@@ -168,7 +149,12 @@ def test_a_round_of_mrnf_matches_the_restatement(step, room):
     assert (event.pruned_opacity, event.split_gradient) == (7, split.sum())
     assert split.sum() == 7 + left
     assert event.blocked_by_cap == (wanted - 7 - left if step < 15_000 else 0)
-    children = [half(rows[i], side) for side in (1, -1) for i in np.nonzero(split)[0]]
+    # a child is half a standard deviation away
+    children = [
+        restatement.half(rows[i], side, 0.5, 0.5, 0.85)
+        for side in (1, -1)
+        for i in np.nonzero(split)[0]
+    ]
     kept = [row for i, row in enumerate(rows) if not split[i] and not gone[i]]
     assert_same(trainable, [decayed(row, 1 - step / 30_000) for row in kept + children])
     assert event.balances()

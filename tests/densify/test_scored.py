@@ -6,12 +6,10 @@ import torch
 
 from gsbench.densify import FastGS
 from gsbench.densify.scores import draw
-from gsbench.raster.reference import ReferenceRasterizer
-from gsbench.train.loss import torch_photometric_loss
 from tests.densify.helpers import EXTENT, assert_same, at, gathered, generator, to_rows
 from tests.densify.restatement import opacity, size, with_logit
 from tests.densify.test_adc_variants import absgs_growth
-from tests.densify.test_scores import BLACK, COUNT, Room, alphas, started
+from tests.densify.test_scores import COUNT, Room, started
 
 
 def counted(values, threshold):
@@ -21,13 +19,12 @@ def counted(values, threshold):
     number, scaled to [0, 1].
     """
     room, total, weighted = Room(), np.zeros(COUNT), np.zeros(COUNT)
-    for view, camera in enumerate(room.cameras):
-        image = ReferenceRasterizer().render(values, camera, 0, BLACK).image.detach()
+    for view, image, blended in room.shown(values):
         error = np.abs(image.numpy() - room.images[view].numpy() / 255).mean(-1)
         bad = (error - error.min()) / (error.max() - error.min()) > threshold
-        count = ((alphas(values, camera) > 0) & bad).sum((1, 2))
+        count = ((blended > 0) & bad).sum((1, 2))
         total += count
-        weighted += count * float(torch_photometric_loss(image, room.images[view])[0])
+        weighted += count * float(room.loss(view, image))
     return total // 3, (weighted - weighted.min()) / (weighted.max() - weighted.min())
 
 

@@ -54,6 +54,12 @@ class Room:
     def render(self, index, gaussians, step):
         return ReferenceRasterizer().render(gaussians, self.cameras[index], 0, BLACK)
 
+    def shown(self, gaussians):
+        """For each view its number, the render, and alpha T of every Gaussian, [N, H, W]."""
+        for view, camera in enumerate(self.cameras):
+            image = self.render(view, gaussians, 0).image.detach()
+            yield view, image, alphas(gaussians, camera)
+
     def dissimilarity(self, index, image):
         return (1 - ssim_map(image, self.images[index].to(image) / 255).mean(0)).clamp_min(0)
 

@@ -17,7 +17,7 @@ from gsbench.densify import (
     Refinement,
     Volumetric,
 )
-from gsbench.densify.base import standard_normal
+from gsbench.densify.formulas import standard_normal
 from tests.densify.helpers import generator, trained
 from tests.gaussians.helpers import random_gaussians
 

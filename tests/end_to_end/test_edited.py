@@ -37,7 +37,7 @@ def test_a_trial_is_trained_again_after_an_edit_of_the_loss(gsbench, tmp_path):
 
     train()
     first = results()
-    assert first["code"]["rooms"]["eval/ssim.py"]
+    assert first["code"]["packages"]["eval/ssim.py"]
     loss = copy / "train/trainer.py"
     text = loss.read_text()
     assert text.count("PhotometricLoss(options.ssim_weight,") == 1

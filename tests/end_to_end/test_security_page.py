@@ -1,22 +1,29 @@
 """docs/security.md, line by line: what each verb may run, and which edits of files are noticed."""
 
 import json
+import os
 import re
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 from gsbench.cli import run
 from gsbench.errors import InputError
 from gsbench.runs.store import read_manifest
 from gsbench.runs.trial_folder import TrialFolder
+from gsbench.system.jit import cache_base
 from gsbench.verbs import VERBS
 from gsbench.view.trials import find_trial, model_file
 from tests.end_to_end.conftest import FINISHED
+from tests.end_to_end.test_hydra import TINY
+from tests.helpers import write
 
 PAGE = Path(__file__).parents[2] / "docs/security.md"
+CLAIMS = PAGE.parents[1] / "conf/claims/volumetric.yaml"
 pytestmark = pytest.mark.slow
 
 
@@ -43,28 +50,153 @@ def place(runs, monkeypatch, tmp_path):
     return runs
 
 
-def test_verbs_that_run_nothing_start_no_program(place, monkeypatch):
-    assert run(["export", "--results", FINISHED, "--out", "a.zip"]) == 0
+# Imported by each Python below: it writes down which programs start, who is called, and which files
+# are written.
+WATCH = """
+import os, sys
+seen = os.open(os.environ["WATCHED"], os.O_WRONLY | os.O_APPEND | os.O_CREAT)
+def watch(event, words):
+    if event in ("subprocess.Popen", "os.posix_spawn", "os.exec", "os.system"):
+        line = "run " + os.path.basename(os.fsdecode(words[0] or words[1][0]))
+    elif event == "socket.connect" and not str(words[1][0]).startswith(("127.", "/")):
+        line = f"call {words[1]}"
+    elif event == "open" and isinstance(words[0], str | bytes) and (words[2] or 0) & os.O_ACCMODE:
+        line = "write " + os.path.abspath(os.fsdecode(words[0]))
+    else:
+        return
+    os.write(seen, (line + "\\n").encode())
+sys.addaudithook(watch)
+"""
+SECRET = "do-not-tell-it"
+ON_GPU = {"nvidia-smi"} | ({"cc", "gcc", "clang"} if torch.cuda.is_available() else set())
+COMMIT = {"git", *ON_GPU}  # of gsbench's checkout
+CLIENT = {"uname", *COMMIT}  # MLflow's asks for the machine
+TRIAL = f"{FINISHED}:courtyard:adc:0"
+GATE = ["gate", "tiny.zip", "--metric", "psnr", "--least", "5", *TINY]
+RENDERS = "runs/finished/courtyard/random-adc/*/"
+# By the row's first cell: its commands, the programs that they start, and where its permissions
+# are tested.
+VERB_ROWS = {
+    "trials, `ablate`": (
+        [["-m", *TINY, "name=tiny", "seed=0,1"]],
+        COMMIT,
+        "config/test_trust.py::test_code_that_a_file_names_is_not_run",
+    ),
+    "`check`, `ledger`, `retry`": (
+        [["check", str(CLAIMS), "--dry-run"], ["retry", FINISHED]],
+        COMMIT,
+        "config/test_permissions.py::test_no_file_of_a_stranger_decides_what_runs_and_where_results_go",
+    ),
+    "`check --from`": ([["check", "--from", "a.zip", str(CLAIMS)]], set(), ""),
+    "`gate`": ([["export", "--results", "tiny"], GATE], COMMIT, ""),
+    "`bisect`": (
+        [],
+        set(),
+        "system/test_work_trees.py::test_neither_hooks_nor_filters_of_the_repository_run",
+    ),
+    "`tables`, `report`, `explain`, `plan`, `pool`, `site`, `vote`": (
+        [
+            ["tables", FINISHED],
+            ["report", FINISHED],
+            ["explain", f"{FINISHED}:courtyard:psnr:adc"],
+            ["plan", FINISHED],
+            ["pool", "a.zip", "--arm", "volumetric"],
+            ["site", "a.zip", "--out", "site"],
+            ["vote", "make", FINISHED, "--arms", "adc,volumetric", "--out", "vote"],
+        ],
+        set(),
+        "",
+    ),
+    "`status`": (
+        [["status", FINISHED]],
+        set(),
+        "launch/test_states.py::test_the_queue_is_asked_for_the_users_and_is_unknown_if_slurm_fails",
+    ),
+    "`evaluate`": (
+        [["evaluate", f"{RENDERS}renders", "--truth", f"{RENDERS}ground_truth", "eval.lpips=[]"]],
+        ON_GPU,
+        "",
+    ),
+    "`export`": ([["export", TRIAL], ["export", TRIAL, "--out", "m.html"]], {"npx"}, ""),
+    "`view`": ([["view", TRIAL, "--port", "0"]], ON_GPU, ""),
+    "`sync`, `ui`": (
+        [["sync", FINISHED]],
+        CLIENT,
+        "tracking/test_address.py::test_sync_sends_nothing_to_a_tracker_that_was_not_typed",
+    ),
+    "`fetch`": (
+        [["fetch", "--list"]],
+        set(),
+        "datasets/test_fetch.py::test_names_that_lead_out_of_the_folder_are_refused",
+    ),
+    "`bench`, `doctor`": (
+        [["bench", "--raster", "reference", "--size", "32x24", "--count", "9"], ["doctor"]],
+        COMMIT,
+        "",
+    ),
+}
 
-    def start(*words, **how):
-        raise AssertionError(f"a program was started: {words}")
 
-    monkeypatch.setattr(subprocess, "Popen", start)
-    scene = f"{FINISHED}:courtyard"
-    commands = {
-        "tables": [FINISHED],
-        "report": [FINISHED],
-        "explain": [f"{scene}:psnr:adc"],
-        "status": [FINISHED],
-        "plan": [FINISHED],
-        "pool": ["a.zip", "--arm", "volumetric"],
-        "site": ["a.zip", "--out", "site"],
-        "vote": ["make", FINISHED, "--arms", "adc,volumetric", "--out", "vote"],
+def seen_of(words, place, environment):
+    """What a command is seen to do, as lines of `WATCH`; a server is ended once it says where."""
+    watched = place.parent / "watched"
+    watched.unlink(missing_ok=True)
+    command = [sys.executable, "-P", "-c", "from gsbench.cli import main; main()", *words]
+    with subprocess.Popen(
+        command,
+        cwd=place.parent,
+        env=environment | {"WATCHED": str(watched)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    ) as program:
+        said = ""
+        for line in program.stdout:
+            said += line
+            if line.startswith("http://"):
+                program.terminate()
+    assert program.returncode in (0, 1, 2, 143), said
+    assert "Traceback" not in said
+    assert SECRET not in said
+    return set(watched.read_text().splitlines()) if watched.exists() else set()
+
+
+@pytest.mark.parametrize("row", VERB_ROWS)
+def test_a_verb_runs_and_writes_what_the_page_says(row, place, environment, tmp_path):
+    commands, programs, elsewhere = VERB_ROWS[row]
+    if elsewhere:
+        file, _, name = elsewhere.partition("::")
+        assert f"def {name}(" in (PAGE.parents[1] / "tests" / file).read_text()
+    hook = write(tmp_path / "hook" / "sitecustomize.py", WATCH).parent
+    write(tmp_path / "bin" / "npx", "#!/bin/sh\nexit 1\n").chmod(0o755)
+    own = environment | {
+        "GSBENCH_RUNS": str(place),
+        "PATH": f"{tmp_path / 'bin'}{os.pathsep}{os.environ['PATH']}",
+        "PYTHONPATH": os.pathsep.join([str(hook), str(PAGE.parents[1] / "src")]),
+        "TMPDIR": str(tmp_path / "scratch"),
+        "AWS_SECRET_ACCESS_KEY": SECRET,
     }
-    (nothing,) = [row[0] for row in RUNS if row[0].startswith("`tables`")]
-    assert re.findall(r"`(\w+)`", nothing) == [verb for verb in commands if verb != "status"]
-    for verb, words in commands.items():
-        assert run([verb, *words]) in (0, 2), verb
+    (tmp_path / "scratch").mkdir()
+    assert run(["export", "--results", FINISHED, "--out", "a.zip"]) == 0
+    if row == "`gate`":
+        seen_of(VERB_ROWS["trials, `ablate`"][0][0], place, own)
+    for words in commands:
+        words = [str(next(tmp_path.glob(word))) if "*" in word else word for word in words]
+        seen = seen_of(words, place, own)
+        started = {line.removeprefix("run ") for line in seen if line.startswith("run ")}
+        # gsbench's own child processes are not named in the page
+        assert started <= programs | {Path(sys.executable).name}, words
+        assert not [line for line in seen if line.startswith("call ")], words
+        strange = [line for line in seen if line.startswith("write ")]
+        allowed = (str(tmp_path), "/dev/", "/proc/self/", str(cache_base()))
+        assert not [line for line in strange if not line[6:].startswith(allowed)], words
+    for file in tmp_path.rglob("*"):
+        if file.is_file() and file.stat().st_size < 1 << 22:
+            assert SECRET.encode() not in file.read_bytes(), file
+
+
+def test_every_row_of_verbs_has_a_test():
+    assert [row[0] for row in RUNS] == [*VERB_ROWS]
 
 
 # ---- edits

@@ -1,6 +1,7 @@
 """After an edit of a densifier's helper, tables show the newest code and name the older trials."""
 
 import json
+import os
 import shutil
 from pathlib import Path
 from shlex import split
@@ -65,6 +66,12 @@ def test_trials_of_an_edited_densifier_are_not_averaged_with_earlier_ones(
     shown = ask("tables edited")
     assert "edited since" not in shown
     assert "edited: 2 trials of random-mine made by earlier versions of helper: " in shown
+    # a copy without its times, where the module is not: the same version counts
+    copied = shutil.copytree(tmp_path / "runs", tmp_path / "elsewhere" / "runs")
+    for trial in copied.glob("edited/*/*/*/results.json"):
+        os.utime(trial, (9e9, 9e9) if trial.parent.name.endswith(("0", "1")) else (1, 1))
+    there = gsbench("tables edited", cwd=copied.parent, GSBENCH_RUNS=str(copied)).stdout
+    assert there == shown.partition("left out: ")[0]
     listed = json.loads(ask("status edited --json"))
     states = {Path(trial["folder"]).name.partition("-")[2]: trial["state"] for trial in listed}
     assert states == {"seed0": "superseded", "seed1": "superseded", "seed2": "done"}

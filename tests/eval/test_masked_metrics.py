@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 import torch
-from skimage.metrics import structural_similarity
 
 from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.lpips import load_lpips
 from gsbench.eval.protocol import PAPER, STANDARD
+from tests.eval.reference import ssim_map
 
 HEIGHT, WIDTH = 64, 80
 
@@ -36,23 +36,11 @@ def test_masked_psnr_is_over_the_pixels_that_count(pair):
     assert found == pytest.approx(-10 * np.log10(squared.mean()), abs=1e-6)
 
 
-@pytest.mark.parametrize("protocol, inside", [(STANDARD, True), (PAPER, False)])
-def test_masked_ssim_is_the_mean_of_scikit_images_map_where_pixels_count(pair, protocol, inside):
+@pytest.mark.parametrize("protocol, beyond", [(STANDARD, 0), (PAPER, 5)])
+def test_masked_ssim_is_the_mean_of_scikit_images_map_where_pixels_count(pair, protocol, beyond):
     render, truth, mask = pair
-    shown = np.where(mask[..., None], render, truth) / 255
-    border = 0 if inside else 5
-    images = [np.pad(x, ((border, border), (border, border), (0, 0))) for x in (shown, truth / 255)]
-    _, full = structural_similarity(
-        *images,
-        gaussian_weights=True,
-        sigma=1.5,
-        use_sample_covariance=False,
-        channel_axis=-1,
-        data_range=1,
-        full=True,
-    )
-    full = full[5:-5, 5:-5]
-    counts = mask[5:-5, 5:-5] if inside else mask
+    full = ssim_map(np.where(mask[..., None], render, truth) / 255, truth / 255, beyond)
+    counts = mask if beyond else mask[5:-5, 5:-5]
     found = evaluator(protocol).evaluate_view(render, truth, mask)["ssim"]
     assert found == pytest.approx(full[counts].mean(), abs=1e-9)
 

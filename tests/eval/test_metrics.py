@@ -1,4 +1,4 @@
-"""PSNR, SSIM and FLIP against scikit-image, brute force and values calculated by hand."""
+"""PSNR, SSIM and FLIP against scikit-image and values calculated by hand."""
 
 import math
 import re
@@ -6,10 +6,10 @@ import re
 import numpy as np
 import pytest
 import torch
-from skimage.metrics import structural_similarity
 
 from gsbench.eval.metrics import flip, flip_map, psnr
 from gsbench.eval.ssim import ssim
+from tests.eval.reference import ssim_map
 
 
 def distorted_pair(height=40, width=53, seed=0):
@@ -18,31 +18,6 @@ def distorted_pair(height=40, width=53, seed=0):
     rows, columns = np.mgrid[0:height, 0:width]
     image = 0.5 + 0.4 * np.sin(rows[..., None] / 5 + columns[..., None] / 7 + rng.uniform(0, 6, 3))
     return image, np.clip(image + rng.normal(0, 0.08, image.shape), 0, 1)
-
-
-def brute_force_ssim(x, y):
-    """Zero-padded SSIM of [H, W, 3], pixel by pixel, by its definition in a weighted window."""
-    offsets = np.arange(-5, 6)
-    window = np.exp(-(offsets[:, None] ** 2 + offsets[None, :] ** 2) / (2 * 1.5**2))
-    window /= window.sum()
-    height, width, channels = x.shape
-    x, y = (np.pad(image, ((5, 5), (5, 5), (0, 0))) for image in (x, y))
-    values = []
-    for row in range(height):
-        for column in range(width):
-            for channel in range(channels):
-                a = x[row : row + 11, column : column + 11, channel]
-                b = y[row : row + 11, column : column + 11, channel]
-                mean_a, mean_b = (window * a).sum(), (window * b).sum()
-                var_a = (window * (a - mean_a) ** 2).sum()
-                var_b = (window * (b - mean_b) ** 2).sum()
-                cov = (window * (a - mean_a) * (b - mean_b)).sum()
-                values.append(
-                    (2 * mean_a * mean_b + 1e-4)
-                    * (2 * cov + 9e-4)
-                    / ((mean_a**2 + mean_b**2 + 1e-4) * (var_a + var_b + 9e-4))
-                )
-    return float(np.mean(values))
 
 
 def test_psnr_is_one_value_per_image_over_all_channels():
@@ -62,33 +37,14 @@ def test_psnr_of_identical_images_is_infinite():
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_ssim_valid_matches_scikit_image(seed):
+@pytest.mark.parametrize("padding, beyond", [("valid", 0), ("zero", 5)])
+def test_ssim_matches_scikit_image(seed, padding, beyond):
     x, y = distorted_pair(seed=seed)
-    expected = structural_similarity(
-        x,
-        y,
-        channel_axis=2,
-        data_range=1.0,
-        gaussian_weights=True,
-        sigma=1.5,
-        use_sample_covariance=False,
-    )
-    assert float(ssim(torch.tensor(y), torch.tensor(x), "valid")) == pytest.approx(
-        expected, abs=1e-9
-    )
-    assert float(ssim(torch.tensor(y).float(), torch.tensor(x).float(), "valid")) == pytest.approx(
-        expected, abs=1e-5
-    )
-
-
-def test_ssim_zero_padding_matches_brute_force():
-    x, y = distorted_pair(14, 17)
-    expected = brute_force_ssim(x, y)
-    assert float(ssim(torch.tensor(y), torch.tensor(x), "zero")) == pytest.approx(
-        expected, abs=1e-10
-    )
-    # the two conventions differ
-    assert abs(expected - float(ssim(torch.tensor(y), torch.tensor(x), "valid"))) > 1e-3
+    expected, other = (ssim_map(y, x, around).mean() for around in (beyond, 5 - beyond))
+    x, y = torch.tensor(x), torch.tensor(y)
+    assert float(ssim(y, x, padding)) == pytest.approx(expected, abs=1e-9)
+    assert float(ssim(y.float(), x.float(), padding)) == pytest.approx(expected, abs=1e-5)
+    assert abs(expected - other) > 1e-3  # the two conventions differ
 
 
 def test_a_batch_gives_the_values_of_its_images():

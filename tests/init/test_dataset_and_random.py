@@ -79,15 +79,14 @@ def test_random_draws_points_and_colours_around_the_training_cameras_alone(tmp_p
 
 
 @pytest.mark.parametrize("seen_by", [1, 3])
-def test_carved_keeps_points_in_view_of_enough_training_cameras(courtyard, tmp_path, seen_by):
+def test_carved_keeps_points_in_view_of_enough_training_cameras(courtyard, seen_by):
     """Checked with COLMAP's projection, one point and one image at a time."""
     options = {"count": 300, "size": 2.0, "seed": 3}
-    Random(**options).run(courtyard, tmp_path / "random")
-    report = Carved(**options, seen_by=seen_by).run(courtyard, tmp_path / "carved")
     model = pycolmap.Reconstruction(courtyard.model)
     images = [image for image in model.images.values() if image.name in courtyard.train_names]
-    whole, expected = read_cloud(tmp_path / "random" / MODEL_FOLDER).points, []
-    for point in whole:
+    whole, carved = Random(**options), Carved(**options, seen_by=seen_by)
+    expected = []
+    for point in whole.cloud(courtyard, model).points:
         pixels = [(image.project_point(point), model.cameras[image.camera_id]) for image in images]
         views = sum(
             pixel is not None and 0 <= pixel[0] < camera.width and 0 <= pixel[1] < camera.height
@@ -95,13 +94,10 @@ def test_carved_keeps_points_in_view_of_enough_training_cameras(courtyard, tmp_p
         )
         if views >= seen_by:
             expected.append(point)
-    assert_array_equal(read_cloud(tmp_path / "carved" / MODEL_FOLDER).points, expected)
-    assert 0 < len(expected) == report.num_points < 300
-
-
-def test_carved_refuses_a_cloud_without_points_in_view(courtyard, tmp_path):
+    assert_array_equal(carved.cloud(courtyard, model).points, expected)
+    assert 0 < len(expected) < 300
     with refusal(r"none is in view of 9999 training cameras"):
-        Carved(count=10, seen_by=9999).run(courtyard, tmp_path)
+        Carved(count=10, seen_by=9999).cloud(courtyard, model)
 
 
 def test_shifts_of_copies_are_proportional_to_the_neighbours_distance(tmp_path):

@@ -1,6 +1,5 @@
 """Points that do not depend on test photographs (init.points_from=train)."""
 
-import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +8,7 @@ import pytest
 from numpy.testing import assert_allclose
 from PIL import Image
 
-from gsbench.init import MODEL_FOLDER, Dataset, Sfm, SiftKornia, read_cloud
+from gsbench.init import MODEL_FOLDER, Dataset, Sfm, SiftKornia
 from gsbench.init.base import REPORT_FILE
 from gsbench.runs.keys import options_of
 from gsbench.scene.colmap import read_model
@@ -17,16 +16,11 @@ from tests.helpers import read_json
 from tests.init.models import add_point
 
 
-def quick_sfm(**options):
-    """SIFT without enlarged images and with few features, to be fast."""
-    return Sfm(**({"threads": 1, "first_octave": 0, "max_num_features": 1500} | options))
-
-
 @pytest.fixture(scope="module")
 def with_points(courtyard, tmp_path_factory):
     """The courtyard with points of all views, and image ids in the reverse order of names."""
     folder = tmp_path_factory.mktemp("points")
-    quick_sfm().run(courtyard, folder)
+    Sfm(threads=1, first_octave=0, max_num_features=1500).run(courtyard, folder)
     model, turned = read_model(folder / MODEL_FOLDER), pycolmap.Reconstruction()
     camera = next(iter(model.cameras.values()))
     turned.add_camera_with_trivial_rig(camera)
@@ -52,41 +46,18 @@ def seen_by(model):
     ]
 
 
-def poses(folder):
-    model = read_model(folder / MODEL_FOLDER)
-    return {
-        image.name: image.cam_from_world().matrix().tobytes() for image in model.images.values()
-    }
-
-
-@pytest.mark.slow
-def test_dataset_keeps_the_points_that_two_training_views_see(with_points, tmp_path):
-    before = read_model(with_points.model)
-    train, test = set(with_points.train_names), set(with_points.test_names)
-    wanted = sorted(  # as a list: features of two orientations may make two points at one place
-        point.xyz.tobytes()
-        for point, names in zip(before.points3D.values(), seen_by(before), strict=True)
-        if len(names & train) >= 2
-    )
-    assert len(wanted) < before.num_points3D(), "else nothing is tested"
-    report = Dataset(points_from="train").run(with_points, tmp_path)
-    after = read_model(tmp_path / MODEL_FOLDER)
-    assert sorted(point.xyz.tobytes() for point in after.points3D.values()) == wanted
-    assert not any(names & test for names in seen_by(after))
-    assert all(len(names) >= 2 for names in seen_by(after))
-    assert len(after.images) == len(before.images), "test views keep their cameras"
-    points = report.training_points
-    kept, total = len(wanted), before.num_points3D()
+def test_points_and_colours_come_from_training_photographs(with_points, tmp_path):
+    """Each colour is the mean of the photographs at the observations, interpolated here again."""
+    total = read_model(with_points.model).num_points3D()
+    points = Dataset(points_from="train").run(with_points, tmp_path).training_points
+    model = read_model(tmp_path / MODEL_FOLDER)
+    kept = model.num_points3D()
     assert (points.choice, points.kept, points.total) == ("train", kept, total)
+    assert kept < total
     assert points.removed == pytest.approx(1 - kept / total)
     assert read_json(tmp_path / REPORT_FILE)["training_points"]["removed"] == points.removed
+    assert not any(names & {*with_points.test_names} for names in seen_by(model))
     assert not (tmp_path / "work").exists()
-
-
-def test_colours_come_from_training_photographs(with_points, tmp_path):
-    """Each colour is the mean of the photographs at the observations, interpolated here again."""
-    Dataset(points_from="train").run(with_points, tmp_path)
-    model = read_model(tmp_path / MODEL_FOLDER)
     pictures = {
         name: np.asarray(Image.open(with_points.images / name)).astype(float)
         for name in with_points.image_names
@@ -103,38 +74,6 @@ def test_colours_come_from_training_photographs(with_points, tmp_path):
                 + dy * ((1 - dx) * picture[row + 1, column] + dx * picture[row + 1, column + 1])
             )
         assert_allclose(point.color, np.mean(samples, axis=0), atol=1.0)
-
-
-def with_noise(capture, folder):
-    """The capture with its test photographs replaced by noise."""
-    shutil.copytree(capture.images, folder)
-    rng = np.random.default_rng(0)
-    for name in capture.test_names:
-        width, height = Image.open(folder / name).size
-        noise = rng.integers(0, 256, (height, width, 3), dtype=np.uint8)
-        Image.fromarray(noise).save(folder / name)
-    return replace(capture, images=folder)
-
-
-MAKERS = {
-    "sfm": quick_sfm(points_from="train"),
-    "sfm on all": quick_sfm(points_from="all"),  # this one must see the noise
-    # takes the path of dim without weights
-    "sift_kornia": SiftKornia(points_from="train", max_keypoints=1024, threads=1),
-    "dataset": Dataset(points_from="train"),
-}
-
-
-@pytest.mark.parametrize("name", MAKERS)
-@pytest.mark.slow
-def test_the_cloud_does_not_depend_on_test_photographs(with_points, tmp_path, name):
-    clouds = []
-    for capture, place in ((with_points, "a"), (with_noise(with_points, tmp_path / "noise"), "b")):
-        MAKERS[name].run(capture, tmp_path / place)
-        cloud = read_cloud(tmp_path / place / MODEL_FOLDER)
-        assert len(cloud) > 100
-        clouds.append((cloud.points.tobytes(), cloud.colors.tobytes(), poses(tmp_path / place)))
-    assert (clouds[0] == clouds[1]) == (name != "sfm on all")
 
 
 @pytest.mark.slow

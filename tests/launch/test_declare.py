@@ -7,7 +7,9 @@ from shlex import split
 
 import pytest
 
+from gsbench.analysis.comparison import compare
 from gsbench.analysis.declaration import active_declaration
+from gsbench.analysis.judgement import judge
 from gsbench.analysis.results import load_experiment
 from gsbench.config.compose import Trial
 from gsbench.launch.record import add_to_plan, declare, declare_questions, declared_metrics
@@ -15,6 +17,9 @@ from gsbench.runs.experiments import Declaration, Question, declared_now, read_d
 from tests.end_to_end.conftest import SMALL
 from tests.helpers import refusal, write
 from tests.trials import bare_trial as trial
+from tests.trials import write_trial
+
+ARMS = ("adc", "mine")
 
 # later words win: a trial of seconds
 TINY = SMALL + split(
@@ -179,3 +184,32 @@ def test_results_keep_what_was_declared_and_a_change_computes_nothing(tmp_path, 
     again = load_experiment(tmp_path, "again")
     found = active_declaration(again)
     assert not found.standing([], again.trials).beforehand
+
+
+@pytest.mark.parametrize("in_claims", [False, True])
+def test_results_that_a_wrong_clock_dated_later_than_their_declaration_were_seen(
+    tmp_path, caplog, in_claims
+):
+    trials = [declaring(tmp_path, "psnr", seed, name=arm) for arm in ARMS for seed in range(3)]
+    for number, one in enumerate(trials):
+        write_trial(
+            tmp_path,
+            *(one.values["seed"], one.folder.name[:8]),
+            **{"experiment": "exp", "scene": "courtyard", "init": "a_init"},
+            **{"densify": one.values["densify"]["name"], "psnr": 20.0 + number},
+            _measured="2037-01-01T00:00:00Z",
+        )
+    keys = tuple(dict.fromkeys(one.files.key for one in trials))
+    question = Question(metric="psnr", scenes={"courtyard": keys}, seeds=(0, 1, 2), name="claim")
+    with caplog.at_level(logging.WARNING):
+        if in_claims:
+            asked = declare_questions(tmp_path / "exp", declared_now(questions=(question,)))
+        else:
+            declare(trials)
+    assert "results of a_init-adc, a_init-mine are dated later than now" in caplog.text
+    experiment = load_experiment(tmp_path, "exp")
+    if in_claims:
+        assert len(judge(experiment.trials, asked)[0].seen) == 3
+    else:
+        (sentence,) = compare(experiment).sentences
+        assert "declared, but only after 3 trials of the arm had been measured" in sentence

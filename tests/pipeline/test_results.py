@@ -115,7 +115,7 @@ def test_results_combine_the_results_of_the_steps(made):
     assert found.hashes["data"] == "0abc"
     assert (found.events["cloned"], found.events["pruned_size"], found.events["added"]) == (5, 1, 0)
     assert (found.code.commit, found.code.edited) == ("abc", True)
-    assert found.code.rooms == {"init": "1", "train": "2"}
+    assert found.code.packages == {"init": "1", "train": "2"}
     assert found.code.stages == {stage.name: stage.version for stage in STAGES}
 
 

@@ -1,8 +1,6 @@
 """Tests of what gsbench's own executors promise beyond the contract, one function per promise."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from collections import namedtuple
 
 import pytest
 import torch
@@ -16,14 +14,9 @@ from tests.gaussians.helpers import leaves as of_gaussians
 BLACK = torch.zeros(3)
 
 
-@dataclass(frozen=True)
-class Subject:
-    """An executor, and scenes of two sizes that it renders quickly."""
-
-    make: Callable[[], Any]
-    small: Case
-    large: Case
-    needle_limit: float  # largest error, as a fraction of the largest gradient of a needle
+# An executor, scenes of two sizes that it renders quickly, and the largest error of a needle as a
+# fraction of its largest gradient.
+Subject = namedtuple("Subject", "make small large needle_limit")
 
 
 def bits(output, gradients):

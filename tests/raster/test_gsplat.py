@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from gsbench.raster.contract import Case, departures, render_with_gradients
-from gsbench.raster.gsplat import GsplatRasterizer, _DeviceCamera, _reaches_image, _square_radii
+from gsbench.raster.gsplat import GsplatRasterizer, _reaches_image, _square_radii
 from gsbench.raster.reference import ReferenceRasterizer, project, tile_rectangles
 from tests.gaussians.helpers import front_camera, random_gaussians
 from tests.gaussians.helpers import leaves as of_gaussians
@@ -175,16 +175,3 @@ def test_a_square_that_only_touches_the_image_does_not_reach_it():
     radii = torch.tensor([3, 3, 3, 3, 3, 3, 3, 3, 0])
     expected = [False, True, False, True, False, True, False, True, False]
     assert _reaches_image(means, radii, 64, 48).tolist() == expected
-
-
-def test_the_uploaded_camera_projects_points_to_pixels():
-    camera = front_camera(64, 48, (3.0, -2.0))
-    point = torch.tensor([0.3, -0.2, 4.0], dtype=torch.float64)
-    on_device = _DeviceCamera.of(camera, point)
-    pixel = on_device.intrinsics[0] @ (on_device.view[0] @ torch.cat([point, torch.ones(1)]))[:3]
-    expected = camera.rotation @ point.numpy() + camera.translation
-    assert float(pixel[0] / pixel[2]) == pytest.approx(
-        camera.fx * expected[0] / expected[2] + camera.cx
-    )
-    assert on_device.center.tolist() == pytest.approx(camera.center.tolist())
-    assert on_device.half_size.tolist() == [32, 24]

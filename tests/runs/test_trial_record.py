@@ -28,6 +28,12 @@ def test_only_results_of_renders_may_lack_the_number_of_gaussians():
             record(evaluated_from=evaluated_from, num_gaussians=None)
 
 
+@pytest.mark.parametrize("key", ["packages", "rooms"])  # the second in early files
+def test_the_states_of_packages_are_read_by_either_name(key):
+    code = record(code={key: {"train": "a" * 16}}).code
+    assert code.to_json() == {"packages": {"train": "a" * 16}}
+
+
 def test_unfinished_results_are_distinguished_from_damaged_ones():
     with pytest.raises(UnfinishedError, match="is unfinished, its status is 'running'"):
         record(status="running", seed="0")

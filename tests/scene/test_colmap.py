@@ -16,7 +16,8 @@ from gsbench.scene.colmap import (
     read_reference,
     write_model,
 )
-from gsbench.scene.colmap_files import _MODELS, ModelChecks, check_model
+from gsbench.scene.colmap_checks import MODELS, ModelChecks
+from gsbench.scene.colmap_files import check_model
 from gsbench.scene.readers import read_colmap, read_photos
 from gsbench.scene.types import Camera
 from tests.helpers import refusal
@@ -139,8 +140,8 @@ def test_camera_models_are_those_of_colmap():
     """Model numbers and parameter counts are COLMAP's, and focal lengths come first."""
     known = {name: int(number) for name, number in pycolmap.CameraModelId.__members__.items()}
     known.pop("INVALID")
-    assert {name: number for number, (name, _) in _MODELS.items()} == known
-    for name, length in _MODELS.values():
+    assert {name: number for number, (name, _) in MODELS.items()} == known
+    for name, length in MODELS.values():
         camera = pycolmap.Camera.create_from_model_name(1, name, 50.0, 40, 30)
         assert len(camera.params) == length
         focal = list(camera.focal_length_idxs()) or [0, 1]  # EQUIRECTANGULAR has its size
@@ -227,7 +228,9 @@ def test_each_file_of_a_model_with_rigs_is_checked_to_its_end(rigs, stem):
     check_model(rigs)
     (file,) = rigs.glob(f"{stem}.*")
     whole = file.read_bytes()
-    for torn in (whole[:-1], whole + b"\0") if file.suffix == ".bin" else (b"1 2", whole + b"\xff"):
+    many = struct.pack("<Q", 2**60) + whole[8:]  # a count that the file cannot hold
+    binary = file.suffix == ".bin"
+    for torn in (whole[:-1], whole + b"\0", many) if binary else (b"1 2", whole + b"\xff"):
         file.write_bytes(torn)
         with refusal(f"{file.name}: .*: copy or export it again"):
             check_model(rigs)

@@ -24,7 +24,7 @@ from gsbench.scene.images import (
 )
 from gsbench.scene.options import SplitRule
 from gsbench.scene.readers import fingerprint, read_photos
-from tests.helpers import refusal
+from tests.helpers import refusal, write
 
 pytestmark = pytest.mark.skipif(
     not hasattr(os, "mkfifo"), reason="pipes and links of a POSIX system"
@@ -101,6 +101,7 @@ def test_links_in_a_circle_are_followed_once(photos):
         (photos / name).symlink_to(".")
     (photos / "inner").mkdir()
     (photos / "inner" / "up").symlink_to("../..")
+    write(photos.parent / "private" / "own.png", b"")  # above the capture: not read
     assert list_images(photos) == ["a.png", "b.png", "c.png"]
 
 

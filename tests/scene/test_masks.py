@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
-from gsbench.pipeline.steps.scene import masking_step
 from gsbench.scene.load import load_scene
 from gsbench.scene.masks import (
     fill_ignored,
@@ -18,7 +17,6 @@ from gsbench.scene.masks import (
     read_mask,
     resize_mask,
 )
-from gsbench.scene.options import SceneConfig
 from gsbench.scene.readers import read_colmap, read_photos
 from gsbench.scene.types import Capture
 from tests.helpers import refusal
@@ -57,14 +55,6 @@ def test_masks_are_found_by_the_names_of_colmap(make_scene, read):
     assert capture.image_names == names
 
 
-def test_photographs_are_prepared_again_for_another_backdrop(make_scene):
-    capture = read_photos("toy", with_masks(make_scene()), masks="masks")
-    steps = {behind: masking_step(capture, behind) for behind in ("black", "white")}
-    assert all(steps.values())
-    assert steps["black"].key != steps["white"].key
-    assert steps["white"].inputs["behind"] == "white"
-
-
 def test_a_mask_file_with_another_name_is_not_used(tmp_path):
     for name in ("a.jpg.png", "b.png"):
         save(tmp_path / name, half())
@@ -99,11 +89,6 @@ def test_a_mask_of_another_size_is_refused(make_scene):
     path = save(root / "masks" / "02.png.png", half(20, 15))
     with refusal(rf"{path}: the mask is 20x15 px and its image 02\.png 40x30"):
         read_colmap("toy", root, masks="masks")
-
-
-def test_masks_for_the_courtyard_are_refused():
-    with refusal("courtyard"):
-        SceneConfig(name="courtyard", kind="courtyard", masks="masks")
 
 
 @pytest.mark.parametrize(
@@ -168,18 +153,6 @@ def test_filled_pixels_depend_only_on_counted_pixels(height, width, seed):
     assert_array_equal(filled[counts], one[counts])
     low, high = one[counts].min(axis=0), one[counts].max(axis=0)
     assert ((filled >= low) & (filled <= high)).all(), "means of what counts"
-
-
-def test_a_hole_in_one_colour_gets_that_colour_and_a_hole_in_a_ramp_has_no_step():
-    plain = np.full((50, 60, 3), (10, 200, 90), dtype=np.uint8)
-    counts = np.ones((50, 60), bool)
-    counts[10:40, 15:45] = False
-    holed = np.where(counts[..., None], plain, 0).astype(np.uint8)
-    assert_array_equal(fill_ignored(holed, counts), plain)
-    ramp = np.broadcast_to(np.linspace(0, 240, 60)[:, None], (50, 60, 3)).astype(np.uint8)
-    filled = fill_ignored(ramp, counts).astype(int)
-    # filling with black would make a step of 180
-    assert np.abs(np.diff(filled[25, :, 0])).max() < 60
 
 
 def test_filling_between_two_pixels_is_linear():

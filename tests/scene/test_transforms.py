@@ -16,7 +16,7 @@ from gsbench.scene.colmap import read_model, read_reference
 from gsbench.scene.options import SceneConfig
 from gsbench.scene.transforms import read_transforms
 from gsbench.scene.transforms_keys import HARMLESS, REFUSED
-from tests.helpers import read_json, refusal
+from tests.helpers import change_json, read_json, refusal
 from tests.scene.cameras import cameras_of
 
 SHARED = {"w": 40, "h": 30, "fl_x": 50.0, "fl_y": 51.0, "cx": 19.5, "cy": 15.5}
@@ -64,11 +64,6 @@ def in_each_frame(**keys):
 
 def in_frame(number, **keys):
     return lambda document: document["frames"][number].update(keys)
-
-
-def join(file, **keys):
-    """Change keys of a written file."""
-    file.write_text(json.dumps(read_json(file) | keys))
 
 
 def capture_of(folder, work, **options):
@@ -148,9 +143,9 @@ def test_two_files_must_name_the_same_points_under_one_transform(tmp_path, chang
     assert read_transforms(folder).points == folder / "a.ply"
     # the other file has no transform, which means the identity
     test = folder / "transforms_test.json"
-    join(test, ply_file_path="a.ply", applied_transform=IDENTITY)
+    change_json(test, ply_file_path="a.ply", applied_transform=IDENTITY)
     assert read_transforms(folder).points == folder / "a.ply"
-    join(test, **change)
+    change_json(test, **change)
     with refusal(said):
         read_transforms(folder)
 
@@ -253,10 +248,12 @@ def test_a_file_with_mask_paths_needs_the_folder_of_masks(tmp_path):
     assert found.masks["images/2.png"] == folder / "masks/images/2.png.png"
 
 
-def test_the_file_is_a_source_of_the_capture_and_changes_its_fingerprint(tmp_path):
+def test_the_file_is_read_once_and_changes_the_fingerprint(tmp_path, monkeypatch):
+    read, files = transforms.read_bytes, []
+    monkeypatch.setattr(transforms, "read_bytes", lambda path: files.append(path) or read(path))
     folder = write(tmp_path / "in")
     capture = capture_of(folder, tmp_path / "a")
-    assert capture.read_from == (folder / "transforms.json",)
+    assert files == [*capture.read_from] == [folder / "transforms.json"]
     write(folder, fl_x=49.0)
     assert capture_of(folder, tmp_path / "b").fingerprint != capture.fingerprint
 
@@ -327,7 +324,7 @@ def test_images_one_pixel_wide_are_accepted_and_a_missing_side_is_measured(tmp_p
     write(tmp_path / "in")
     for k in range(len(EYES)):
         Image.new("RGB", (1, 30)).save(tmp_path / f"in/images/{k}.png")
-    join(tmp_path / "in/transforms.json", w=1)
+    change_json(tmp_path / "in/transforms.json", w=1)
     images = read_transforms(tmp_path / "in").images
     assert {camera.width for camera, *_ in images.values()} == {1}
     for side in ("w", "h"):
@@ -367,7 +364,7 @@ def test_scene_images_replaces_the_folder_that_the_file_names(tmp_path, keep):
     capture = capture_of(folder, tmp_path / "made", images="images_2")
     assert capture.image_names == tuple(f"images_2/{k}.png" for k in range(6))
     fitted = read_reference(capture)
-    join(
+    change_json(
         folder / "transforms.json",
         train_filenames=[f"images/{k}.png" for k in range(4)],
         test_filenames=["images/5"],
@@ -389,13 +386,6 @@ def test_an_error_says_which_folder_has_the_named_files(tmp_path):
         r"file, but at least 3 are needed: images_2 has 6 of the names: set scene.images=images_2"
     ):
         capture_of(folder, tmp_path / "made")
-
-
-def test_transforms_json_is_read_once(tmp_path, monkeypatch):
-    read, files = transforms.read_bytes, []
-    monkeypatch.setattr(transforms, "read_bytes", lambda path: files.append(path) or read(path))
-    capture_of(write(tmp_path / "in"), tmp_path / "made")
-    assert files == [tmp_path / "in" / "transforms.json"]
 
 
 def focal(side, angle):

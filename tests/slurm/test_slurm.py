@@ -18,6 +18,7 @@ import pytest
 
 from tests.end_to_end.conftest import SMALL
 from tests.helpers import read_json
+from tests.processes import completed
 
 pytestmark = [pytest.mark.slurm, pytest.mark.slow]
 
@@ -58,10 +59,8 @@ def slurm():
             "no Slurm here: scripts/slurm_one_node.sh start (root, Debian or Ubuntu) sets one up"
         )
     try:
-        states = subprocess.run(
-            split("sinfo -h -o %T"), capture_output=True, text=True, timeout=120, check=True
-        ).stdout
-    except (subprocess.SubprocessError, OSError) as error:
+        states = completed(split("sinfo -h -o %T"), timeout=120).stdout
+    except (subprocess.SubprocessError, OSError, AssertionError) as error:
         pytest.skip(f"Slurm does not answer: {error}")
     if not any(state in states for state in ("idle", "mixed", "allocated")):
         pytest.skip(f"no node is ready: {states.strip() or 'none'}")
@@ -78,16 +77,15 @@ def place(tmp_path):
 
 
 def start(place, environment, runs, *words, pause=0):
+    command, variables = called(environment, runs, words, pause)
+    output = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    return subprocess.Popen(command, cwd=place, env=variables, **output)
+
+
+def called(environment, runs, words, pause=0):
+    """A command line of gsbench and its variables."""
     variables = environment | {"GSBENCH_RUNS": str(runs), "PAUSE": str(pause)}
-    command = [sys.executable, "-m", "gsbench.cli", *words]
-    return subprocess.Popen(
-        command,
-        cwd=place,
-        env=variables,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
+    return [sys.executable, "-m", "gsbench.cli", *words], variables
 
 
 def models(runs):
@@ -101,10 +99,7 @@ def job_logs(runs):
 
 
 def queue():
-    listing = subprocess.run(
-        split("squeue --me -h -r -o %i"), capture_output=True, text=True, check=True
-    )
-    return listing.stdout.split()
+    return completed(split("squeue --me -h -r -o %i")).stdout.split()
 
 
 def test_a_requeued_sweep_ends_with_the_models_of_an_undisturbed_one(place, environment):
@@ -124,7 +119,7 @@ def test_a_requeued_sweep_ends_with_the_models_of_an_undisturbed_one(place, envi
     assert len(queued) == 2
     time.sleep(3)
     # like a preemption: SIGTERM, then back to the queue
-    subprocess.run(["scontrol", "requeue", queued[0]], check=True)
+    completed(["scontrol", "requeue", queued[0]])
     first.send_signal(signal.SIGINT)
     output, _ = first.communicate(timeout=120)
     assert first.returncode == 130
@@ -150,11 +145,8 @@ def test_a_requeued_sweep_ends_with_the_models_of_an_undisturbed_one(place, envi
 
 def gsbench(place, environment, *words, pause=0):
     """Run the program to its end; its output is in stdout, its log lines in stderr."""
-    variables = environment | {"GSBENCH_RUNS": str(place / "runs"), "PAUSE": str(pause)}
-    command = [sys.executable, "-m", "gsbench.cli", *words]
-    return subprocess.run(
-        command, cwd=place, env=variables, capture_output=True, text=True, timeout=240, check=False
-    )
+    command, variables = called(environment, place / "runs", words, pause)
+    return completed(command, code=None, cwd=place, env=variables, timeout=240)
 
 
 def states(place, environment):
@@ -224,7 +216,7 @@ def test_a_cancelled_job_is_missing_and_can_run_without_slurm(place, environment
     assert done.returncode == 0, done.stderr
     job = done.stdout.split()[2].rstrip(":")
     assert states(place, environment) == {"slow": "queued"}
-    subprocess.run(["scancel", job], check=True)
+    completed(["scancel", job])
     wait_for_states(place, environment, slow="missing")
     assert (
         f"Slurm job {job} has ended, log: "
@@ -255,13 +247,7 @@ def test_failed_trial_and_killed_job_are_reported(place, environment):
     ]
     job = read_json(folder / ".submitted.json")["job"]
     holder = read_json(folder / ".lock.holder")
-    status = subprocess.run(
-        [sys.executable, "-m", "gsbench.cli", "status", "cluster"],
-        env=environment | {"GSBENCH_RUNS": str(runs)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    status = gsbench(place, environment, "status", "cluster")
     assert "running" in status.stdout
     assert f"Slurm job {holder['slurm']}" in status.stdout
     os.kill(holder["pid"], signal.SIGKILL)

@@ -1,12 +1,8 @@
 """The isolated call: results, exceptions and crashes come back as what they are."""
 
 import os
-import signal
-import subprocess
 import sys
-import textwrap
 import time
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,18 +10,13 @@ import psutil
 import pytest
 from numpy.testing import assert_array_equal
 
-import gsbench
 from gsbench.errors import InputError
 from gsbench.system import isolate
 from gsbench.system.isolate import CrashError, run_isolated
 from tests.helpers import refusal
-from tests.processes import heed_interrupts
-
-PATIENCE = 120.0  # seconds; a slow machine needs fewer
-SOURCE = Path(gsbench.__file__).parents[1]
 
 FUNCTIONS = """
-import logging, os, sys, time
+import logging, os, sys
 import numpy as np
 from gsbench.errors import InputError
 
@@ -59,12 +50,6 @@ def abort():
 
 def leave():
     os._exit(7)
-
-def beat(path):
-    while True:
-        with open(path, "a") as stream:
-            stream.write(".")
-        time.sleep(0.02)
 """
 
 
@@ -123,38 +108,6 @@ def test_crash_is_one_line_with_the_reason(functions, tmp_path):
 def test_early_exit_without_output(functions):
     with pytest.raises(CrashError, match=r"exit code 7.*no output"):
         run_isolated(functions.leave)
-
-
-@pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGKILL])
-def test_child_ends_with_its_parent(functions, tmp_path, sign):
-    beats, script = tmp_path / "beats.txt", tmp_path / "main.py"
-    script.write_text(
-        textwrap.dedent(f"""
-        import sys
-        sys.path[:0] = [{str(SOURCE)!r}, {str(tmp_path)!r}]
-        from gsbench.system.isolate import run_isolated
-        import isolated_functions
-        run_isolated(isolated_functions.beat, {str(beats)!r})  # no __main__ guard: it must not be imported again
-        """)
-    )
-    parent = subprocess.Popen(
-        [sys.executable, str(script)], stderr=subprocess.PIPE, preexec_fn=heed_interrupts
-    )
-    deadline = time.monotonic() + PATIENCE
-    while not beats.exists() and time.monotonic() < deadline:
-        time.sleep(0.02)
-    assert beats.exists()
-    parent.send_signal(sign)
-    _, errors = parent.communicate(timeout=PATIENCE)
-    deadline = time.monotonic() + PATIENCE
-    assert parent.returncode != 0
-    if sign == signal.SIGINT:
-        assert b"KeyboardInterrupt" in errors
-    size = -1
-    while beats.stat().st_size != size:  # it writes fifty times a second as long as it lives
-        assert time.monotonic() < deadline
-        size = beats.stat().st_size
-        time.sleep(0.5)
 
 
 # ---- parts, in this process

@@ -19,12 +19,11 @@ KERNEL_MODULES = sorted(
 )
 
 
-@pytest.fixture
-def package(tmp_path):
+@pytest.fixture(scope="module")
+def package(tmp_path_factory):
     """A copy of gsbench's sources."""
-    return Path(
-        shutil.copytree(PACKAGE, tmp_path / "gsbench", ignore=shutil.ignore_patterns("__pycache__"))
-    )
+    copy, unwanted = tmp_path_factory.mktemp("sources") / "gsbench", ("__pycache__",)
+    return Path(shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns(*unwanted)))
 
 
 def functions_of(value, seen):

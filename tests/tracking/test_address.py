@@ -1,5 +1,10 @@
 """A tracker that a stranger's file names gets nothing unless the user types its address."""
 
+import os
+import sqlite3
+import struct
+from contextlib import closing
+
 import pytest
 
 from gsbench.cli import run
@@ -100,6 +105,37 @@ def test_a_link_among_the_artifacts_is_not_followed(tmp_path):
     with refusal("follows no links"):
         mirror_trial(options(), folder, values)
     assert private.read_text() == "secret"
+
+
+def journal_naming(other, pages):
+    """A journal as SQLite leaves it after a crash, which tells it to delete the file ``other``.
+
+    The layout is that of https://www.sqlite.org/fileformat2.html#the_rollback_journal.
+    """
+    magic, name = bytes.fromhex("d9d505f920a163d7"), os.fsencode(other)
+    head = magic + struct.pack(">5I", 0, 1, pages, 512, 4096)
+    end = struct.pack(">I", 2**30 // 4096 + 1) + name + struct.pack(">2I", len(name), sum(name))
+    return head.ljust(512, b"\0") + end + magic
+
+
+@pytest.mark.parametrize("command", [["sync", "theirs"], ["ui", "--no-browser"]])
+def test_a_journal_of_a_database_deletes_no_file(command, tmp_path, monkeypatch, capfd):
+    runs, private = tmp_path / "runs", write(tmp_path / "private", "secret")
+    ended_trial(runs, name="theirs")
+    connect(None, runs)
+    database = runs / "mlflow.db"
+    journal = journal_naming(private, database.stat().st_size // 4096)
+    write(runs / "mlflow.db-journal", journal)
+    monkeypatch.setenv("GSBENCH_RUNS", str(runs))
+    monkeypatch.delenv(VARIABLE, raising=False)
+    monkeypatch.setattr("gsbench.verbs.servers.subprocess.Popen", None)
+    assert run(command) in (1, 2)
+    assert "mlflow.db-journal would delete another file: remove it" in capfd.readouterr().err
+    assert private.exists()
+    # The journal is what SQLite takes for one.
+    with closing(sqlite3.connect(database)) as connection:
+        connection.execute("SELECT * FROM experiments")
+    assert not private.exists()
 
 
 @pytest.mark.parametrize("address", ["./mlruns", "mlruns", "file:./mlruns", "http:/host"])

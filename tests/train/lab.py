@@ -1,16 +1,12 @@
 """Short trainings of a tiny scene, for most tests of this folder."""
 
 import json
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 
 import torch
 
 from gsbench.densify import ADC, GNS, MCMC, MRNF, FastGS, SteepGS
 from gsbench.gaussians.initial import gaussians_from_cloud
-from gsbench.gaussians.model import Gaussians
-from gsbench.raster.base import Rasterizer
-from gsbench.scene.types import Scene
 from gsbench.train.options import TrainConfig
 from gsbench.train.trainer import Trainer
 
@@ -70,14 +66,11 @@ def stop_at(step):
     return stop
 
 
-@dataclass
 class Lab:
     """A scene with its Gaussians, a rasterizer, and a folder for trainings."""
 
-    scene: Scene
-    truth: Gaussians
-    rasterizer: Rasterizer
-    folder: Path
+    def __init__(self, *parts):
+        self.scene, self.truth, self.rasterizer, self.folder = parts
 
     def new(self, densifier, seed=0, snapshot_at=(), **changes):
         parts = (self.scene, cloud(self.truth), densifier, self.rasterizer)
@@ -102,4 +95,5 @@ class Lab:
         return sorted(int(path.stem.removeprefix("checkpoint-")) for path in found)
 
     def with_views(self, **changes):
-        return replace(self, scene=replace(self.scene, **changes))
+        scene = replace(self.scene, **changes)
+        return Lab(scene, self.truth, self.rasterizer, self.folder)

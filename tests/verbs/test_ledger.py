@@ -61,7 +61,7 @@ class Trainings:
 @pytest.fixture
 def trainings(monkeypatch, runs):
     made = Trainings()
-    monkeypatch.setattr(verb, "compose_trials", composed)
+    monkeypatch.setattr("gsbench.app.ledger_trials.compose_trials", composed)
     monkeypatch.setattr(verb, "run_trials", made)
     # The new seeds follow from all lines before, so from their times.
     monkeypatch.setattr(verb, "stamp_now", lambda: "2026-11-28T00:00:00Z")
@@ -244,10 +244,10 @@ def test_settings_that_are_no_idea_are_refused_and_leave_no_line(home, words, re
         ("seed=0", "needs at least 2 seeds"),
         ("seed=0,1 densify=adc,volumetric", "one arm at a time"),
         ("seed=0,1 --metric psmr", "there is no such metric"),
-        ("seed=0,1 --fdr 1", "must be above 0 and below 1"),
-        ("seed=0,1 --fdr 0", "must be above 0 and below 1"),
-        ("seed=0,1 --fdr 5%", "must be above 0 and below 1, got '5%'"),
-        ("seed=0,1 --ideas 0", "must be a whole number from 1 to 10000"),
+        ("seed=0,1 --fdr 1", "must be a number in (0, 1)"),
+        ("seed=0,1 --fdr 0", "must be a number in (0, 1)"),
+        ("seed=0,1 --fdr 5%", "must be a number in (0, 1), got '5%'"),
+        ("seed=0,1 --ideas 0", "must be a whole number in [1, 10000]"),
         ("seed=0,1 eval.primary=psnr", "eval.primary follows from the ledger"),
         ("seed=0,1 launch.wait=false", "launch.wait=false"),
     ],
@@ -405,6 +405,13 @@ def test_an_archived_ledger_names_no_folder_and_no_server(home, trainings, tmp_p
     assert len(shared.entries) == len(kept.entries)
     assert "tracking=none" in kept.opened.words
     assert "tracking=none" not in shared.opened.words
+
+
+def test_show_prints_all_for_programs(home, said):
+    attempt(f"{SPLIT}=0.02")
+    shown = json.loads(said("ledger show night --json"))
+    assert [one["result"] for one in shown["ideas"]] == ["kept"]
+    assert (shown["tried"], shown["planned"], shown["kept"]) == (1, 40, ["adc"])
 
 
 def test_show_prints_the_rule_and_a_row_for_each_idea(home, said):

@@ -191,8 +191,8 @@ def test_options_of_a_proof_need_prove(tmp_path, words, message):
     [
         ("--size 15x20", "a size is WIDTHxHEIGHT"),
         ("--size 500", "a size is WIDTHxHEIGHT"),
-        ("--count 0", "a count is at least 1"),
-        ("--count 5,x", "a count is at least 1"),
+        ("--count 0", "--count: must be a whole number in "),
+        ("--count 5,x", "--count: must be a whole number in "),
         ("--ply nowhere.ply", "nowhere.ply does not exist"),
         ("--kernels", "has no place in the table: add --json"),
         ("--raster cpu,auto", "name those to time"),

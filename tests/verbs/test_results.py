@@ -193,7 +193,7 @@ def test_an_origin_names_program_machine_and_code():
         hashes={"data": "d", "train": "t"},
         versions={"torch": "2.13.0"},
         renders={"folder": "r"},
-        code=SimpleNamespace(commit="", edited=False, rooms={"init": AS_RELEASED}),
+        code=SimpleNamespace(commit="", edited=False, packages={"init": AS_RELEASED}),
     )
     trial = SimpleNamespace(
         record=record,
@@ -223,9 +223,9 @@ def test_an_origin_names_program_machine_and_code():
     assert found["since"] == "mine was ffffffff, it is now eeeeeeee"
     assert found["commit"] == "abc, edited"
     assert "edited" not in found
-    record.code.rooms["eval"] = "1" * 64
+    record.code.packages["eval"] = "1" * 64
     assert _origin(trial)["edited"] == "since the last release: eval"
-    del record.code.rooms["init"]  # all packages count as edited before the first release
+    del record.code.packages["init"]  # all packages count as edited before the first release
     assert "edited" not in _origin(trial)
 
 

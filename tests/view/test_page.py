@@ -25,6 +25,11 @@ case "$*" in *"{works}"*) (echo "<head></head>"; cat "$settings") > "$previous";
 """
 
 
+@pytest.fixture(autouse=True)
+def _runs(small_runs, monkeypatch):
+    monkeypatch.setenv("GSBENCH_RUNS", str(small_runs))
+
+
 def stand_in(folder, works, fails, works_too=":"):
     """Write an npx that copies its settings to the page if its words contain ``works``."""
     write(
@@ -37,7 +42,6 @@ def stand_in(folder, works, fails, works_too=":"):
 
 @pytest.mark.parametrize("works", ["splat-transform", "-g cpu"], ids=["with a GPU", "without"])
 def test_the_page_has_every_test_view(works, small_runs, tmp_path, monkeypatch, said):
-    monkeypatch.setenv("GSBENCH_RUNS", str(small_runs))
     npx = stand_in(tmp_path / "bin", works, "exit 1")
     monkeypatch.setenv("PATH", f"{npx}{os.pathsep}{os.environ['PATH']}")
     said("export", ADDRESS, "--out", tmp_path / "page.html")
@@ -87,9 +91,8 @@ def test_the_page_is_in_the_models_own_coordinates(small_runs):
     ],
 )
 def test_without_npx_the_error_names_the_command_to_type(
-    fails, cause, small_runs, tmp_path, monkeypatch, capsys
+    fails, cause, tmp_path, monkeypatch, capsys
 ):
-    monkeypatch.setenv("GSBENCH_RUNS", str(small_runs))
     place = f"{stand_in(tmp_path / 'bin', 'never', fails)}:/bin" if fails else str(tmp_path)
     for suffix in ("ply", "json"):
         (tmp_path / f"page.{suffix}").write_text("the user's own")
@@ -117,10 +120,7 @@ def hostile_capture(folder, monkeypatch):
     monkeypatch.chdir(folder)
 
 
-def test_npx_starts_where_no_package_of_the_current_folder_is_found(
-    small_runs, tmp_path, monkeypatch, said
-):
-    monkeypatch.setenv("GSBENCH_RUNS", str(small_runs))
+def test_npx_starts_where_no_package_of_the_current_folder_is_found(tmp_path, monkeypatch, said):
     seen = "(pwd; ls -A; echo $PATH) > $SEEN; d=$(pwd); while [ $d != / ]; do d=$(dirname $d); ls -A $d >> $SEEN; done"
     npx = stand_in(tmp_path / "bin", "splat-transform", "exit 1", seen)
     monkeypatch.setenv("SEEN", str(tmp_path / "seen"))
@@ -141,10 +141,7 @@ def test_npx_starts_where_no_package_of_the_current_folder_is_found(
 
 
 @pytest.mark.parametrize("name", ["node_modules", ".npmrc", "package.json"])
-def test_a_temporary_folder_below_packages_is_refused(
-    name, small_runs, tmp_path, monkeypatch, capsys
-):
-    monkeypatch.setenv("GSBENCH_RUNS", str(small_runs))
+def test_a_temporary_folder_below_packages_is_refused(name, tmp_path, monkeypatch, capsys):
     npx = stand_in(tmp_path / "bin", "splat-transform", "exit 1")
     monkeypatch.setenv("PATH", f"{npx}{os.pathsep}{os.environ['PATH']}")
     (tmp_path / "a" / "b").mkdir(parents=True)

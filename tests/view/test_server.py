@@ -2,12 +2,10 @@
 
 import contextlib
 import math
-import re
 import socket
 import threading
 import time
 import urllib.request
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -17,8 +15,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from gsbench.events import Cause
 from gsbench.raster import create_rasterizer
-from gsbench.system.install import install_command
-from gsbench.verbs import servers
 from gsbench.view import server
 from gsbench.view.server import Session, Viewer, check_port
 from gsbench.view.trials import Layers, TrialPainter, find_trial, load_viewed
@@ -220,14 +216,6 @@ def test_page_shows_the_trials_in_a_browser(viewer, tmp_path):
     with Browser(viewer.url, tmp_path) as browser:
         # Without the controls and the browser's own notes.
         browser.wait_until(lambda page: bool(page[150:, :800].std() > 20), "the trials")
-
-
-def test_without_viser_the_error_names_the_install_command(monkeypatch):
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with refusal(re.escape(install_command("view"))):
-        servers.view(["a:b:c"], Path())
-    with refusal("one or two"):
-        servers.view(["a:b:c"] * 3, Path())
 
 
 def test_a_port_in_use_is_refused_and_one_that_was_just_left_is_not():

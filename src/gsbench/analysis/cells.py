@@ -22,6 +22,7 @@ from gsbench.analysis.results import Experiment, TrialResult, group_by
 from gsbench.analysis.trial_settings import Configured
 from gsbench.errors import InputError
 from gsbench.runs.config_hash import is_hashed
+from gsbench.words import command
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -119,7 +120,7 @@ def check_averageable(trials: Sequence[TrialResult], where: str) -> None:
     """Raise ``InputError`` with the differing keys unless each scene's trials are repetitions."""
     if code := differing_code(trials):
         listed = "; ".join(describe_code(*part) for part in code.items())
-        status = f"gsbench status {trials[0].experiment}"
+        status = command("status", trials[0].experiment)
         raise InputError(
             f"the table cell {where} would average trials made by different versions of {listed}: "
             f"`{status}` names the superseded ones, `{status} --forget-superseded` removes them"

@@ -31,6 +31,7 @@ from gsbench.analysis.verdict_words import sentence
 from gsbench.analysis.verdicts import PairVerdicts, judge_pairs
 from gsbench.runs.experiments import Question
 from gsbench.runs.layout import LEDGER, TUNING
+from gsbench.words import command
 
 VERDICT = Note.of("verdict", sentence="").sentence  # begins the notes that state verdicts
 
@@ -327,15 +328,28 @@ def compare(experiment: Experiment, baseline: str = BASELINE) -> Comparison:
     arms = pair_arms(experiment, baseline)
     declared = active_declaration(experiment)
     usual = arms if baseline == BASELINE else pair_arms(experiment)
-    known = {frozenset(pair) for pair in usual.pairs}
+    shown, known = ({frozenset(pair) for pair in one.pairs} for one in (arms, usual))
     others = [pair for pair in arms.pairs if frozenset(pair) not in known]
+    turned = {(second, first) for first, second in usual.pairs}.difference(usual.pairs)
+    # A baseline that is chosen later frees no question of the others' share of the error rate.
+    pairs = [*arms.pairs, *(pair for pair in usual.pairs if frozenset(pair) not in shown)]
     lacking, older = unfinished(experiment), experiment.older
-    answers = judge_pairs(arms.trials, arms.pairs, declared, lacking, others, older)
+    if declared is not None:
+        lacking += declared.missing(arms.trials)
+    answers = judge_pairs(arms.trials, pairs, declared, lacking, others, older, turned)
+    answers = answers[: len(arms.pairs)]
     if (experiment.folder / LEDGER).exists():
         answers = [
-            replace(answer, undeclared=LEDGER_DECIDES.format(experiment.name)) for answer in answers
+            replace(
+                answer,
+                undeclared=LEDGER_DECIDES.format(command("ledger", "show", experiment.name)),
+            )
+            for answer in answers
         ]
+    elif any(one.kind == "claims" and one.looks for one in experiment.declarations):
+        answers = [replace(one, undeclared=CLAIMS_DECIDE) for one in answers]
     return Comparison(experiment, arms, declared, tuple(answers))
 
 
-LEDGER_DECIDES = "the ledger's tests decide (gsbench ledger show {}), and this is none of them"
+CLAIMS_DECIDE = "declared claims decide (gsbench check), and seeds came in looks until they did"
+LEDGER_DECIDES = "the ledger's tests decide ({}), and this is none of them"

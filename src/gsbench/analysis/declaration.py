@@ -16,7 +16,8 @@ from gsbench.analysis.attempts import of_same_arm, places_of
 from gsbench.analysis.notes import Note
 from gsbench.analysis.results import Experiment, TrialResult
 from gsbench.analysis.trial_settings import config_if_readable, settings_text
-from gsbench.runs.experiments import Declaration, Question, merge_planned, of_latest_metric
+from gsbench.analysis.unfinished import Unfinished
+from gsbench.runs.experiments import Declaration, Planned, Question, merge_planned, of_latest_metric
 from gsbench.runs.layout import FORGOTTEN, SEED
 from gsbench.words import counted
 
@@ -133,6 +134,24 @@ class ActiveDeclaration:
         # a sweep in looks stopped by its own questions
         other_pair = not asked if in_looks else other_pair
         return Standing(self, declaration, question, tuple(seen), tuple(added), other_pair)
+
+    def missing(self, trials: Sequence[TrialResult]) -> list[Unfinished]:
+        """The declared trials without a result, except those of looks, which may not be needed.
+
+        A trial counts only if its settings are those of its arm's finished trials on its scene.
+        """
+        plans = [one.planned for one in self.declared if not one.looks]
+        planned: Planned = reduce(merge_planned, plans, {})
+        configs = {trial.key: trial.config for trial in trials}
+        places = {key.rpartition("/")[0] for key in configs}
+        done = {(trial.key, trial.seed) for trial in trials}
+        return [
+            Unfinished(self.folder / f"{key}{SEED}{seed}", configs.get(key, {}))
+            for key, seeds in planned.items()
+            if key in configs or key.rpartition("/")[0] not in places
+            for seed in seeds
+            if (key, seed) not in done
+        ]
 
     def progress(self, trials: Sequence[TrialResult]) -> list[Note]:
         """A note on the declared trials that are missing; none if all are there."""

@@ -268,7 +268,7 @@ def tuning_notes(
     notes = [unlike] if unlike else []
     for arm in pair:
         own = trials_of(trials, arm)
-        notes += [_search_note(own, name, record) for name, record in _searches(own[0]).items()]
+        notes += [_search_note(own, name, record) for name, record in searches_of(own[0]).items()]
         notes += _varied_settings([*trials, *older], own[0])
     return notes or [Note.of("no tuning")]
 
@@ -291,7 +291,9 @@ def _tuning_budget(trial: TrialResult) -> str:
 
     For example ``6 points of 2 seeds on validation views``.
     """
-    searches = [search for search in _searches(trial).values() if _has_settings(trial, search.best)]
+    searches = [
+        search for search in searches_of(trial).values() if _has_settings(trial, search.best)
+    ]
     if not searches:
         return "none"
     largest = max(searches, key=lambda search: len(search.points) * len(search.seeds))
@@ -301,13 +303,14 @@ def _tuning_budget(trial: TrialResult) -> str:
     )
 
 
-def _searches(trial: TrialResult) -> dict[str, TuningRecord]:
+def searches_of(trial: TrialResult) -> dict[str, TuningRecord]:
     """The searches of a trial's arm in its runs folder, by experiment.
 
     These are the searches for the trial's own sweep, and those that tried exactly its settings.
     """
     arm, sweep = f"{trial.init}-{trial.densify}", trial.path.parents[2].name
     searches = {}
+    # Each search has an experiment of its own, and may be from before this sweep.
     for file in sorted(trial.path.parents[3].glob(f"*/{TUNING}")):
         search = read_if_sound(file, TuningRecord)
         if search is None or search.arm != arm:

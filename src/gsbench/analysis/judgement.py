@@ -213,6 +213,7 @@ def judge(
             return [trial for key in keys for trial in by_folder.get(key, [])]
         return [trial for arm in (question.baseline, question.arm) for trial in by_arm.get(arm, [])]  # type: ignore[arg-type]
 
+    # Pairs come first: which questions have any decides the size of a family, and so each test.
     unjudged = [
         _with_pairs(trials_of(question), question, declaration)
         for question in declaration.questions

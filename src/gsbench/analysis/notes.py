@@ -137,6 +137,25 @@ SENTENCES: dict[str, str] = {
         "The same bits in all trials of one scene and seed: {arms:all}. The settings in which they "
         "differ had no effect, so there is nothing to compare."
     ),
+    # ---- claims, gates and ledgers of ideas
+    "least not shown": "by {effect} or more is not shown",
+    "look waits": "the next look waits for trials that are missing",
+    "failed": "failed: {reasons:few}",
+    "other machine": (
+        "deviation: the baseline ran on another kind of machine ({baseline:all}) than the new "
+        "trials ({new:all}); this alone changes last digits and, after long training, results"
+    ),
+    "other library": (
+        "deviation: the baseline was made with {library} {baseline:all}, the new trials with "
+        "{new:all}"
+    ),
+    "small loss": (
+        "the last commit differs by {difference}, which a step with {seeds:n seed} shows in only "
+        "{chance} of 100 cases: the search may end with a range; allow more --seeds or scenes"
+    ),
+    "contradiction": (
+        "{idea}: the ledger says {recorded}, but its trials say {now}: one of them was edited"
+    ),
     # ---- how to read a table
     "one trial": "One trial per cell, so there is no deviation.",
     "mean": "Mean over {trials:n trial}; ± is the deviation (n − 1) over {spread}.",

@@ -25,7 +25,7 @@ from gsbench.runs.layout import CONFIG, FAILED, FORGOTTEN, PER_VIEW, RESULTS, SE
 from gsbench.runs.nested import SHOWN
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import UnfinishedError
-from gsbench.words import counted, some_of
+from gsbench.words import command, counted, some_of
 
 K = TypeVar("K", bound=Hashable)
 T = TypeVar("T")
@@ -135,6 +135,18 @@ def read_experiment(folder: Path) -> Experiment:
     usable.sort(
         key=lambda trial: (trial.scene, trial.init, trial.densify, trial.seed, trial.config_hash)
     )
+    known = {
+        (key, seed): declared.moment
+        for declared in reversed(read_declarations(folder))
+        for key, seeds in declared.known.items()
+        for seed in seeds
+    }
+    usable = [
+        replace(trial, known=known[trial.key, trial.seed])
+        if (trial.key, trial.seed) in known
+        else trial
+        for trial in usable
+    ]
     forgotten, unread = _forgotten(folder, {trial.path for trial in usable})
     warnings = sorted(f"{path.relative_to(runs_dir)}: {fault}" for path, fault in faults.items())
     lacking = tuple(
@@ -269,7 +281,7 @@ def read_trial(path: Path, runs_dir: Path, settings: Configurations) -> TrialRes
         record = folder.record()
         if change := folder.change():
             raise UnusableError(
-                f"damaged, {change}: `gsbench retry {record.experiment}` repairs it"
+                f"damaged, {change}: `{command('retry', record.experiment)}` repairs it"
             )
     except FileNotFoundError:
         raise UnusableError(_why_unfinished(path)) from None

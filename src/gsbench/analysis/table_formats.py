@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
 from gsbench.analysis.cells import Cell
+from gsbench.words import printable
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -70,7 +71,7 @@ class Table:
 def fill(template: str, package: str = TEMPLATES, **values: Any) -> str:
     """Fill a jinja2 template of ``package``, or else of the report, with ``values``.
 
-    Values are escaped for HTML.
+    Values are escaped for HTML, and `printable`: a name could turn the sentence after it around.
     """
     return _environment(package).get_template(template).render(**values)
 
@@ -81,6 +82,7 @@ def _environment(package: str) -> Environment:
     environment = Environment(
         loader=loader,
         autoescape=True,
+        finalize=lambda value: printable(value) if type(value) is str else value,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
@@ -102,15 +104,16 @@ MARKUP = re.compile(r"<(?=[a-zA-Z/!?])|(?<=\])\(")
 
 def _markdown_text(text: str) -> str:
     """A text from a trial, which may be a stranger's, in one line without HTML and links."""
-    return MARKUP.sub(r"\\\g<0>", " ".join(text.split()))
+    return MARKUP.sub(r"\\\g<0>", printable(" ".join(text.split())))
 
 
 def csv_of(frame: pd.DataFrame) -> str:
     """The frame as CSV, in which no text is a formula: an apostrophe precedes it."""
 
     def plain(value: Any) -> Any:
-        is_formula = isinstance(value, str) and FORMULA.match(value.lstrip())
-        return f"'{value}" if is_formula else value
+        if not isinstance(value, str):
+            return value
+        return ("'" if FORMULA.match(value.lstrip()) else "") + printable(value)
 
     return str(frame.map(plain).rename(columns=plain).to_csv(index=False, lineterminator="\n"))
 
@@ -249,7 +252,8 @@ _LATEX = str.maketrans(
 
 def escape_latex(text: str) -> str:
     """Text as LaTeX source; a character that plain LaTeX does not have becomes a question mark."""
-    return " ".join(text.split()).translate(_LATEX).encode("latin-1", "replace").decode("latin-1")
+    text = printable(" ".join(text.split()))
+    return text.translate(_LATEX).encode("latin-1", "replace").decode("latin-1")
 
 
 def _latex_text(entry: TableEntry) -> str:

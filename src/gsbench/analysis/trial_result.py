@@ -1,5 +1,6 @@
 """A complete trial as tables and verdicts see it: its record, settings, code and conditions."""
 
+import math
 import os
 import re
 from collections.abc import Mapping
@@ -23,7 +24,8 @@ class TrialResult:
     """One complete trial.
 
     ``record`` is its ``results.json``, ``config_hash`` the hash in its folder's name. ``settings``
-    reads the configurations of its experiment.
+    reads the configurations of its experiment. ``known`` is the Unix time of a declaration that
+    its results came before, whatever their own time says.
     """
 
     path: Path
@@ -32,6 +34,7 @@ class TrialResult:
     # swept settings that distinguish arms of one initialiser and densifier
     variant: tuple[tuple[str, str], ...] = ()
     settings: Configurations = field(default_factory=Configurations, repr=False, compare=False)
+    known: float = field(default=math.inf, repr=False)
 
     @property
     def experiment(self) -> str:
@@ -117,10 +120,14 @@ class TrialResult:
         modules = {part: made for part, made in self.code.items() if part.kind == "module"}
         return list(code_changes(modules, partial(present_version, folder=os.getcwd())))
 
-    @property
+    @cached_property
     def finished(self) -> float:
-        """The Unix time at which the trial was finished."""
-        return (self.path / RESULTS).stat().st_mtime
+        """The Unix time at which the trial was finished; if unrecorded, that of the file.
+
+        A copy of the folder may have other times of its files.
+        """
+        made_of = self.folder.made_of()
+        return (made_of and made_of.finished) or (self.path / RESULTS).stat().st_mtime
 
     @cached_property
     def machine(self) -> str | None:
@@ -137,9 +144,9 @@ class TrialResult:
 
     @cached_property
     def measured(self) -> float:
-        """The Unix time of measuring the metrics; if unrecorded, that of the file."""
+        """The Unix time of measuring the metrics; if unrecorded, that of finishing the trial."""
         moment = unix_time(self.record.measured)
-        return self.finished if moment is None else moment
+        return min(int(self.finished) if moment is None else moment, self.known - 1)
 
     @cached_property
     def conditions(self) -> Mapping[str, str]:
@@ -154,7 +161,11 @@ class TrialResult:
         if not self.from_renders:
             conditions["raster"] = self.record.raster
         if not self.made_elsewhere:
-            conditions["iterations"] = str(self.record.iterations)
+            budget, iterations = self.record.budget, self.record.iterations
+            if budget is not None and budget.seconds is not None:
+                # A time limit ends each training at another one: the planned number must agree.
+                iterations = self.config.get("train.iterations", iterations)
+            conditions["iterations"] = str(iterations)
         if not self.made_elsewhere and not self.program:
             conditions["budget"] = (
                 "null" if self.record.budget is None else canonical(asdict(self.record.budget))

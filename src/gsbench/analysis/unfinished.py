@@ -5,7 +5,7 @@ no verdict favours an arm that lacks a result where the other arm has one.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -21,9 +21,13 @@ BASELINE, ARM = 0, 1  # the sides of a question
 
 @dataclass(frozen=True)
 class Unfinished:
-    """The folder of a trial that failed, was stopped, is damaged, or lacks the metric."""
+    """The folder of a trial that failed, was stopped, is damaged or gone, or lacks the metric.
+
+    ``known`` are its settings if they need not be read.
+    """
 
     path: Path
+    known: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
 
     @property
     def scene(self) -> str:
@@ -44,7 +48,7 @@ class Unfinished:
     @cached_property
     def config(self) -> Mapping[str, Any]:
         """The settings with dotted keys; empty if unreadable."""
-        return config_if_readable(self.path)
+        return self.known or config_if_readable(self.path)
 
     def is_of(self, question: Question, side: int) -> bool:
         """Return whether the trial belongs to a side of the question."""
@@ -53,7 +57,8 @@ class Unfinished:
         if question.scenes:
             return self.key == question.scenes.get(self.scene, ("", ""))[side]
         arm = (question.baseline, question.arm)[side]
-        return arm is not None and arm.has(self.path.parts[-2], self.config)
+        # without readable settings it may be of any arm of that name
+        return arm is not None and arm.has(self.path.parts[-2], self.config or dict(arm.variant))
 
 
 def unfinished(experiment: Experiment) -> list[Unfinished]:
@@ -75,7 +80,7 @@ def one_sided(
         is_arm = trial.key in of_arm if question.scenes else trial.arm == question.arm
         done[ARM if is_arm else BASELINE].add((trial.scene, trial.seed))
     found: tuple[list[Unfinished], list[Unfinished]] = ([], [])
-    for one in lacking:
+    for one in dict.fromkeys(lacking):
         for side in (BASELINE, ARM):
             if (one.scene, one.seed) in done[1 - side] - done[side] and one.is_of(question, side):
                 found[side].append(one)
@@ -85,6 +90,6 @@ def one_sided(
 def lacking_words(lacking: Sequence[Unfinished]) -> str:
     """The reason why a verdict that would favour an arm with such trials is undecided."""
     return (
-        f"{counted(len(lacking), 'trial')} of one arm alone failed, stopped or gave no value, "
-        f"perhaps its bad ones: {some_of([trial.label for trial in lacking])}"
+        f"{counted(len(lacking), 'trial')} of one arm alone failed, stopped, went missing or gave "
+        f"no value, perhaps its bad ones: {some_of([trial.label for trial in lacking])}"
     )

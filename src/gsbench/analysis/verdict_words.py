@@ -1,5 +1,6 @@
 """The words of verdicts: each verb, table and page takes its sentences on verdicts from here."""
 
+import re
 from collections.abc import Sequence
 
 from gsbench.analysis.attempts import share_of_version
@@ -33,6 +34,7 @@ SYMBOLS: dict[Outcome, str] = {
     "undecided": "●",
 }
 MISSING = "trials are missing"
+IN_BRACKETS = re.compile(r" \([^()]*\)")
 
 
 # ---- one verdict
@@ -229,6 +231,15 @@ def sentence(judged: PairVerdicts) -> str:
         f"({max(verdict.family for verdict in verdicts)}).{_versions_words(judged)}"
         + "".join(f" Undecided: {lacking_words(verdict.lacking)}." for verdict in in_doubt)
     )
+
+
+def headline(judged: PairVerdicts) -> str:
+    """The first statement of the `sentence`, without what is in brackets.
+
+    Without a declared metric that is the outcome in every metric: no one decides.
+    """
+    first = IN_BRACKETS.sub("", sentence(judged)).partition(". ")[0].rstrip(".")
+    return first.partition(";")[0] if judged.beforehand else first
 
 
 def _versions_words(judged: PairVerdicts) -> str:

@@ -14,7 +14,7 @@ If several versions of an arm's code were measured on the pairs of a question, i
 smaller (`gsbench.analysis.attempts`). The other arms of its declaration are still adjusted for it.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from gsbench.analysis.attempts import measured_versions, of_same_arm, share_of_version
@@ -30,6 +30,7 @@ from gsbench.analysis.quantities import (
     choose_quantities,
 )
 from gsbench.analysis.results import Arm, TrialResult, group_by
+from gsbench.analysis.statistics import UNDECIDED
 from gsbench.analysis.unfinished import Unfinished
 from gsbench.runs.experiments import NO_TIME, Declaration, Question
 
@@ -70,6 +71,11 @@ class PairVerdicts:
             return None
         return next((note for note in self.notes if note.about == self.declared.name), None)
 
+    @property
+    def undecided(self) -> bool:
+        """Return whether no verdict that decides about the arms is decided."""
+        return all(one.outcome == UNDECIDED for one in self.primary)
+
     def role(self, verdict: Verdict) -> str:
         """Declared or secondary; "" if all metrics are one family."""
         return SECONDARY if verdict.question.secondary else DECLARED if self.beforehand else ""
@@ -87,26 +93,31 @@ def judge_pairs(
     lacking: Sequence[Unfinished] = (),
     others: Sequence[ArmPair] = (),
     older: Sequence[TrialResult] = (),
+    turned: Collection[ArmPair] = (),
 ) -> list[PairVerdicts]:
     """Judge each pair of arms in every metric that has a direction.
 
     ``declared`` defines the families of tests; ``lacking`` are trials without a result, ``older``
-    those of earlier code. The pairs ``others`` are no questions of the declaration.
+    those of earlier code. The pairs ``others`` are no questions of the declaration, and those that
+    are ``turned`` are questions of it with the sides exchanged.
     """
     by_arm = group_by(trials, lambda trial: trial.arm)
     primaries: dict[ArmPair, Quantity] = {}
     standings: dict[ArmPair, Standing] = {}
     undirected: dict[ArmPair, list[Note]] = {}
     versions: dict[ArmPair, int] = {}
-    asked: list[Asked] = []
-    gone: list[tuple[Asked, OtherTest]] = []
+    asked: list[PairQuestion] = []
+    gone: list[tuple[PairQuestion, OtherTest]] = []
+    # All questions are collected before one is judged, since families span pairs.
     for pair in pairs:
         first, second = (by_arm.get(arm, []) for arm in pair)
         metrics = [
             metric for metric in choose_quantities(_trials_of(by_arm, pair)) if not metric.cost
         ]
+        # of a question that is turned, what was asked of the arm stands in the baseline's place
+        sides = (second, first) if pair in turned else (first, second)
         if declared is not None:
-            standing = declared.standing(first, second, other_pair=pair in others)
+            standing = declared.standing(*sides, other_pair=pair in others)
             primary = asked_quantity(standing.active.metric, trials)
             standings[pair], primaries[pair] = standing, primary
             metrics = [primary, *(metric for metric in metrics if metric.key != primary.key)]
@@ -116,15 +127,15 @@ def judge_pairs(
             if not metric.direction
         ]
         directed = [metric for metric in metrics if metric.direction]
-        versions[pair] = measured_versions(first, second, older)
+        versions[pair] = measured_versions(*sides, older)
         known = standings.get(pair)
         asked += [
-            Asked(pair, metric, _question(first, pair, metric, known), known, versions[pair])
+            PairQuestion(pair, metric, _question(first, pair, metric, known), known, versions[pair])
             for metric in directed
         ]
         if declared is not None:
-            gone += _before_late_trials(pair, directed, first, second, known)
-            gone += _of_earlier_code(pair, directed, first, second, declared)
+            gone += _before_late_trials(pair, directed, *sides, known)
+            gone += _of_earlier_code(pair, directed, *sides, declared)
     verdicts = _judge_families(by_arm, trials, asked, gone, lacking)
     by_pair = group_by(zip(asked, verdicts, strict=True), lambda answered: answered[0].pair)
     judged = []
@@ -167,7 +178,7 @@ def _why_missing(trials: Sequence[TrialResult], metric: Quantity, verdict: Verdi
 
 
 @dataclass(frozen=True)
-class Asked:
+class PairQuestion:
     """A question about a pair of arms, with the standing of the declaration to it."""
 
     pair: ArmPair
@@ -198,8 +209,8 @@ class Asked:
 def _judge_families(
     by_arm: Mapping[Arm, Sequence[TrialResult]],
     trials: Sequence[TrialResult],
-    asked: Sequence[Asked],
-    gone: Sequence[tuple[Asked, OtherTest]],
+    asked: Sequence[PairQuestion],
+    gone: Sequence[tuple[PairQuestion, OtherTest]],
     lacking: Sequence[Unfinished],
 ) -> list[Verdict]:
     """Judge each family of questions: those of one declaration, or of one exploratory pair.
@@ -250,7 +261,7 @@ def _before_late_trials(
     baseline: Sequence[TrialResult],
     arm: Sequence[TrialResult],
     standing: Standing | None,
-) -> list[tuple[Asked, OtherTest]]:
+) -> list[tuple[PairQuestion, OtherTest]]:
     """The tests of a pair's questions as they were before trials were added too late."""
     if standing is None or not standing.added:
         return []
@@ -260,7 +271,8 @@ def _before_late_trials(
     late = {(trial.scene, trial.seed) for trial in standing.added}
     in_time = [trial for trial in arm if (trial.scene, trial.seed) not in late]
     questions = [
-        Asked(pair, metric, _question(baseline, pair, metric, whole), whole) for metric in metrics
+        PairQuestion(pair, metric, _question(baseline, pair, metric, whole), whole)
+        for metric in metrics
     ]
     return [
         (question, other_test([*baseline, *in_time], question.question)) for question in questions
@@ -273,13 +285,13 @@ def _of_earlier_code(
     baseline: Sequence[TrialResult],
     arm: Sequence[TrialResult],
     declared: ActiveDeclaration,
-) -> list[tuple[Asked, OtherTest]]:
+) -> list[tuple[PairQuestion, OtherTest]]:
     """The tests of a pair's questions with each earlier version of the arm's code.
 
     The new code is tested in another family.
     """
     found = []
-    old = [replace(trial, variant=pair[1].variant) for trial in of_same_arm(arm, declared.older)]
+    old = [replace(trial, variant=arm[0].variant) for trial in of_same_arm(arm, declared.older)]
     for version in group_by(old, lambda trial: frozenset(trial.code.items())).values():
         # the state when this version was trained
         first = min(trial.measured for trial in version)
@@ -288,7 +300,7 @@ def _of_earlier_code(
         )
         standing = known.standing(baseline, version)
         questions = [
-            Asked(pair, metric, _question(baseline, pair, metric, standing), standing)
+            PairQuestion(pair, metric, _question(baseline, pair, metric, standing), standing)
             for metric in metrics
         ]
         found += [

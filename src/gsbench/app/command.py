@@ -13,12 +13,7 @@ from collections.abc import Sequence
 from gsbench.analysis.quantities import COSTS
 from gsbench.app.grids import planned_trials, run_sweep
 from gsbench.app.hydra_main import run_main
-from gsbench.app.plugins import (
-    TrialTask,
-    other_sweep,
-    words_for_plugins,
-    words_without_sweeper,
-)
+from gsbench.app.plugins import TrialTask, other_sweep, words_for_plugins, words_without_sweeper
 from gsbench.app.sweep import HYDRA_ERRORS, Ended, Sweep
 from gsbench.claims.stopping import log_verdicts
 from gsbench.config.command_words import parse
@@ -30,6 +25,7 @@ from gsbench.launch.batch import check_parts, missing_folders, need_no_check, ru
 from gsbench.launch.dry_run import describe_plan
 from gsbench.launch.jobs import Outcome
 from gsbench.logs import set_up_logging
+from gsbench.words import command
 
 log = logging.getLogger(__name__)
 
@@ -41,6 +37,7 @@ def launch(argv: list[str]) -> int:
     """
     words, multirun, is_dry_run = parse(argv)
     sweep = _read(words, multirun)
+    # Trials run in this block, so only Hydra's errors are about the words.
     with explained(words, HYDRA_ERRORS):
         if is_dry_run:
             return dry_run(sweep)
@@ -121,6 +118,7 @@ def one_trial_per_scene(verb: str, settings: Sequence[str], metric: str) -> dict
     keys = [word.partition("=")[0].lstrip("+") for word in settings]
     if implied := [key for key in keys if key in ("seed", "eval.primary")]:
         raise InputError(f"{verb}: {implied[0]} follows from the other words: leave it out")
+    # any seed will do: the verb runs as many as its question needs
     trials = compose_trials(
         [*settings, "seed=0", *([] if "name" in keys else [f"name={verb}"])], multirun=True
     )
@@ -128,7 +126,7 @@ def one_trial_per_scene(verb: str, settings: Sequence[str], metric: str) -> dict
     if len(by_scene) < len(trials):
         raise InputError(f"{verb} is about one arm: only scene may list values")
     require_waiting(verb, trials)
-    if metric not in COSTS:
+    if metric not in COSTS:  # raises for a metric that the trials would not compute
         EvalConfig(**trials[0].values["eval"] | {"primary": metric})
     return by_scene
 
@@ -146,6 +144,7 @@ def run_trials(trials: Sequence[Trial]) -> int:
 
 def list_trials(trials: Sequence[Trial]) -> None:
     """Print the trials with their states, and the folders that are missing; run none."""
+    # Making the parts loads torch, which takes seconds.
     if not need_no_check(trials):
         check_parts(trials, on_this_machine=False)
     lines = describe_plan(trials, trials[0].values["launch"]["parallel"])
@@ -165,9 +164,10 @@ def summarize(outcomes: Sequence[Outcome], trials: Sequence[Trial]) -> int:
     name = trials[-1].values["name"]  # the last one's: a tuning runs before, in its own experiments
     done = sum(outcome.status == "done" for outcome in outcomes)
     if any(outcome.status == "queued" for outcome in outcomes):
-        advice = f"how far the others are: gsbench status {name}"
+        advice = f"how far the others are: {command('status', name)}"
     else:
-        advice = f"again: gsbench retry {name}" if failed else f"the table: gsbench tables {name}"
+        advice = command("retry" if failed else "tables", name)
+        advice = f"{'again' if failed else 'the table'}: {advice}"
         if len(outcomes) == 1:
             advice += f"; renders and model: {outcomes[0].folder}"
     log.info("%d of %d trials done; %s", done, len(outcomes), advice)

@@ -17,9 +17,10 @@ from omegaconf import DictConfig, OmegaConf
 from gsbench.app.sweep import Run, Sweep
 from gsbench.app.tuning import tuned_jobs
 from gsbench.claims.stopping import KeyAndSeed, log_verdicts, plan_sweep
-from gsbench.config.command_words import bare_key, grid_points, is_interval, key_of, value_text
+from gsbench.config.command_words import grid_points, is_interval
 from gsbench.config.compose import Trial
 from gsbench.config.groups import GROUPS
+from gsbench.config.overrides import bare_key, key_of, value_text
 from gsbench.errors import InputError
 from gsbench.files import checked_runs_folder, make_runs_folder
 from gsbench.launch.record import declare_questions
@@ -93,7 +94,7 @@ def _run_until_decided(trials: Sequence[Trial], run: Run) -> None:
         if batch:
             run(batch)
 
-    stopping.asked.answer(run_planned)
+    stopping.test.answer(run_planned)
     if not launched:  # else it is said when the trials' outcomes are
         log_verdicts(trials)
     spared = [
@@ -146,10 +147,10 @@ def words_of_grids(
     listed = set(map(bare_key, itertools.chain(*grids)))
     jobs = []
     for grid in grids or [{}]:
-        own = set(map(bare_key, grid))
-        shared = {key: value for key, value in params.items() if bare_key(key) not in own}
+        of_grid = set(map(bare_key, grid))
+        shared = {key: value for key, value in params.items() if bare_key(key) not in of_grid}
         words = [f"{key}={value}" for key, value in (*grid.items(), *shared.items())]
-        jobs.append([*words, *(word for word in given if key_of(word) not in listed - own)])
+        jobs.append([*words, *(word for word in given if key_of(word) not in listed - of_grid)])
     return jobs
 
 
@@ -160,18 +161,20 @@ def _advise_grids(sweep: Sweep, typed: Mapping[str, Override]) -> str:
     """
     for group in GROUPS:
         choices = typed.get(group)
-        own = [
+        keys_of_group = [
             key
             for key, word in typed.items()
             if key.startswith(f"{group}.") and not word.is_add() and not word.is_delete()
         ]
-        if choices is None or not choices.is_discrete_sweep() or not own:
+        if choices is None or not choices.is_discrete_sweep() or not keys_of_group:
             continue
         lacking: dict[tuple[str, ...], list[str]] = {}  # {settings: the choices that lack them}
         for choice in map(str, choices.sweep_string_iterator()):
             node = sweep.composer.settings([f"{group}={choice}"])
-            lacking.setdefault(tuple(key for key in own if not _has(node, key)), []).append(choice)
-        words = [choices.input_line, *(typed[key].input_line for key in own)]
+            lacking.setdefault(
+                tuple(key for key in keys_of_group if not _has(node, key)), []
+            ).append(choice)
+        words = [choices.input_line, *(typed[key].input_line for key in keys_of_group)]
         if len(lacking) == 1 or any(mark in str(word) for word in words for mark in "'\""):
             continue
         arms = []
@@ -179,7 +182,7 @@ def _advise_grids(sweep: Sweep, typed: Mapping[str, Override]) -> str:
             values = {group: ",".join(names)}
             values |= {
                 key: str(typed[key].input_line).partition("=")[2]
-                for key in own
+                for key in keys_of_group
                 if key not in missing
             }
             arms.append(", ".join(f'{key}: "{value}"' for key, value in values.items()))

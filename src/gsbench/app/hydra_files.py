@@ -12,8 +12,8 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf
 
 from gsbench.app.sweep import OWN
-from gsbench.config.command_words import key_of
-from gsbench.config.compose import installed_nodes
+from gsbench.config.hydra_setup import installed_nodes
+from gsbench.config.overrides import key_of
 from gsbench.errors import InputError
 from gsbench.launch.jobs import check_job_links
 
@@ -30,10 +30,10 @@ def words_for_hydras_files(config: DictConfig, words: Sequence[str], multirun: b
 
     Otherwise Hydra writes nothing, since each trial's folder has its configuration and log.
     """
-    node, own = (OmegaConf.to_container(config.hydra, resolve=False), installed_nodes(()))
+    node, usual = (OmegaConf.to_container(config.hydra, resolve=False), installed_nodes(()))
     assert isinstance(node, dict)
     logs = node["job_logging"].get("root")
-    if not logs and all(node[key] == own[key] for key in WRITTEN):
+    if not logs and all(node[key] == usual[key] for key in WRITTEN):
         return []
     typed = {key_of(word) for word in words}
     added = {}
@@ -41,9 +41,9 @@ def words_for_hydras_files(config: DictConfig, words: Sequence[str], multirun: b
         added["hydra.output_subdir"] = ".hydra"
     if not logs and "hydra/job_logging" not in typed:
         added |= {"hydra/job_logging": "default", "hydra.job_logging.root.handlers": "[file]"}
-    if node["run"] == own["run"]:
+    if node["run"] == usual["run"]:
         added["hydra.run.dir"] = f"${{runs}}/{FOLDER}"
-    if multirun and node["sweep"]["subdir"] == own["sweep"]["subdir"]:
+    if multirun and node["sweep"]["subdir"] == usual["sweep"]["subdir"]:
         added["hydra.sweep.subdir"] = "${hydra.job.num}"
     if multirun and config.hydra.runtime.choices["hydra/launcher"] == OWN:
         if config.launch.name == "serial":

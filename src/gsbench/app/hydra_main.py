@@ -11,7 +11,7 @@ import hydra.utils
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from gsbench.config.compose import CONFIG_NAME, VERSION_BASE
+from gsbench.config.hydra_setup import CONFIG_NAME, VERSION_BASE
 from gsbench.config.schema import register_schemas
 from gsbench.config.trust import HYDRAS_CALLBACKS, load_callbacks
 from gsbench.runs.nested import targets_in

@@ -28,27 +28,10 @@ from gsbench.analysis.results import group_by
 from gsbench.app.grids import GRIDS, run_sweep
 from gsbench.app.hydra_files import check_links, words_for_hydras_files, words_for_new_folder
 from gsbench.app.hydra_main import run_main
-from gsbench.app.sweep import (
-    DEFAULT_METRIC,
-    HYDRA_ERRORS,
-    OWN,
-    Ended,
-    Sweep,
-    better_direction,
-)
-from gsbench.config.command_words import (
-    bare_key,
-    grid_points,
-    is_sweep,
-    key_of,
-    parse_word,
-    task_words,
-)
-from gsbench.config.compose import (
-    Trial,
-    check_permitted,
-    trial_of_job,
-)
+from gsbench.app.sweep import DEFAULT_METRIC, HYDRA_ERRORS, OWN, Ended, Sweep, better_direction
+from gsbench.config.command_words import grid_points
+from gsbench.config.compose import Trial, check_permitted, trial_of_job
+from gsbench.config.overrides import bare_key, is_sweep, key_of, parse_word, task_words
 from gsbench.errors import GsbenchError, InputError
 from gsbench.files import checked_runs_folder
 from gsbench.launch.batch import begin_for_another_launcher
@@ -56,7 +39,7 @@ from gsbench.launch.jobs import Outcome, outcome_of_error
 from gsbench.logs import set_up_logging
 from gsbench.runs.experiments import metric_and_question
 from gsbench.system.own_modules import allow_modules
-from gsbench.words import counted
+from gsbench.words import command, counted
 
 GRID_SWEEPER = "basic"  # Hydra's own, which expands lists and asks for no values
 MAX_CHOICES = 1000  # of groups, in a sweep of another sweeper
@@ -152,8 +135,8 @@ class TrialTask:
     def _compose(self, config: DictConfig, typed: DictConfig) -> list[Trial]:
         """The job's trial, or one for each seed of the objective."""
         words: Any = OmegaConf.to_container(typed, resolve=False)
-        own = [word for word in words["hydra"] if word.partition("=")[0] not in (MODE, GRIDS)]
-        overrides, trials = [*own, *words["task"]], []
+        of_hydra = [word for word in words["hydra"] if word.partition("=")[0] not in (MODE, GRIDS)]
+        overrides, trials = [*of_hydra, *words["task"]], []
         for word in self.objective.seeds if self.objective else ():
             of_seed = copy.deepcopy(config)
             of_seed.seed = parse_word(word).value()
@@ -282,10 +265,10 @@ def other_sweep(sweep: Sweep, run: Callable[[Sequence[Trial]], list[Outcome]]) -
         ) from error
     if not task.ended.trials:
         log.info(
-            "hydra/sweeper=%s has ended: gsbench status %s; the table: gsbench tables %s",
+            "hydra/sweeper=%s has ended: %s; the table: %s",
             name,
-            config.name,
-            config.name,
+            command("status", config.name),
+            command("tables", config.name),
         )
     elif name != GRID_SWEEPER and (best := best_line(task.ended.trials, objective)):
         log.info("hydra/sweeper=%s: %s", name, best)
@@ -299,9 +282,9 @@ def best_line(trials: Sequence[Trial], objective: Objective) -> str:
     """
     by_job = group_by(trials, _words_without_seed)
     values: dict[tuple[str, ...], float] = {}
-    for words, own in by_job.items():
+    for words, of_job in by_job.items():
         with suppress(GsbenchError):  # a job that failed has no value
-            values[words] = objective.value(own)
+            values[words] = objective.value(of_job)
     if not values:
         return ""
     best = max(values, key=lambda words: objective.sign * values[words])

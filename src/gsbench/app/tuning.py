@@ -15,115 +15,41 @@ from __future__ import annotations
 import importlib.util
 import itertools
 import logging
-import math
-import statistics
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from hydra.core.override_parser.types import Override
 
-from gsbench.app.sweep import DEFAULT_METRIC, Run, Sweep, better_direction
-from gsbench.config.command_words import (
-    bare_key,
-    check_makes_trials,
-    grid_points,
-    key_of,
-    parse_word,
+from gsbench.analysis.results import group_by
+from gsbench.app.arm_search import (
+    RETUNED,
+    SEED,
+    ArmSearch,
+    distribution,
+    own_values,
+    words_of_values,
 )
+from gsbench.app.sweep import DEFAULT_METRIC, Run, Sweep, better_direction
+from gsbench.config.command_words import grid_points
 from gsbench.config.compose import Composer, Trial
+from gsbench.config.overrides import bare_key, key_of, parse_word
 from gsbench.config.schema import TUNE, TuneSettings
 from gsbench.errors import GsbenchError, InputError
 from gsbench.eval.facts import known_keys
 from gsbench.files import checked_runs_folder, make_runs_folder, write_json
-from gsbench.runs.experiments import SearchPoint, TuningRecord, make_home, metric_and_question
+from gsbench.runs.experiments import TuningRecord, make_home, metric_and_question
 from gsbench.runs.layout import TUNING
-from gsbench.runs.nested import flatten
 from gsbench.settings import check_values
 from gsbench.system.install import install_command
-from gsbench.words import counted, did_you_mean, listed
+from gsbench.words import command, counted, did_you_mean, listed
 
 if TYPE_CHECKING:
-    from optuna import Study
-    from optuna.distributions import BaseDistribution
     from optuna.trial import Trial as Proposal
 
 log = logging.getLogger(__name__)
 
-SEED = "seed"
-# groups that say how all arms are run and judged
-NOT_TUNED = ("scene", "eval", "launch", "tracking", "hydra")
-# settings that have their own values in the trials of a point
-RETUNED = (SEED, "name", "scene.validation", "eval.primary")
-DIGITS = 4  # significant digits of a value, so that people can type it
-
-
-@dataclass(frozen=True)
-class ArmSearch:
-    """The search for the values of an arm, in the experiment whose folder is ``home``.
-
-    ``record`` says what is searched and by which metric, and gets the judged points. ``jobs`` are
-    the arm's jobs in the sweep without the settings `RETUNED`. ``first`` are the arm's own values,
-    None if they lie outside the ranges.
-    """
-
-    record: TuningRecord
-    home: Path
-    at_once: int
-    ranges: Mapping[str, BaseDistribution]
-    jobs: Sequence[Sequence[str]]
-    first: Mapping[str, Any] | None
-
-    @cached_property
-    def study(self) -> Study:
-        """Optuna's study, which proposes points and gets their results."""
-        import optuna
-
-        optuna.logging.set_verbosity(optuna.logging.WARNING)
-        sampler = optuna.samplers.TPESampler(seed=0, constant_liar=self.at_once > 1)
-        direction: Literal["maximize", "minimize"] = "minimize"
-        if self.record.direction > 0:
-            direction = "maximize"
-        study = optuna.create_study(direction=direction, sampler=sampler)
-        if self.first is not None:
-            study.enqueue_trial(dict(self.first))
-        return study
-
-    def propose(self) -> list[Proposal]:
-        """The next points, ``at_once`` at most; none once all are judged."""
-        count = min(self.at_once, self.record.wanted - len(self.record.points))
-        return [self.study.ask(dict(self.ranges)) for _ in range(count)]
-
-    def jobs_of(self, values: Mapping[str, Any]) -> list[list[str]]:
-        """The words of a point's trials."""
-        own = [
-            f"name={self.home.name}",
-            "scene.validation=true",
-            "eval.primary=null",
-            *words_of_values(values),
-        ]
-        seeds = [f"{SEED}={seed}" for seed in self.record.seeds]
-        return [[*job, *own, seed] for job, seed in itertools.product(self.jobs, seeds)]
-
-    def value_of(self, trial: Trial) -> float | None:
-        """The metric of a trial, read from its files; None if it has none."""
-        record = trial.files.sound_record()
-        return None if record is None else record.metrics.get(self.record.metric)
-
-    def judge(self, proposal: Proposal, trials: Sequence[Trial]) -> SearchPoint:
-        """Judge a point by the mean of its trials; it failed if one of them lacks the metric."""
-        from optuna.trial import TrialState
-
-        values = [value for trial in trials if (value := self.value_of(trial)) is not None]
-        mean = statistics.fmean(values) if len(values) == len(trials) else None
-        state = TrialState.FAIL if mean is None else TrialState.COMPLETE
-        self.study.tell(proposal, mean, state=state)
-        settings = {key: _rounded(value) for key, value in proposal.params.items()}
-        point = SearchPoint(settings=settings, value=mean)
-        self.record.points.append(point)
-        return point
+# the metric of all searches, its better direction, and the seeds of a point's trials
+Goal = tuple[str, Literal[-1, 1], list[int]]
 
 
 def tuned_jobs(
@@ -159,7 +85,7 @@ def tuned_jobs(
     best_words = {arm: _best_words(search) for arm, search in tuned.items()}
     arms = (trial.folder.parent.name for trial in trials)
     tuned_words = (best_words.get(arm, ()) for arm in arms)
-    return [[*job, *own] for job, own in zip(jobs, tuned_words, strict=True)], True
+    return [[*job, *best] for job, best in zip(jobs, tuned_words, strict=True)], True
 
 
 def _search(composer: Composer, searches: Sequence[ArmSearch], run: Run | None) -> bool:
@@ -180,15 +106,15 @@ def _search(composer: Composer, searches: Sequence[ArmSearch], run: Run | None) 
         composed = iter(composer.trials(list(itertools.chain(*(jobs for _, _, jobs in points)))))
         trials = [list(itertools.islice(composed, len(jobs))) for _, _, jobs in points]
         missing: list[Trial] = []
-        for (search, _, _), own in zip(points, trials, strict=True):
-            missing += [trial for trial in own if search.value_of(trial) is None]
+        for (search, _, _), of_point in zip(points, trials, strict=True):
+            missing += [trial for trial in of_point if search.value_of(trial) is None]
         if missing:
             if run is None:
                 return False
             _write(searches)  # before training, so that the ranges were on record before any result
             run(missing)
-        for (search, proposal, _), own in zip(points, trials, strict=True):
-            point, record = search.judge(proposal, own), search.record
+        for (search, proposal, _), of_point in zip(points, trials, strict=True):
+            point, record = search.judge(proposal, of_point), search.record
             if missing:
                 value = "failed" if point.value is None else f"{point.value:.5g}"
                 title = f"{search.home.name}: point {len(record.points)} of {record.wanted}"
@@ -212,8 +138,8 @@ def _best_words(search: ArmSearch) -> list[str]:
     record, best, name = search.record, search.record.best, search.home.name
     if best is None:
         raise GsbenchError(
-            f"{TUNE}: no point of {record.arm} has a {record.metric} (gsbench status {name} says "
-            "why)"
+            f"{TUNE}: no point of {record.arm} has a {record.metric} "
+            f"({command('status', name)} says why)"
         )
     words = words_of_values(best.settings)
     failed = sum(point.value is None for point in record.points)
@@ -272,49 +198,60 @@ def _plan(
         raise InputError(
             f"{TUNE} searches on validation views by itself: leave scene.validation out"
         )
-    metric, direction, seeds = _goal(tune, trials)
-    (home,) = homes
-    arms = [trial.folder.parent.name for trial in trials]
-    searches = []
-    for arm in dict.fromkeys(arms):
-        indices = [index for index, name in enumerate(arms) if name == arm]
-        found: dict[str, Override] = {}
-        arm_jobs = []
-        for i in indices:
-            found |= intervals[i]
-            arm_jobs.append(tuple(word for word in jobs[i] if key_of(word) not in RETUNED))
-        arm_intervals = {key: found[key] for key in sorted(found)}
-        fixed = set(map(key_of, itertools.chain(*arm_jobs)))
-        if both := next((key for key in arm_intervals if bare_key(key) in fixed), None):
-            raise InputError(
-                f"{both} of {arm} is searched in one grid and given in another: leave one of them "
-                "out"
-            )
-        ranges = {key: distribution(interval) for key, interval in arm_intervals.items()}
-        first = _own_values(trials[indices[0]].values, ranges)
-        record = TuningRecord(
-            sweep=home.name,
-            arm=arm,
-            metric=metric,
-            direction=direction,
-            wanted=tune.points,
-            seeds=seeds,
-            scenes=list(dict.fromkeys(trial.values["scene"]["name"] for trial in trials)),
-            ranges={
-                key: str(interval.input_line).partition("=")[2]
-                for key, interval in arm_intervals.items()
-            },
-            log=[key for key, values in ranges.items() if getattr(values, "log", False)],
-            points=[],
-        )
-        own_home = home.with_name(f"{home.name}-tune-{arm}")
-        searches.append(
-            ArmSearch(record, own_home, tune.at_once, ranges, list(dict.fromkeys(arm_jobs)), first)
-        )
-    return searches
+    goal = _goal(tune, trials)
+    scenes = list(dict.fromkeys(trial.values["scene"]["name"] for trial in trials))
+    by_arm = group_by(
+        zip(trials, jobs, intervals, strict=True), lambda job: job[0].folder.parent.name
+    )
+    return [_arm_search(tune, arm, goal, scenes, of_arm) for arm, of_arm in by_arm.items()]
 
 
-def _goal(tune: TuneSettings, trials: Sequence[Trial]) -> tuple[str, Literal[-1, 1], list[int]]:
+def _arm_search(
+    tune: TuneSettings,
+    arm: str,
+    goal: Goal,
+    scenes: list[str],
+    jobs: Sequence[tuple[Trial, Sequence[str], Mapping[str, Override]]],
+) -> ArmSearch:
+    """The search of an arm with these ``jobs``: each a trial, its words, and its intervals."""
+    metric, direction, seeds = goal
+    found: dict[str, Override] = {}
+    for _, _, of_job in jobs:
+        found |= of_job
+    intervals = {key: found[key] for key in sorted(found)}
+    kept = [tuple(word for word in words if key_of(word) not in RETUNED) for _, words, _ in jobs]
+    fixed = set(map(key_of, itertools.chain(*kept)))
+    if both := next((key for key in intervals if bare_key(key) in fixed), None):
+        raise InputError(
+            f"{both} of {arm} is searched in one grid and given in another: leave one of them out"
+        )
+    ranges = {key: distribution(interval) for key, interval in intervals.items()}
+    first, home = jobs[0][0], jobs[0][0].files.home
+    record = TuningRecord(
+        sweep=home.name,
+        arm=arm,
+        metric=metric,
+        direction=direction,
+        wanted=tune.points,
+        seeds=seeds,
+        scenes=scenes,
+        ranges={
+            key: str(interval.input_line).partition("=")[2] for key, interval in intervals.items()
+        },
+        log=[key for key, values in ranges.items() if getattr(values, "log", False)],
+        points=[],
+    )
+    return ArmSearch(
+        record,
+        home.with_name(f"{home.name}-tune-{arm}"),
+        tune.at_once,
+        ranges,
+        list(dict.fromkeys(kept)),
+        own_values(first.values, ranges),
+    )
+
+
+def _goal(tune: TuneSettings, trials: Sequence[Trial]) -> Goal:
     """The metric of all searches, its better direction, and the seeds of a point's trials.
 
     Raises InputError for an unknown metric, and for one without a better direction.
@@ -347,67 +284,3 @@ def _goal(tune: TuneSettings, trials: Sequence[Trial]) -> tuple[str, Literal[-1,
 
 
 # ---- ranges
-
-
-def distribution(override: Override) -> BaseDistribution:
-    """The range of an interval, for Optuna.
-
-    Raises InputError for a wrong interval or a setting that arms share.
-    """
-    from optuna.distributions import FloatDistribution, IntDistribution
-
-    check_makes_trials(override)
-    key = override.get_key_element()
-    if bare_key(key).partition(".")[0] in (*NOT_TUNED, *RETUNED):
-        raise InputError(f"{key} belongs to what all arms share, not to one arm: give it a value")
-    sweep: Any = override.value()
-    low, high, log_scale = sweep.start, sweep.end, "log" in sweep.tags
-    try:
-        if not -math.inf < low < high < math.inf:
-            raise ValueError("an interval goes from a number to a larger one")
-        if log_scale and low <= 0:
-            raise ValueError("on a logarithmic scale an interval begins above 0")
-        if "int" in sweep.tags:
-            if not float(low).is_integer() or not float(high).is_integer():
-                raise ValueError("whole numbers lie between whole numbers")
-            return IntDistribution(int(low), int(high), log=log_scale)
-        return FloatDistribution(float(low), float(high), log=log_scale)
-    except ValueError as error:
-        raise InputError(f"{override.input_line}: {error}") from error
-
-
-def _own_values(
-    values: Mapping[str, Any], ranges: Mapping[str, BaseDistribution]
-) -> dict[str, Any] | None:
-    """The arm's own values of the searched settings; None if outside the ranges, or if none."""
-    settings = flatten(values)
-    own = {key: settings.get(bare_key(key)) for key in ranges}
-    return (
-        own if own and all(_is_in(own[key], searched) for key, searched in ranges.items()) else None
-    )
-
-
-def _is_in(value: Any, searched: Any) -> bool:
-    """Return whether ``value`` lies in ``searched`` and rounding to `DIGITS` does not change it."""
-    if (
-        isinstance(value, bool)
-        or not isinstance(value, int | float)
-        or not searched.low <= value <= searched.high
-    ):
-        return False
-    return (
-        isinstance(value, int) if isinstance(searched.low, int) else _rounded(float(value)) == value
-    )
-
-
-def words_of_values(values: Mapping[str, Any]) -> list[str]:
-    """The words of a command line that set ``values``."""
-    return [
-        f"{key}={f'{value:.{DIGITS}g}' if isinstance(value, float) else value}"
-        for key, value in values.items()
-    ]
-
-
-def _rounded(value: Any) -> Any:
-    """A value rounded as `words_of_values` writes it."""
-    return float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value

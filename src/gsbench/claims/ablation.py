@@ -25,7 +25,9 @@ Run = frozenset[str]  # the switches that are on
 TrialKeys = Mapping[str, str]  # scene -> folder of a run's trials, without the seed
 
 
-def declared_switches(own: Mapping[str, Switch], values: Mapping[str, Any]) -> dict[str, Switch]:
+def declared_switches(
+    of_class: Mapping[str, Switch], values: Mapping[str, Any]
+) -> dict[str, Switch]:
     """The switches of a densifier's class (``own``) and of its settings.
 
     Those whose ``off`` settings hold already are left out. Raises InputError for a malformed
@@ -36,7 +38,7 @@ def declared_switches(own: Mapping[str, Switch], values: Mapping[str, Any]) -> d
         raise InputError(
             f"densify.switches must be a mapping NAME: {{off: {{KEY: VALUE}}}}, got {in_settings!r}"
         )
-    switches = dict(own)
+    switches = dict(of_class)
     for name, entry in in_settings.items():
         where = f"densify.switches.{name}"
         if not isinstance(entry, Mapping) or "off" not in entry:
@@ -151,8 +153,8 @@ def markdown_table(verdicts: Sequence[Verdict]) -> list[str]:
         f"| run | difference in {name} from all parts | interval | verdict |",
         "|---|---|---|---|",
     ]
-    for one in verdicts:
-        mean = "–" if one.mean is None else one.shown(one.mean)
-        interval = "–" if one.interval is None else one.shown_interval(one.interval)
-        lines.append(f"| {one.question.arm} | {mean} | {interval} | {reason(one)} |")
+    for verdict in verdicts:
+        mean = "–" if verdict.mean is None else verdict.shown(verdict.mean)
+        interval = "–" if verdict.interval is None else verdict.shown_interval(verdict.interval)
+        lines.append(f"| {verdict.question.arm} | {mean} | {interval} | {reason(verdict)} |")
     return lines

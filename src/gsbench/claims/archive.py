@@ -11,6 +11,7 @@ An archive is a zip file that is also an RO-Crate 1.2 (`gsbench.claims.export` w
 - ``per_view.csv``: the metrics of every test view;
 - ``declared.jsonl``: the declarations of the experiment, if there are any;
 - ``ledger.jsonl``: the ideas of a ledger (`gsbench ledger`), if it is one;
+- ``searches.jsonl``: the records of searches that tuned its arms, or of the search that it is;
 - ``from_pixels.jsonl``: measures of the trials' pictures, if declared claims use them;
 - ``pictures/``: renders and photographs of test views by trial, only if they were asked for;
 - ``archive.json``: the version of this format and the sha256 of the files above;
@@ -41,6 +42,8 @@ from gsbench.analysis.results import (
     read_views,
 )
 from gsbench.errors import InputError
+from gsbench.parsing import parse_typed
+from gsbench.runs.experiments import TuningRecord
 from gsbench.runs.layout import (
     CONFIG,
     DECLARED,
@@ -50,6 +53,7 @@ from gsbench.runs.layout import (
     PER_VIEW,
     RENDERS,
     RESULTS,
+    TUNING,
 )
 from gsbench.settings import ARM_BYTES, is_folder_name
 from gsbench.words import readable_bytes
@@ -59,6 +63,7 @@ FORMAT, VERSION = "gsbench results", 1
 PIXELS = "from_pixels.jsonl"
 MANIFEST, CRATE = "archive.json", "ro-crate-metadata.json"
 TRIALS, CONFIGURATIONS = "results.jsonl", "configurations.jsonl"
+SEARCHES = "searches.jsonl"
 UNFINISHED, OLDER = "unfinished.jsonl", "older"
 PICTURES_FOLDER, PICTURES = "pictures", (RENDERS, GROUND_TRUTH)
 # Archives may come from strangers: these limits stop a zip bomb. They are larger than any
@@ -86,6 +91,8 @@ def unpack_archive(file: Path, runs: Path) -> Experiment:
             (_checked_folder(line["folder"]), line["results"]) for line in _lines(contents[TRIALS])
         ]
         _unpack(home, trials, contents)
+        for line in _lines(contents.get(SEARCHES, b"")):
+            _unpack_search(runs, line)
         for line in _lines(contents[TRIALS]):
             if line.get(OLDER):  # what was finished last counts
                 os.utime(home / line["folder"] / RESULTS, (0, 0))
@@ -248,6 +255,16 @@ def _unpack_unfinished(home: Path, line: Mapping[str, Any]) -> Path:
     folder.mkdir(parents=True)
     (folder / CONFIG).write_text(yaml.safe_dump(line["configuration"]), encoding="utf-8")
     return folder
+
+
+def _unpack_search(runs: Path, line: Mapping[str, Any]) -> None:
+    """Write the record of a search into the folder of its experiment."""
+    name, content = line["experiment"], json.dumps(line["search"]).encode()
+    parse_typed(content, TuningRecord, Path(SEARCHES))
+    if not isinstance(name, str) or not is_folder_name(name):
+        raise InputError(f"{name!r} cannot be the name of an experiment")
+    (runs / name).mkdir(exist_ok=True)
+    (runs / name / TUNING).write_bytes(content)
 
 
 def _unpack_picture(home: Path, name: str, content: bytes) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from gsbench.analysis.comparison import unused_trials
 from gsbench.analysis.judgement import Verdict, judge
-from gsbench.analysis.notes import Note
+from gsbench.analysis.notes import Note, texts
 from gsbench.analysis.pairing import Pairs
 from gsbench.analysis.quantities import asked_quantity
 from gsbench.analysis.results import read_experiment
@@ -20,7 +20,7 @@ from gsbench.analysis.statistics import SUPPORTED
 from gsbench.analysis.verdict_words import in_words, reason
 from gsbench.claims.archive import unpack_archive
 from gsbench.claims.file import Claim, ClaimsFile
-from gsbench.claims.stopping import Asked, KeyAndSeed, trials_of_look
+from gsbench.claims.stopping import KeyAndSeed, SequentialTest, trials_of_look
 from gsbench.config.compose import Trial, compose_one, with_seed
 from gsbench.errors import InputError
 from gsbench.parsing import read_if_sound
@@ -58,14 +58,15 @@ class ClaimVerdict:
         verdict = self.verdict
         if verdict.untestable:
             return reason(verdict)
-        parts = [f"{self.claim.arm} against {self.claim.baseline}: {in_words(verdict)}"]
+        notes = []
         if verdict.outcome == SUPPORTED and not self._by_least():
-            parts.append(f"by {self.claim.effect} or more is not shown")
+            notes.append(Note.of("least not shown", effect=self.claim.effect))
         if not verdict.final:
-            parts.append("the next look waits for trials that are missing")
+            notes.append(Note.of("look waits"))
         if self.failed:
-            parts.append(f"failed: {some_of(list(self.failed))}")
-        return "; ".join(parts)
+            notes.append(Note.of("failed", reasons=self.failed))
+        words = f"{self.claim.arm} against {self.claim.baseline}: {in_words(verdict)}"
+        return "; ".join([words, *texts(notes)])
 
     def _by_least(self) -> bool:
         """Return whether the difference is shown to be the least that matters, or more."""
@@ -116,8 +117,8 @@ class Check:
         return self.to_run(trials_of_look(self.declaration, questions, seeds))
 
     @property
-    def asked(self) -> Asked:
-        return Asked(self.declaration, lambda: read_experiment(self.home).trials)
+    def test(self) -> SequentialTest:
+        return SequentialTest(self.declaration, lambda: read_experiment(self.home).trials)
 
     def checked(self, judged: Sequence[Verdict]) -> Checked:
         """All claims in the order of the file, with the reasons why trials failed."""
@@ -125,7 +126,7 @@ class Check:
         verdicts = [
             replace(verdict, failed=tuple(self._failures(verdict.verdict))) for verdict in verdicts
         ]
-        unused = unused_trials(list(self.asked.read()), judged)
+        unused = unused_trials(list(self.test.read()), judged)
         declarations = read_declarations(self.home)
         return Checked(self.file, verdicts, self.declaration, declarations, unused)
 
@@ -162,7 +163,7 @@ def prepare(
             for arm in (claim.baseline, claim.arm):
                 own = file.words(claim, scene, arm)
                 words = (*own, f"name={file.name}", "seed=0", *permissions)
-                if words not in composed:
+                if words not in composed:  # claims share scenes and arms
                     where = f"claim {claim.id}, scene {scene}, arm {arm}"
                     composed[words] = _compose(words, permissions, runs, where)
                 trials.append(composed[words])

@@ -80,9 +80,9 @@ def to_text(page: Page) -> str:
     """The page's lines and headlines, for a terminal."""
     verdicts = []
     for section in page.sections:
-        one = section.verdict
-        verdicts.append(f"{one.word:<19}  {one.claim.id}: {section.headline}")
-        more = _judged_on(one), like_these_words(one.verdict)
+        judged = section.verdict
+        verdicts.append(f"{judged.word:<19}  {judged.claim.id}: {section.headline}")
+        more = _judged_on(judged), like_these_words(judged.verdict)
         verdicts += [f"{'':<19}  {line}" for line in more if line]
     return "\n".join([page.title, *page.lines, *verdicts]) + "\n"
 
@@ -92,35 +92,35 @@ def to_html(page: Page) -> str:
     return fill("page.html.j2", "gsbench.claims", page=page, symbols=SYMBOLS)
 
 
-def _section(one: ClaimVerdict) -> ClaimSection:
-    claim, verdict, answer = one.claim, one.verdict, one.verdict.answer
+def _section(judged: ClaimVerdict) -> ClaimSection:
+    claim, verdict, answer = judged.claim, judged.verdict, judged.verdict.answer
     evidence = [f"what would refute it: {claim.refuted_if}"]
-    headline = one.sentence
+    headline = judged.sentence
     if answer is not None and answer.interval is not None:
         evidence += [
             f"least effect that matters: {claim.effect}; baseline's mean "
             f"{_number(verdict.pairs.baseline)}",
-            _judged_on(one),
+            _judged_on(judged),
             like_these_words(verdict),
         ]
     seen = [Note.of("seen", trials=len(verdict.seen))] if verdict.seen else []
     evidence += [outlying_words(verdict), *texts([*seen, *verdict.notes])]
-    fairness, mixed = _fairness(one)
+    fairness, mixed = _fairness(judged)
     if mixed:
         headline += f". {mixed}"
     return ClaimSection(
-        one,
+        judged,
         headline,
         tuple(filter(None, evidence)),
         fairness,
         _folders(verdict.pairs.trials),
-        _chart(one),
+        _chart(judged),
     )
 
 
-def _judged_on(one: ClaimVerdict) -> str:
+def _judged_on(judged: ClaimVerdict) -> str:
     """``judged on 8 trials: 2 scenes, 2 seeds, two arms; ...``; "" if there is no mean."""
-    verdict = one.verdict
+    verdict = judged.verdict
     if verdict.answer is None:
         return ""
     planned = ", ".join(str(seeds) for seeds in plan_looks(len(verdict.question.seeds)))
@@ -131,12 +131,12 @@ def _judged_on(one: ClaimVerdict) -> str:
     )
 
 
-def _fairness(one: ClaimVerdict) -> tuple[tuple[Table, ...], str]:
+def _fairness(judged: ClaimVerdict) -> tuple[tuple[Table, ...], str]:
     """The fairness sheets of a claim's arms, and the `caveats` of comparing them."""
-    trials = with_variants(one.verdict.pairs.trials)
+    trials = with_variants(judged.verdict.pairs.trials)
     arm_of = {trial.path: trial.arm for trial in trials}
     arms = dict.fromkeys(
-        (arm_of[baseline.path], arm_of[new.path]) for baseline, new in one.verdict.pairs.counting
+        (arm_of[baseline.path], arm_of[new.path]) for baseline, new in judged.verdict.pairs.counting
     )
     pairs = [(baseline, arm) for baseline, arm in arms if baseline != arm]
     # The arms are written in the claims file, so no command alone would change them.
@@ -157,21 +157,21 @@ def _declared_line(declared: Declaration, declarations: Sequence[Declaration]) -
     return line
 
 
-def _chart(one: ClaimVerdict) -> str:
-    verdict, answer = one.verdict, one.verdict.answer
+def _chart(judged: ClaimVerdict) -> str:
+    verdict, answer = judged.verdict, judged.verdict.answer
     if answer is None or answer.interval is None:
         return ""
     rows = [ForestRow(scene.scene, scene.mean) for scene in verdict.scenes]
     rows.append(ForestRow("all", answer.mean, answer.interval))
-    unit = "log ratio" if one.claim.effect.relative else "difference"
-    title = f"{one.claim.arm} against {one.claim.baseline}"
-    return forest_plot(title, rows, f"{verdict.quantity.name}, {unit}", one.claim.sign)
+    unit = "log ratio" if judged.claim.effect.relative else "difference"
+    title = f"{judged.claim.arm} against {judged.claim.baseline}"
+    return forest_plot(title, rows, f"{verdict.quantity.name}, {unit}", judged.claim.sign)
 
 
 def _folders(trials: Sequence[TrialResult]) -> tuple[tuple[str, str], ...]:
     """``("exp/garden/sfm-adc/1a2b3c4d", "seeds 0, 1, 2")`` for each scene and arm."""
     groups = group_by(trials, lambda trial: trial.label.rpartition(SEED)[0])
-    return tuple((folder, seeds_text(own)) for folder, own in groups.items())
+    return tuple((folder, seeds_text(of_arm)) for folder, of_arm in groups.items())
 
 
 def _number(value: float) -> str:

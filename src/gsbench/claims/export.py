@@ -18,11 +18,13 @@ from pathlib import Path, PurePath
 from typing import Any
 
 from gsbench import __version__
+from gsbench.analysis.fairness import searches_of
 from gsbench.analysis.images import PixelMeasures, textured_error
 from gsbench.analysis.quantities import TEXTURED
 from gsbench.analysis.results import (
     Experiment,
     TrialResult,
+    group_by,
     newest_code,
     read_views,
 )
@@ -36,6 +38,7 @@ from gsbench.claims.archive import (
     PICTURES,
     PICTURES_FOLDER,
     PIXELS,
+    SEARCHES,
     SEED_KEY,
     TRIALS,
     UNFINISHED,
@@ -44,13 +47,14 @@ from gsbench.claims.archive import (
 )
 from gsbench.errors import InputError
 from gsbench.files import atomic
-from gsbench.parsing import read_bytes, read_yaml
-from gsbench.runs.experiments import read_declarations
+from gsbench.parsing import read_bytes, read_typed, read_yaml
+from gsbench.runs.experiments import STAMP, TuningRecord, read_declarations
 from gsbench.runs.layout import (
     CONFIG,
     DECLARED,
     LEDGER,
     PER_VIEW,
+    TUNING,
 )
 from gsbench.runs.ledger import as_json, chained, read_ledger
 from gsbench.words import without_folders
@@ -72,6 +76,7 @@ FILES = {  # media types and descriptions
     CONFIGURATIONS: ("application/jsonl", "Every configuration, with the trials that had it"),
     PER_VIEW: ("text/csv", "Metrics of every test view of every trial"),
     PIXELS: ("application/jsonl", "What declared claims ask of the trials' pictures, measured"),
+    SEARCHES: ("application/jsonl", "The searches that tuned arms, with all points"),
     DECLARED: ("application/jsonl", "What was declared before the trials were run"),
     LEDGER: ("application/jsonl", "The ideas of a ledger and their tests (gsbench ledger)"),
     MANIFEST: ("application/json", "Version of the archive, and the sha256 of its files"),
@@ -83,9 +88,9 @@ def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> 
 
     ``pictures`` adds those of the test views. Raises InputError if no trial can be exported.
     """
-    kept, rows, left_out = [], [], list(experiment.warnings)
-    unfinished, experiment = [*experiment.lacking], newest_code(experiment)
-    older = {trial.path for trial in experiment.older}
+    left_out, unfinished = list(experiment.warnings), [*experiment.lacking]
+    experiment = newest_code(experiment)
+    kept, rows = list[TrialResult](), list[dict[str, Any]]()
     # {configuration as JSON: (folder, seed) of its trials}
     configurations: dict[str, list[tuple[str, int]]] = {}
     # results of earlier code were seen, so a declaration after it is late
@@ -102,6 +107,7 @@ def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> 
         kept.append(trial)
     if not kept:
         raise InputError(f"{experiment.name} has no whole trial to export (first: {left_out[0]})")
+    older = {trial.path for trial in experiment.older}
     contents = {
         TRIALS: _json_lines(
             {"folder": _folder(trial.path), "results": _results(trial)}
@@ -114,6 +120,7 @@ def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> 
         ),
         PER_VIEW: _table(rows),
         **_declared(experiment.folder, kept),
+        **_searches(experiment.folder, kept),
     }
     if unfinished:
         contents[UNFINISHED] = _json_lines(map(_unfinished, unfinished))
@@ -123,22 +130,24 @@ def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> 
             for path in trial.folder.pictures(kind):
                 contents[f"{place}/{path.name}"] = read_bytes(path)
     check_size(sum(map(len, contents.values())))
-    manifest = {
-        "format": FORMAT,
-        "version": VERSION,
-        "experiment": experiment.name,
-        "gsbench": __version__,
-        "sha256": {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()},
-    }
-    contents[MANIFEST] = _page(manifest)
-    sizes = {name: len(content) for name, content in contents.items()}
-    # The description of the crate comes first, where other programs look for it.
-    contents = {CRATE: _page(crate_metadata(experiment.name, kept, sizes))} | contents
-    with atomic(out, sync=False) as temporary, zipfile.ZipFile(temporary, "w") as archive:
-        for name, content in contents.items():
-            info = zipfile.ZipInfo(name, FIXED_DATE)
-            archive.writestr(info, content, zipfile.ZIP_DEFLATED, compresslevel=9)
+    _write_zip(out, experiment.name, kept, contents)
     return left_out
+
+
+def _write_zip(
+    out: Path, name: str, trials: Sequence[TrialResult], contents: dict[str, bytes]
+) -> None:
+    """Write the archive of these ``contents`` by name, with its manifest and its description."""
+    digests = {file: hashlib.sha256(content).hexdigest() for file, content in contents.items()}
+    manifest = {"format": FORMAT, "version": VERSION, "experiment": name}
+    contents = contents | {MANIFEST: _page(manifest | {"gsbench": __version__, "sha256": digests})}
+    sizes = {file: len(content) for file, content in contents.items()}
+    # The description of the crate comes first, where other programs look for it.
+    contents = {CRATE: _page(crate_metadata(name, trials, sizes))} | contents
+    with atomic(out, sync=False) as temporary, zipfile.ZipFile(temporary, "w") as archive:
+        for file, content in contents.items():
+            info = zipfile.ZipInfo(file, FIXED_DATE)
+            archive.writestr(info, content, zipfile.ZIP_DEFLATED, compresslevel=9)
 
 
 def _declared(home: Path, trials: Sequence[TrialResult]) -> dict[str, bytes]:
@@ -160,6 +169,23 @@ def _declared(home: Path, trials: Sequence[TrialResult]) -> dict[str, bytes]:
                 measured.append({"folder": _folder(trial.path), "measures": measures})
         contents[PIXELS] = _json_lines(measured)
     return contents
+
+
+def _searches(home: Path, trials: Sequence[TrialResult]) -> dict[str, bytes]:
+    """The search that the experiment in ``home`` is, and those that tuned its arms.
+
+    Points of a search were chosen by their results, so nothing about them may be tested.
+    """
+    found = {}
+    if (home / TUNING).exists():
+        found[home.name] = read_typed(home / TUNING, TuningRecord)
+    for of_arm in group_by(trials, lambda trial: trial.key).values():
+        found |= searches_of(of_arm[0])
+    lines = [
+        {"experiment": name, "search": without_paths(search.to_json())}
+        for name, search in sorted(found.items())
+    ]
+    return {SEARCHES: _json_lines(lines)} if lines else {}
 
 
 def _shared_ledger(home: Path) -> bytes:
@@ -217,6 +243,8 @@ def _configuration(path: Path) -> str:
 def _results(trial: TrialResult) -> dict[str, Any]:
     """The record of the trial without paths of this machine."""
     record = trial.record.to_json()
+    # unpacked files are new, so what was measured before a declaration would look later
+    record.setdefault("measured", time.strftime(STAMP, time.gmtime(trial.measured)))
     reasons = {metric: without_folders(reason) for metric, reason in record["unavailable"].items()}
     results: dict[str, Any] = without_paths(record | {"unavailable": reasons})
     return results

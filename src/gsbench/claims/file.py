@@ -35,7 +35,7 @@ from annotated_types import Interval, Predicate, doc
 from gsbench.analysis.looks import FIRST_LOOK, plan_looks
 from gsbench.analysis.quantities import askable_names, asked_quantity
 from gsbench.analysis.statistics import ALPHA
-from gsbench.config.command_words import value_text
+from gsbench.config.overrides import value_text
 from gsbench.config.permissions import PERMISSIONS
 from gsbench.errors import InputError
 from gsbench.parsing import read_yaml, resolved
@@ -220,11 +220,11 @@ def _claim(entry: object, number: int) -> Claim:
 def _require(cls: type, values: Iterable[str], where: str) -> None:
     """Raise InputError for the first field without a default that was not given."""
     given = set(values)
-    for one in fields(cls):
-        required = one.default is one.default_factory  # both are dataclasses.MISSING
-        if required and one.name not in given:
+    for entry in fields(cls):
+        required = entry.default is entry.default_factory  # both are dataclasses.MISSING
+        if required and entry.name not in given:
             raise InputError(
-                f"{where}{'.' if where else ''}{one.name} is not given: a claim needs it "
+                f"{where}{'.' if where else ''}{entry.name} is not given: a claim needs it "
                 "(docs/claims.md)"
             )
 
@@ -290,13 +290,13 @@ def _check_claim(claim: Claim, file: ClaimsFile) -> None:
 
 def _check_metric(claim: Claim, file: ClaimsFile) -> None:
     where, names = f"claim {claim.id}", askable_names()
-    own = f"eval.extra.{claim.metric}."
+    prefix = f"eval.extra.{claim.metric}."
     if claim.metric not in names and not any(
-        key.lstrip("+").startswith(own) for key in file.settings
+        key.lstrip("+").startswith(prefix) for key in file.settings
     ):
         raise InputError(
             f"{where}: {claim.metric!r} is not a metric{did_you_mean(claim.metric, names)} (choose "
-            f"{', '.join(names)}; one of your own by settings: {{{own}_target_: mine.MyMetric}})"
+            f"{', '.join(names)}; one of your own by settings: {{{prefix}_target_: mine.MyMetric}})"
         )
     effect = claim.effect
     if asked_quantity(claim.metric).cost and not effect.relative:

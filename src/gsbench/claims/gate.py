@@ -13,16 +13,17 @@ from typing import Any
 from gsbench.analysis.designs import POWER, Design, power_of_mean
 from gsbench.analysis.judgement import Verdict
 from gsbench.analysis.looks import FIRST_LOOK, look_levels, plan_looks
+from gsbench.analysis.notes import Note
 from gsbench.analysis.quantities import COSTS, NO_DIRECTION
 from gsbench.analysis.results import Arm, TrialResult
 from gsbench.analysis.statistics import REFUTED, SUPPORTED, TOO_SMALL, UNDECIDED
 from gsbench.analysis.verdict_words import in_words, least_words, with_notes
 from gsbench.claims.file import LeastEffect, read_least
-from gsbench.claims.stopping import Asked, facts_for
+from gsbench.claims.stopping import SequentialTest, facts_for
 from gsbench.errors import InputError
 from gsbench.eval.facts import known_keys
 from gsbench.runs.experiments import ERROR_RATE, Declaration, Question, declared_now, trial_key
-from gsbench.words import counted, did_you_mean, listed
+from gsbench.words import did_you_mean
 
 # replace the configuration hash in trials' keys, since versions may share settings
 BASELINE, NEW, LAST = "baseline", "new", "last"
@@ -31,13 +32,13 @@ PASSED, WORSE, NOT_DECIDED = "passed", "worse", "undecided"
 ReadTrials = Callable[[], Iterable[TrialResult]]
 
 
-def ask_gate(declaration: Declaration, baseline: ReadTrials, new: ReadTrials) -> Asked:
+def ask_gate(declaration: Declaration, baseline: ReadTrials, new: ReadTrials) -> SequentialTest:
     """The question of a gate, with functions that read each version's finished trials.
 
     It ends also as soon as the new version is shown not to be worse: a gate asks no more.
     """
     read = _versions({BASELINE: baseline, NEW: new})
-    return Asked(declaration, read, lambda verdicts: result_of(verdicts[0]) != NOT_DECIDED)
+    return SequentialTest(declaration, read, lambda verdicts: result_of(verdicts[0]) != NOT_DECIDED)
 
 
 def _versions(sides: Mapping[str, ReadTrials]) -> ReadTrials:
@@ -95,8 +96,8 @@ def asked_difference(
     ``values`` is a trial's configuration, which may define the user's own metrics. Raises
     InputError, one line, for a metric that cannot be judged.
     """
-    own = values["eval"].get("extra") or {}
-    metrics = (*known_keys(), *COSTS, *own)
+    users_metrics = values["eval"].get("extra") or {}
+    metrics = (*known_keys(), *COSTS, *users_metrics)
     if metric not in metrics:
         raise InputError(
             f"--metric {metric}: there is no such metric{did_you_mean(metric, metrics)}"
@@ -140,30 +141,20 @@ def describe(verdict: Verdict) -> str:
     return with_notes(f"{result_of(verdict)}: {sentence}", verdict)
 
 
-def deviations(baseline: Sequence[TrialResult], new: Sequence[TrialResult]) -> list[str]:
-    """A line for each difference of machine or libraries between the two versions' trials."""
-    lines = []
-    kinds = [sorted({trial.machine or "not recorded" for trial in own}) for own in (baseline, new)]
-    if kinds[0] != kinds[1]:
-        lines.append(
-            f"deviation: the baseline ran on another kind of machine ({listed(kinds[0])}) than the "
-            f"new trials ({listed(kinds[1])}); this alone changes last digits and, after long "
-            "training, results"
-        )
-    libraries = {name for trial in (*baseline, *new) for name in trial.record.versions} - {
-        "gsbench"
-    }
-    for name in sorted(libraries):
-        versions = [
-            sorted({trial.record.versions.get(name, "none") for trial in own})
-            for own in (baseline, new)
-        ]
-        if versions[0] != versions[1]:
-            lines.append(
-                f"deviation: the baseline was made with {name} {listed(versions[0])}, the new "
-                f"trials with {listed(versions[1])}"
-            )
-    return lines
+def deviations(baseline: Sequence[TrialResult], new: Sequence[TrialResult]) -> list[Note]:
+    """A note for each difference of machine or libraries between the two versions' trials."""
+    machine = ""  # beside the names of libraries, and sorted before them
+    sides = [
+        [{machine: trial.machine or "not recorded"} | trial.record.versions for trial in trials]
+        for trials in (baseline, new)
+    ]
+    notes = []
+    for name in sorted(set().union(*sides[0], *sides[1]) - {"gsbench"}):
+        old, now = (sorted({made.get(name, "none") for made in side}) for side in sides)
+        if old != now:
+            kind = "other machine" if name == machine else "other library"
+            notes.append(Note.of(kind, library=name, baseline=old, new=now))
+    return notes
 
 
 # ---- bisection: the search for the commit that made a trainer worse
@@ -176,7 +167,7 @@ def deviations(baseline: Sequence[TrialResult], new: Sequence[TrialResult]) -> l
 
 def ask_step(
     gate: Declaration, share: float, good: ReadTrials, last: ReadTrials, new: ReadTrials
-) -> Asked:
+) -> SequentialTest:
     """The questions about a commit against a first one and a worse last one.
 
     ``gate`` is the declaration of the last commit; ``share`` is the chance that a step is wrong.
@@ -191,7 +182,7 @@ def ask_step(
     # The two share the error rate, and half of a share is that of one side.
     declaration = replace(gate, questions=(question, against_last), error_rate=4 * share)
     read = _versions({BASELINE: good, LAST: last, NEW: new})
-    return Asked(declaration, read, lambda verdicts: step_result(verdicts) != NOT_DECIDED)
+    return SequentialTest(declaration, read, lambda verdicts: step_result(verdicts) != NOT_DECIDED)
 
 
 def step_result(verdicts: Sequence[Verdict]) -> str:
@@ -211,21 +202,18 @@ def describe_step(verdicts: Sequence[Verdict]) -> str:
     return "; ".join([step_result(verdicts), *parts])
 
 
-def too_small_to_place(verdict: Verdict, share: float) -> str:
-    """A warning if steps will often not see the loss of the last commit; "" else."""
+def too_small_to_place(verdict: Verdict, share: float) -> Note | None:
+    """A note if steps will often not see the loss of the last commit."""
     deviation, most = verdict.deviation, len(verdict.question.seeds)
     if not deviation or verdict.mean is None:
-        return ""
+        return None
     looks = plan_looks(most)
     level = look_levels(len(verdict.pairs.rows), looks, 2 * share)[-1]
     chance = power_of_mean(deviation, Design(len(verdict.pairs.rows), most), verdict.mean, level)
     if chance >= POWER:
-        return ""
-    return (
-        f"the last commit differs by {verdict.shown(verdict.mean)}, which a step with "
-        f"{counted(most, 'seed')} shows in only {100 * chance:.0f} of 100 cases: the search may "
-        "end with a range; allow more --seeds or scenes"
-    )
+        return None
+    difference = verdict.shown(verdict.mean)
+    return Note.of("small loss", difference=difference, seeds=most, chance=f"{100 * chance:.0f}")
 
 
 def _known_side(verdict: Verdict) -> int:

@@ -24,7 +24,7 @@ from gsbench.analysis.quantities import COSTS, relative_change
 from gsbench.analysis.results import Arm, TrialResult
 from gsbench.analysis.statistics import REFUTED, SUPPORTED, TOO_SMALL
 from gsbench.analysis.verdict_words import least_words, reason, with_notes
-from gsbench.claims.stopping import Asked
+from gsbench.claims.stopping import SequentialTest
 from gsbench.errors import InputError
 from gsbench.runs.experiments import Declaration, Question
 from gsbench.runs.ledger import (
@@ -55,7 +55,7 @@ LOOKS_WORSE = "looks worse"  # by this rate, which is no verdict's
 SEEDS_FROM, SEEDS_TO = 100_000, 1_000_000  # of tests
 
 
-def check_room(ledger: Ledger) -> None:
+def check_ideas_left(ledger: Ledger) -> None:
     """Raise InputError unless another idea may be tried."""
     if ledger.tried >= ledger.opened.ideas:
         raise InputError(
@@ -169,9 +169,9 @@ def _question(
     )
 
 
-def ask_idea(declaration: Declaration, read: Callable[[], Iterable[TrialResult]]) -> Asked:
+def ask_idea(declaration: Declaration, read: Callable[[], Iterable[TrialResult]]) -> SequentialTest:
     """The question of an idea; it ends also as soon as the idea is given up."""
-    return Asked(declaration, read, lambda verdicts: result_of(verdicts[0]) != UNDECIDED)
+    return SequentialTest(declaration, read, lambda verdicts: result_of(verdicts[0]) != UNDECIDED)
 
 
 def result_of(verdict: Verdict) -> Result:
@@ -239,26 +239,23 @@ def unused(ledger: Ledger, trials: Sequence[TrialResult]) -> list[Note]:
     return unused_trials(trials, verdicts)
 
 
-def contradictions(ledger: Ledger, trials: Sequence[TrialResult]) -> list[str]:
-    """A line for each idea whose recorded result is not what its trials show.
+def contradictions(ledger: Ledger, trials: Sequence[TrialResult]) -> list[Note]:
+    """A note for each idea whose recorded result is not what its trials show.
 
     It is judged again from the seeds that it was decided by, if all its trials are still there.
     """
-    lines = []
+    notes = []
     for idea, ended in ledger.ended.items():
         if ended.result == FAILED:
             continue
         declaration = (test_of if idea in ledger.tests else screening_of)(ledger, idea)
         seeds = declaration.questions[0].seeds[: ended.seeds]
-        own = [trial for trial in trials if trial.seed in seeds]
-        (verdict,) = ask_idea(declaration, own.copy).judged()
+        counting = [trial for trial in trials if trial.seed in seeds]
+        (verdict,) = ask_idea(declaration, counting.copy).verdicts()
         now = result_of(verdict)
         if verdict.pairs.seeds == ended.seeds and now != ended.result:
-            lines.append(
-                f"{idea}: the ledger says {ended.result}, but its trials say {now}: one of them "
-                "was edited"
-            )
-    return lines
+            notes.append(Note.of("contradiction", idea=idea, recorded=ended.result, now=now))
+    return notes
 
 
 def check_unknown_trials(ledger: Ledger, trials: Sequence[TrialResult]) -> None:

@@ -7,6 +7,7 @@ the intervals of usual random-effects methods then miss the mean. Studies are po
 protocols agree.
 """
 
+import itertools
 import math
 import tempfile
 from collections import Counter
@@ -18,15 +19,18 @@ import numpy as np
 
 from gsbench.analysis.addresses import fitting
 from gsbench.analysis.cells import select_trials, with_variants
+from gsbench.analysis.declaration import active_declaration
 from gsbench.analysis.differences import between_scenes_notes
 from gsbench.analysis.fairness import budget_words
 from gsbench.analysis.notes import Note
 from gsbench.analysis.pairing import Pairs, ScenePairs, pair
 from gsbench.analysis.results import Arm, TrialResult, group_by
 from gsbench.analysis.statistics import Interval, StudentT, t_test
+from gsbench.analysis.unfinished import lacking_words, one_sided, unfinished
 from gsbench.claims.archive import unpack_archive
 from gsbench.errors import InputError
 from gsbench.runs.experiments import Question
+from gsbench.runs.layout import TUNING
 from gsbench.runs.nested import sha256_of
 
 MIN_STUDIES = 2
@@ -155,6 +159,7 @@ def pool_sources(
         except InputError as error:
             faults.append(f"left out: {error}")
             continue
+        # An archive under two names, or exported again with more trials, is no further study.
         if twice := marks & seen.keys():
             faults.append(
                 f"left out: {source} has trials that {seen[min(twice)]} has, and they would count "
@@ -188,7 +193,14 @@ def read_studies(
     studies, notes = [], list[str]()
     with tempfile.TemporaryDirectory() as folder:
         archived = unpack_archive(path, Path(folder))
+        if (archived.folder / TUNING).exists():
+            raise InputError(
+                f"{path} is of a search, whose points were chosen by their results: give the "
+                "archive of the sweep that it was for"
+            )
         notes += [f"{name}: left out, {line}" for line in archived.warnings]
+        gone, declared = unfinished(archived), active_declaration(archived)
+        gone += declared.missing(archived.trials) if declared is not None else []
         trials = with_variants(select_trials(archived.trials, question.where))
         by_protocol = sorted(group_by(trials, lambda trial: trial.record.protocol).items())
         for protocol, own in by_protocol:
@@ -200,13 +212,16 @@ def read_studies(
                 rows: list[ScenePairs] = []
                 left_out: list[Note] = []
                 for baseline, arm in arms:
-                    pairs = pair(own, Question(metric=question.metric, baseline=baseline, arm=arm))
+                    asked = Question(metric=question.metric, baseline=baseline, arm=arm)
+                    pairs = pair(own, asked)
                     count = sum(len(row.seeds) for row in pairs.rows)
                     notes.append(
                         f"{label}: {arm} against {baseline}, {count} pairs of trials on "
                         f"{', '.join(pairs.scenes)}; {_size(own)}"
                     )
                     notes += [f"{label}: left out, {line}" for line in pairs.left_out]
+                    if lacking := [*itertools.chain(*one_sided(asked, own, gone))]:
+                        notes.append(f"{label}: caution, {lacking_words(lacking)}")
                     unlike = between_scenes_notes(pairs.of_baseline, pairs.of_arm)
                     notes += [f"{label}: {line}" for line in unlike]
                     rows += pairs.rows
@@ -263,8 +278,8 @@ def _arm_pairs(
 
 def _budgets(trials: Sequence[TrialResult], pairs: Sequence[tuple[Arm, Arm]]) -> str:
     """``20,000 Gaussians (governor)``: the limits on growth in these pairs of arms."""
-    own = [trial for trial in trials if any(trial.arm in pair for pair in pairs)]
-    return " or ".join(sorted({budget_words(trial) or "not known" for trial in own}))
+    of_arms = [trial for trial in trials if any(trial.arm in pair for pair in pairs)]
+    return " or ".join(sorted({budget_words(trial) or "not known" for trial in of_arms}))
 
 
 def _size(trials: Sequence[TrialResult]) -> str:

@@ -48,7 +48,7 @@ def write_site(archives: Sequence[Path], out: Path, title: str, scratch: Path) -
             continue
         with own_output(file := out / REPORTS / f"{key}.html"):
             write_text(file, report)
-        sections.append(section)
+        sections.append(section)  # only now: a section links to its report
     if not sections:
         raise InputError(f"no archive can be shown ({left_out[0]})")
     script = files("gsbench.claims").joinpath("site.js").read_text(encoding="utf-8")

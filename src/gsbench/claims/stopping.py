@@ -50,36 +50,9 @@ def trials_of_look(
     return list(needed)
 
 
-def run_looks(
-    declaration: Declaration,
-    judged: Callable[[], list[Verdict]],
-    run: Callable[[list[KeyAndSeed]], object],
-) -> list[Verdict]:
-    """Add seeds look by look until all questions are decided, and return the verdicts.
-
-    ``judged`` gives the verdicts so far, ``run`` runs trials unless they are done. A question whose
-    trials failed gets no further seeds; the others continue.
-    """
-    stuck: set[int] = set()
-    verdicts = judged()
-    for seeds in declaration.looks:
-        undecided = [
-            k for k, verdict in enumerate(verdicts) if not verdict.final and k not in stuck
-        ]
-        if not undecided:
-            break
-        if needed := trials_of_look(declaration, undecided, seeds):
-            trials, questions = counted(len(needed), "trial"), counted(len(undecided), "question")
-            log.info("seeds up to %d: %s for %s", seeds, trials, questions)
-            run(needed)
-        verdicts = judged()
-        stuck |= {k for k in undecided if not verdicts[k].final and verdicts[k].pairs.seeds < seeds}
-    return verdicts
-
-
 @dataclass(frozen=True)
-class Asked:
-    """A declaration with the trials that answer it so far, which ``read`` gives.
+class SequentialTest:
+    """The test of a declaration's questions by the trials so far, which ``read`` gives.
 
     ``ends`` tells if verdicts give a result although a question is undecided.
     """
@@ -88,15 +61,34 @@ class Asked:
     read: Callable[[], Iterable[TrialResult]]
     ends: Callable[[Sequence[Verdict]], bool] = lambda verdicts: False
 
-    def judged(self) -> list[Verdict]:
+    def verdicts(self) -> list[Verdict]:
         """The verdicts so far; all are final as soon as they give a result."""
         verdicts = judge(list(self.read()), self.declaration)
         ended = self.ends(verdicts)
         return [replace(verdict, final=verdict.final or ended) for verdict in verdicts]
 
     def answer(self, run: Callable[[list[KeyAndSeed]], object]) -> list[Verdict]:
-        """The verdicts after all looks that are needed (`run_looks`)."""
-        return run_looks(self.declaration, self.judged, run)
+        """Add seeds look by look until all questions are decided; returns the verdicts.
+
+        ``run`` runs trials unless they are done. A question whose trials failed gets no further
+        seeds; the others continue.
+        """
+        stuck: set[int] = set()
+        verdicts = self.verdicts()
+        for seeds in self.declaration.looks:
+            undecided = [k for k, one in enumerate(verdicts) if not one.final and k not in stuck]
+            if not undecided:
+                break
+            if needed := trials_of_look(self.declaration, undecided, seeds):
+                trials = counted(len(needed), "trial")
+                questions = counted(len(undecided), "question")
+                log.info("seeds up to %d: %s for %s", seeds, trials, questions)
+                run(needed)
+            verdicts = self.verdicts()
+            stuck |= {
+                k for k in undecided if not verdicts[k].final and verdicts[k].pairs.seeds < seeds
+            }
+        return verdicts
 
 
 @dataclass(frozen=True)
@@ -108,8 +100,8 @@ class SweepInLooks:
     trials: Mapping[KeyAndSeed, Trial]
 
     @property
-    def asked(self) -> Asked:
-        return Asked(self.declaration, lambda: read_experiment(self.home).trials)
+    def test(self) -> SequentialTest:
+        return SequentialTest(self.declaration, lambda: read_experiment(self.home).trials)
 
     def describe(self) -> str:
         """A line about the looks for a dry run."""
@@ -261,12 +253,12 @@ def _seeds(trials: Sequence[PlannedTrial]) -> tuple[int, ...]:
     """
     first: tuple[int, ...] = ()
     for (scene, arm), group in group_by(trials, lambda trial: (trial.scene, trial.arm)).items():
-        own = tuple(dict.fromkeys(trial.seed for trial in group))
-        first = first or own
-        if own != first:
+        of_group = tuple(dict.fromkeys(trial.seed for trial in group))
+        first = first or of_group
+        if of_group != first:
             raise InputError(
                 f"launch.stop_when_decided needs the same seeds everywhere: {arm} on {scene} has "
-                f"{', '.join(map(str, own))}, others {', '.join(map(str, first))}"
+                f"{', '.join(map(str, of_group))}, others {', '.join(map(str, first))}"
             )
     if len(first) < FIRST_LOOK:
         raise InputError(

@@ -83,15 +83,15 @@ def choose_views(
     wanted = dict.fromkeys(left_over, 0)
     while sum(wanted.values()) < count and any(left_over.values()):
         # The scene with the fewest chosen views among those that have more.
-        scene = min((one for one, rest in left_over.items() if rest), key=lambda one: wanted[one])
+        scene = min((name for name, rest in left_over.items() if rest), key=wanted.__getitem__)
         wanted[scene] += 1
         left_over[scene] -= 1
     chosen: list[tuple[Candidate, Chosen]] = []
     for scene, views in wanted.items():
-        ordered = sorted(by_scene[scene], key=lambda one: -one.difference)
+        ordered = sorted(by_scene[scene], key=lambda candidate: -candidate.difference)
         half = (views + 1) // 2
-        chosen += [(one, "most different") for one in ordered[:half]]
-        chosen += [(one, "random") for one in rng.sample(ordered[half:], views - half)]
+        chosen += [(candidate, "most different") for candidate in ordered[:half]]
+        chosen += [(candidate, "random") for candidate in rng.sample(ordered[half:], views - half)]
     return chosen
 
 

@@ -1,19 +1,18 @@
 """Parse and check the words of a command line, before Hydra composes anything."""
 
 import re
-import shlex
-from collections.abc import Iterable, Sequence
-from functools import cache
-from itertools import accumulate, islice, product
+from collections.abc import Sequence
+from itertools import islice, product
 from pathlib import Path
 from typing import Any
 
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
-from hydra.errors import HydraException
 
 from gsbench.config.groups import GROUPS, REMOVABLE, options
-from gsbench.config.permissions import PACKAGE, PERMISSIONS, is_allowed, permission_advice
+from gsbench.config.overrides import bare_key, is_sweep, key_of, parse_word
+from gsbench.config.permissions import PERMISSIONS
+from gsbench.config.programs import reading
+from gsbench.config.search_path import search_path, searched_folders
 from gsbench.errors import InputError
 from gsbench.runs.config_hash import DECLARED, NOT_HASHED, WITHOUT_EFFECT
 from gsbench.words import did_you_mean
@@ -47,8 +46,7 @@ TEXTS = (
     "version",
 )
 MAX_POINTS = 1_000_000  # values of one list; more would fill the memory
-MAX_BRACKETS = 40  # open at once in a word, since Hydra's parser recurses into them
-KEY = re.compile(r"[+~]*\w+([./]\w+)*")
+VARIABLE = re.compile(r"\$\{oc\.env:\s*['\"]?(\w+)")
 
 
 def parse(argv: Sequence[str]) -> tuple[list[str], bool, bool]:
@@ -89,23 +87,6 @@ def parse(argv: Sequence[str]) -> tuple[list[str], bool, bool]:
         else:
             overrides.append(word)
     return [*search_path(folders, overrides), *overrides], multirun, dry_run
-
-
-def search_path(folders: Sequence[Path], overrides: Sequence[str]) -> list[str]:
-    """The word ``hydra.searchpath=…`` for ``--config-dir``, in a list; empty without folders."""
-    if not folders:
-        return []
-    if len(folders) > 1 or any(word.startswith("hydra.searchpath=") for word in overrides):
-        raise InputError(
-            "--config-dir names one folder: for several, give "
-            "hydra.searchpath=[file://A,file://B] alone"
-        )
-    if folders[0] == Path():
-        raise InputError("--config-dir needs a folder")
-    if not folders[0].is_dir():
-        raise InputError(f"--config-dir {folders[0]}: no such folder")
-    escaped = str(folders[0].resolve()).replace("'", "\\'")
-    return [f"hydra.searchpath=['file://{escaped}']"]
 
 
 def check_words(words: Sequence[str]) -> None:
@@ -159,11 +140,6 @@ def check_text(word: str) -> None:
             break
 
 
-def task_words(words: Iterable[str]) -> list[str]:
-    """The words for the trials, which Hydra calls task overrides: those not for Hydra itself."""
-    return [word for word in words if not parse_word(word).is_hydra_override()]
-
-
 def check_removal(override: Override) -> None:
     """Raise InputError unless the removed setting is an option of a component.
 
@@ -194,103 +170,9 @@ def typed_permissions(words: Sequence[str]) -> tuple[str, ...]:
     return allowed
 
 
-def search_places(words: Sequence[str]) -> list[str]:
-    """The places that ``hydra.searchpath`` names.
-
-    Hydra 1.4 also takes ``hydra[searchpath]`` and ``extend_list(pkg://package)``.
-    """
-    places: list[str] = []
-    for word in words:
-        override = parse_word(word)
-        key = key_of(word).replace("[", ".").replace("]", "")
-        if key == "hydra.searchpath" and not override.is_sweep_override():
-            value: Any = override.value()
-            places += map(str, value if isinstance(value, list) else getattr(value, "values", ()))
-    return places
-
-
-def check_search_path(words: Sequence[str], allowed: Sequence[str]) -> list[str]:
-    """Refuse ``hydra.searchpath=[pkg://package]`` for a package that is not ``allowed``.
-
-    Hydra imports such a package while it composes. Returns the packages.
-    """
-    packages: list[str] = []
-    for place in search_places(words):
-        scheme, colon, path = place.partition("://")
-        if not colon or scheme == "file":
-            continue
-        packages.append(path.replace("/", "."))
-        if scheme != "pkg":
-            raise InputError(
-                f"hydra.searchpath: {place} is neither a folder (file://…) nor a package (pkg://…)"
-            )
-        if not is_allowed(packages[-1], (PACKAGE, *allowed)):
-            advice = permission_advice([packages[-1].split(".")[0]], allowed)
-            raise InputError(
-                f"hydra.searchpath: {place} imports a package; if you trust it, {advice}"
-            )
-    return packages
-
-
-@cache
-def parse_word(word: str) -> Override:
-    """Parse a word as Hydra does. Raises InputError unless it is ``key=value`` or ``~key``."""
-    if "=" not in word and not word.startswith("~"):
-        raise InputError(f"{word!r} is not a setting like key=value")
-    open_at_once = accumulate(((letter in "[{(") - (letter in "]})") for letter in word), initial=0)
-    if max(open_at_once) > MAX_BRACKETS:
-        raise InputError(
-            f"{word[:40]!r}… opens more than {MAX_BRACKETS} brackets within each other"
-        )
-    try:
-        override = OverridesParser.create().parse_override(word)
-    except ValueError as error:  # such as a number with more digits than Python converts
-        raise InputError(f"{word[:40]!r}… is not a setting like key=value ({error})") from None
-    except HydraException as error:
-        reason = re.sub(r",? expecting .*", "", str(error).splitlines()[0])
-        raise InputError(
-            f"{word!r} is not a setting like key=value ({reason}){_quoted(word)}"
-        ) from error
-    if not override.key_or_group.strip():
-        raise InputError(f"{word!r} names no setting")
-    return override
-
-
-def key_of(word: str) -> str:
-    """The setting that a word sets, adds or removes."""
-    return bare_key(parse_word(word).get_key_element())
-
-
-def bare_key(key: str) -> str:
-    """A key without the signs that add or remove it."""
-    return key.lstrip("+~")
-
-
-def value_text(value: object) -> str:
-    """The text of a plain value in a word, such as ``null``, ``true`` or ``[1,2]``."""
-    if isinstance(value, list):
-        return f"[{','.join(map(value_text, value))}]"
-    return (
-        "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
-    )
-
-
-def _quoted(word: str) -> str:
-    """A hint to quote the word's value, whose characters mean something to Hydra."""
-    key, _, value = word.partition("=")
-    if not KEY.fullmatch(key):
-        return ""
-    function = re.fullmatch(r"(\w+)\((.*)\)", value)
-    if function and function.group(1) != "glob":
-        return ""  # in quotes it would be a text, not a list of values
-    start, value, end = (
-        (f"{key}=glob(", function.group(2), ")") if function else (f"{key}=", value, "")
-    )
-    quoted = f"{start}'{value}'{end}" if '"' in value else f'{start}"{value}"{end}'
-    return (
-        "; special characters need their own quotes inside those of the shell: "
-        f"{shlex.quote(quoted)}"
-    )
+def typed_readings(words: Sequence[str]) -> tuple[str, ...]:
+    """The permissions to read the variables that the words themselves read by ``${oc.env:…}``."""
+    return tuple(dict.fromkeys(reading(name) for name in VARIABLE.findall(" ".join(words))))
 
 
 def check_single(words: Sequence[str], advice: str) -> None:
@@ -298,11 +180,6 @@ def check_single(words: Sequence[str], advice: str) -> None:
     check_words(words)
     if swept := [word for word in words if is_sweep(word)]:
         raise InputError(f"{swept[0]} lists several values: {advice}")
-
-
-def is_sweep(word: str) -> bool:
-    """Return whether a word lists several values."""
-    return bool(parse_word(word).is_sweep_override())
 
 
 def check_sweep(override: Override) -> None:
@@ -362,12 +239,6 @@ def makes_other_trials(key: str) -> bool:
     first, _, last = key.partition(".")
     without_effect = last in (*WITHOUT_EFFECT, *DECLARED.get(first, ()))
     return not without_effect and (first not in NOT_HASHED or first in IN_TRIAL_PATH)
-
-
-def searched_folders(words: Sequence[str]) -> list[Path]:
-    """The user's folders that ``hydra.searchpath`` among ``words`` names."""
-    places = search_places(words)
-    return [Path(place.removeprefix("file://")) for place in places if "pkg://" not in place]
 
 
 def _check_experiment_word(word: str, override: Override, folders: Sequence[Path]) -> None:

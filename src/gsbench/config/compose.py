@@ -6,51 +6,39 @@ set in a copy, and the resolved copy is checked: a trial.
 
 import os
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
-from importlib.util import find_spec
-from itertools import chain
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import hydra
-import yaml
-from hydra.core.config_loader import ConfigLoader
-from hydra.core.global_hydra import GlobalHydra
-from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from gsbench.config import command_words
-from gsbench.config.command_words import bare_key, key_of, parse_word
+from gsbench.config.command_words import check_single, typed_permissions, typed_readings
 from gsbench.config.explain import explained, not_a_setting
 from gsbench.config.groups import GROUPS
-from gsbench.config.permissions import PERMISSIONS
-from gsbench.config.schema import (
-    ROOT_SETTINGS,
-    Config,
-    check,
-    checked_values,
-    plain,
-    register_schemas,
+from gsbench.config.hydra_setup import (
+    CONFIG_NAME,
+    config_loader,
+    hydra_config,
+    hydra_ready,
+    installed_nodes,
 )
+from gsbench.config.overrides import bare_key, is_sweep, key_of, parse_word, task_words
+from gsbench.config.permissions import PERMISSIONS
+from gsbench.config.schema import ROOT_SETTINGS, Config, check, checked_values, plain
+from gsbench.config.search_files import check_places
+from gsbench.config.search_path import check_search_path, searched_folders
 from gsbench.config.trust import MADE_NODES, check_composed, check_permissions
 from gsbench.errors import InputError
-from gsbench.parsing import MAX_VALUES
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.settings import check_values
-from gsbench.system.install import conf_dir
 from gsbench.system.own_modules import allow_modules
 
-CONFIG_NAME = "config"  # conf/config.yaml
-# Hydra 1.3 warns unless it is told which version's defaults hold; Hydra 1.4 has one set and warns
-# if it is told.
-VERSION_BASE: dict[str, Any] = (
-    {"version_base": "1.3"} if hydra.__version__.startswith("1.3.") else {}
-)
 MADE_GROUPS = tuple(f"hydra/{name}" for name in MADE_NODES)
 # stands for the seed while settings are resolved that all seeds share: reading it is an error
 ANY_SEED = "${no_seed}"
@@ -105,12 +93,12 @@ class Composer:
         # The order matters: Hydra imports packages of the search path while it composes, so they
         # are checked first.
         self.typed = words if typed is None else typed
-        self.allowed = command_words.typed_permissions(self.typed)
-        packages = command_words.check_search_path(words, self.allowed)
+        self.allowed = typed_permissions(self.typed) + typed_readings(self.typed)
+        packages = check_search_path(words, self.allowed)
         allow_modules(self.allowed, os.getcwd() if modules is None else modules)
-        check_places(command_words.searched_folders(words), packages)
-        single = [word for word in words if not command_words.is_sweep(word)]
-        own = command_words.task_words(single)
+        check_places(searched_folders(words), packages)
+        single = [word for word in words if not is_sweep(word)]
+        own = task_words(single)
         self.hydra_words = tuple(word for word in single if word not in own)
         self._chosen: dict[tuple[str, ...], DictConfig] = {}
         self._times: dict[str, Any] = {}  # what ${now:…} stands for, the same in all trials
@@ -165,7 +153,7 @@ class Composer:
 
     def trial(self, overrides: Sequence[str]) -> Trial:
         """The single trial of the command's words, which are its ``overrides``."""
-        words = command_words.task_words(overrides)
+        words = task_words(overrides)
         trial = self._trial(words, words) or self._trial_of_hydra(words)
         return replace(trial, overrides=tuple(overrides))
 
@@ -302,51 +290,6 @@ def set_value(config: DictConfig, override: Override) -> None:
         OmegaConf.update(config, key, value, force_add=is_added or override.is_force_add())
 
 
-def check_places(folders: Sequence[Path], packages: Sequence[str]) -> None:
-    """Refuse a missing place of files, and a file whose YAML aliases stand for too many values.
-
-    A few lines of nested aliases can stand for billions of values ("billion laughs"), and Hydra
-    would expand them.
-    """
-    files: list[Path] = []
-    for package in packages:
-        with explained([]):
-            spec = find_spec(package)
-        if spec is None:
-            raise InputError(f"hydra.searchpath names {package}: no such package")
-    for folder in folders:
-        if not folder.is_dir():  # Hydra only warns
-            raise InputError(f"hydra.searchpath names {folder}: no such folder")
-        for pattern in ("*.yaml", "*/*.yaml", "*/*/*.yaml"):
-            files += folder.glob(pattern)
-    for file in files:
-        try:
-            text = file.read_text(encoding="utf-8") if file.is_file() else ""
-            if "*" not in text:
-                continue
-            # The loader in Python raises RecursionError for deep nesting; that in C would crash.
-            count = _expanded_size(yaml.compose(text, Loader=yaml.SafeLoader), {})
-        # Hydra reports it if it reads the file
-        except (OSError, ValueError, RecursionError, yaml.YAMLError):
-            continue
-        if count > MAX_VALUES:
-            raise InputError(f"{file}: its aliases stand for more than {MAX_VALUES:,} values")
-
-
-def _expanded_size(node: yaml.Node | None, sizes: dict[int, int]) -> int:
-    """The number of values in a YAML node after each alias is replaced by what it names.
-
-    ``sizes`` keeps the numbers that are known, by the id of the node.
-    """
-    if id(node) not in sizes:
-        sizes[id(node)] = 1  # counts where an alias stands for a mapping or list that contains it
-        parts = node.value if isinstance(node, yaml.CollectionNode) else []
-        if isinstance(node, yaml.MappingNode):
-            parts = chain(*parts)  # keys and values
-        sizes[id(node)] = 1 + sum(_expanded_size(part, sizes) for part in parts)
-    return sizes[id(node)]
-
-
 def check_permitted(config: DictConfig, allowed: Sequence[str]) -> None:
     """Run `check_composed` against Hydra's nodes as the installed packages write them."""
     choices = config.hydra.runtime.choices
@@ -354,28 +297,11 @@ def check_permitted(config: DictConfig, allowed: Sequence[str]) -> None:
     check_composed(config, allowed, installed_nodes(made))
 
 
-@cache
-def installed_nodes(choices: tuple[str, ...]) -> Mapping[str, Any]:
-    """Hydra's node for ``choices`` of plug-ins and logs, from installed packages only.
-
-    It includes what gsbench's own ``conf/config.yaml`` sets. Choices that only a user's folder has
-    are left out.
-    """
-    with hydra_ready():
-        known = [
-            word
-            for word in choices
-            if word.partition("=")[2] in config_loader().get_group_options(word.partition("=")[0])
-        ]
-        config = hydra.compose(CONFIG_NAME, known, return_hydra_config=True)
-    return OmegaConf.to_container(config.hydra, resolve=False)  # type: ignore[return-value]
-
-
 def compose_one(
     overrides: Sequence[str], typed: Sequence[str] | None = None, modules: str | None = None
 ) -> Trial:
     """The single trial that ``overrides`` describe; `Composer` says what the others mean."""
-    command_words.check_single(overrides, "choose one")
+    check_single(overrides, "choose one")
     return Composer(overrides, typed, modules).trial(overrides)
 
 
@@ -383,8 +309,8 @@ def typed_address(typed: Sequence[str]) -> tuple[str, ...]:
     """The tracker's address that the ``typed`` words about tracking give by themselves, if any."""
     # Composed from these words alone: whatever else sets the address, such as a file of somebody
     # else's, could send results and a password there.
-    own = ("tracking", "hydra.searchpath")
-    words = [word for word in typed if key_of(word).startswith(own)]
+    about_tracking = ("tracking", "hydra.searchpath")
+    words = [word for word in typed if key_of(word).startswith(about_tracking)]
     with hydra_ready(), explained(words):
         config = hydra.compose(CONFIG_NAME, words)
         return (str(config.tracking.uri),) if config.tracking.get("uri") else ()
@@ -407,32 +333,3 @@ def with_seed(trial: Trial, seed: int) -> Trial:
     seed = check_values(Config, {"seed": seed}, "")["seed"]
     words = tuple(f"seed={seed}" if word.startswith("seed=") else word for word in trial.overrides)
     return replace(trial, values=trial.values | {"seed": seed}, overrides=words)
-
-
-@contextmanager
-def hydra_ready() -> Iterator[None]:
-    """Initialise Hydra with gsbench's configuration folder within the block."""
-    register_schemas()
-    if GlobalHydra.instance().is_initialized():  # within `hydra.main`, or in a block of this kind
-        yield
-        return
-    with hydra.initialize_config_dir(str(conf_dir()), job_name="gsbench", **VERSION_BASE):
-        yield
-
-
-def config_loader() -> ConfigLoader:
-    """Hydra's loader of configurations. Call it within `hydra_ready`."""
-    return GlobalHydra.instance().config_loader()
-
-
-@contextmanager
-def hydra_config(config: DictConfig | None) -> Iterator[None]:
-    """Let ``${hydra:…}`` read the node of ``config`` within the block; with None it is an error."""
-    instance = HydraConfig.instance()
-    before, instance.cfg = instance.cfg, None
-    try:
-        if config is not None:
-            instance.set_config(config)
-        yield
-    finally:
-        instance.cfg = before

@@ -16,8 +16,9 @@ from omegaconf.errors import (
     OmegaConfBaseException,
 )
 
-from gsbench.config.command_words import key_of, searched_folders
 from gsbench.config.groups import EXTERNAL_FOLDER, GROUPS, options
+from gsbench.config.overrides import key_of
+from gsbench.config.search_path import searched_folders
 from gsbench.errors import GsbenchError, InputError
 from gsbench.system.install import conf_dir
 from gsbench.words import did_you_mean
@@ -91,7 +92,7 @@ def unknown_setting(error: Any, words: Sequence[str]) -> str:
     if key in ("hydra.sweeper.grids", "hydra.sweeper.tune"):
         what = "joins grids" if name == "grids" else "tunes arms"
         return f"{key}: gsbench's own sweeper alone {what}, so leave out hydra/sweeper"
-    typed = any(key == own or own.startswith(f"{key}.") for own in map(key_of, words))
+    typed = any(key == given or given.startswith(f"{key}.") for given in map(key_of, words))
     return not_a_setting(key, node, words, "" if typed else _file_that_sets(key, words))
 
 
@@ -100,7 +101,11 @@ def not_a_setting(key: str, node: Any, words: Sequence[str], file: str = "") -> 
     parent, _, name = key.rpartition(".")
     # Hydra's plug-ins are chosen by name, not by class
     hidden = "_target_" if parent.startswith("hydra") else "hydra"
-    keys = [str(own) for own in node if own != hidden] if isinstance(node, DictConfig) else []
+    keys = (
+        [str(known_key) for known_key in node if known_key != hidden]
+        if isinstance(node, DictConfig)
+        else []
+    )
     elsewhere = _settings_of_choices(parent)
     near = did_you_mean(name, [*keys, *elsewhere])
     for known in elsewhere.keys() - set(keys):

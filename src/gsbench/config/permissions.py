@@ -6,6 +6,7 @@ programs (``bash``), environment variables (``PATH``) and addresses.
 
 import importlib
 import re
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -36,7 +37,11 @@ def permission_advice(missing: Sequence[str], allowed: Sequence[str]) -> str:
         name if UNQUOTED.fullmatch(name) else repr(name)
         for name in dict.fromkeys([*allowed, *missing])
     ]
-    return f"add allow_targets=[{','.join(names)}] to the command; no file can allow it"
+    word = f"allow_targets=[{','.join(names)}]"
+    # A shell would run what is in $(…) or behind a quote in a stranger's name.
+    if any(not UNQUOTED.fullmatch(name) for name in (*allowed, *missing)):
+        word = shlex.quote(word) if set(word) & set('$`"\\!') else f'"{word}"'
+    return f"add {word} to the command; no file can allow it"
 
 
 def check_target(

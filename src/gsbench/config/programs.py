@@ -1,4 +1,4 @@
-"""The programs, shell lines, options of Slurm and variables a configuration may use."""
+"""The programs, shell lines, options of Slurm and variables that a configuration may use."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -25,6 +25,9 @@ FREE_VARIABLES = frozenset(
     CUBLAS_WORKSPACE_CONFIG PYTORCH_CUDA_ALLOC_CONF HIP_VISIBLE_DEVICES ROCR_VISIBLE_DEVICES TZ
     """.split()  # noqa: SIM905 - words are easier to read than a list of 20 quoted ones
 )
+# Variables that any configuration may read: places, names and devices. All others may be secrets.
+READABLE_VARIABLES = FREE_VARIABLES | {"HOME", "USER", "PWD", "TMPDIR", "SCRATCH", "WORK"}
+OWN_VARIABLES = "GSBENCH_"
 # Options of sbatch that choose resources (from Slurm's manual). Others can run a program
 # (task_prolog), start a container, or pass on variables (export).
 SBATCH_RESOURCES = frozenset(
@@ -77,6 +80,20 @@ def foreign_variables(variables: Mapping[str, Any], allowed: Sequence[str]) -> d
         for name, value in variables.items()
         if name not in FREE_VARIABLES and name not in allowed and value != os.environ.get(name)
     }
+
+
+def reading(variable: str) -> str:
+    """The permission to read a variable: another word than the one that allows to set it."""
+    return f"env:{variable}"
+
+
+def is_readable(variable: str, allowed: Sequence[str]) -> bool:
+    """Return whether a configuration may read the variable, so that results have its value."""
+    return (
+        variable in READABLE_VARIABLES
+        or variable.startswith(OWN_VARIABLES)
+        or reading(variable) in allowed
+    )
 
 
 def check_launch(launch: Mapping[str, Any], allowed: Sequence[str]) -> None:

@@ -23,7 +23,14 @@ from gsbench.config.permissions import (
     packages_allowed_at,
     permission_advice,
 )
-from gsbench.config.programs import SBATCH_RESOURCES, check_launch, check_program, is_external
+from gsbench.config.programs import (
+    SBATCH_RESOURCES,
+    check_launch,
+    check_program,
+    is_external,
+    is_readable,
+    reading,
+)
 from gsbench.errors import InputError
 from gsbench.runs.nested import TARGET, entries_of, targets_in
 
@@ -112,9 +119,9 @@ def foreign_address(tracking: Mapping[str, Any], allowed: Sequence[str]) -> str:
 
     The user's own are those ``allowed`` on the command line, and those in the environment.
     """
-    own = {*allowed, *map(os.environ.get, ADDRESS_VARIABLES)}
+    known = {*allowed, *map(os.environ.get, ADDRESS_VARIABLES)}
     given = (str(value) for key, value in tracking.items() if value and _is_place(key, str(value)))
-    return next((address for address in given if address not in own), "")
+    return next((address for address in given if address not in known), "")
 
 
 def _is_place(key: str, value: str) -> bool:
@@ -137,7 +144,7 @@ def check_composed(
         _check_hydra(raw["hydra"], allowed)
     for place, key, value in entries_of(raw):
         if isinstance(value, str) and "${" in value:
-            _check_interpolation(place, key, value)
+            _check_interpolation(place, key, value, allowed)
         if key in SPECIAL_KEYS:  # `_partial_` makes a function of anything, to be called later
             raise InputError(
                 f"{'.'.join((*place, key))}: gsbench makes no objects this way: leave it out"
@@ -179,7 +186,9 @@ def _differing(given: Any, installed: Any) -> Any:
     return {key: _differing(value, installed.get(key)) for key, value in differing.items()}
 
 
-def _check_interpolation(place: tuple[str, ...], key: str, value: str) -> None:
+def _check_interpolation(
+    place: tuple[str, ...], key: str, value: str, allowed: Sequence[str]
+) -> None:
     where = ".".join((*place, key))
     if place == ("hydra", "job") and value in HYDRAS_VALUES:
         return
@@ -188,26 +197,36 @@ def _check_interpolation(place: tuple[str, ...], key: str, value: str) -> None:
             f"{where}={value}: write the name itself here, since ${{…}} may become another"
         )
     try:
-        resolvers = list(_resolvers(parse(value)))
+        calls = list(_calls(parse(value)))
     # OmegaConf cannot resolve it either, and says so when the value is read
     except GrammarParseError:
         return
-    for name in resolvers:
+    for name, first in calls:
         if name not in RESOLVERS:
             raise InputError(
                 f"{where}={value}: ${{{name}:…}} is not resolved here, only {', '.join(RESOLVERS)}"
             )
+        # Its value would stand in results, archives and trackers, where others read it.
+        if name == "oc.env" and not is_readable(first, allowed):
+            advice = permission_advice([reading(first)], allowed)
+            raise InputError(
+                f"{where}={value} reads the variable {first}, which may be secret; if you want "
+                f"its value in results, {advice}"
+            )
 
 
-def _resolvers(tree: Any) -> Iterator[str]:
-    """The names of the resolvers in a parsed text.
+def _calls(tree: Any) -> Iterator[tuple[str, str]]:
+    """The resolvers in a parsed text, each with its first argument.
 
-    A name that is itself an interpolation is yielded as written.
+    What is itself an interpolation is yielded as written.
     """
-    if type(tree).__name__ == "ResolverNameContext":
-        yield tree.getText()
-    for child in getattr(tree, "children", None) or []:
-        yield from _resolvers(child)
+    parts = list(getattr(tree, "children", None) or [])
+    for name, *rest in (parts[k:] for k in range(len(parts))):
+        if type(name).__name__ == "ResolverNameContext":
+            listed = [part for part in rest if type(part).__name__ == "SequenceContext"]
+            first = listed[0].getChild(0).getText() if listed else ""
+            yield name.getText(), first.strip().strip("'\"")
+        yield from _calls(name)
 
 
 def _check_place(place: tuple[str, ...], target: Any, allowed: Sequence[str]) -> None:

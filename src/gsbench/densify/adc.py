@@ -10,8 +10,9 @@ from annotated_types import Ge, Interval
 from pydantic import PositiveFloat, PositiveInt
 from torch import Tensor
 
-from gsbench.densify.base import NEVER, Refinement, Rule, Statistic, revised_logits
+from gsbench.densify.base import NEVER, Refinement, Rule, Statistic
 from gsbench.densify.budget import Budgeted, admit
+from gsbench.densify.formulas import revised_logits
 from gsbench.densify.scores import draw
 from gsbench.events import Cause
 from gsbench.raster.base import RenderOutput

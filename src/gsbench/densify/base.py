@@ -1,11 +1,7 @@
-"""The contract of a densifier: hyper-parameters, saved state, lineage, and record of refinements.
-
-At the end of the module are functions that several densifiers share.
-"""
+"""The contract of a densifier: hyper-parameters, saved state, and the record of refinements."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple, Protocol
@@ -13,6 +9,8 @@ from typing import Any, ClassVar, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
+from gsbench.densify.formulas import revised_logits, standard_normal
+from gsbench.densify.lineage import Lineage
 from gsbench.densify.scores import TrainingViews
 from gsbench.events import Cause, RefineEvent
 from gsbench.gaussians.model import Gaussians
@@ -20,66 +18,6 @@ from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.raster.base import RenderOutput
 from gsbench.settings import Switch, check_settings
 from gsbench.words import NamesAttributes
-
-
-class Lineage:
-    """Identity, parent and cause of every Gaussian that ever existed in a training.
-
-    All tensors are on the CPU. ``ids`` [N] are the identities of the present Gaussians. The history
-    of all T Gaussians, ``parents``, ``causes`` and ``steps`` [T], is indexed by identity; the
-    parent of an initial Gaussian is -1.
-    """
-
-    def __init__(self, num_gaussians: int) -> None:
-        self.ids = torch.arange(num_gaussians)  # [N]
-        self.initial_count = num_gaussians
-        # one entry per edit; ``state_dict`` joins them
-        self._history = [self._entries(torch.full((num_gaussians,), -1), Cause.INITIAL, 0)]
-        self._total = num_gaussians
-
-    @staticmethod
-    def _entries(parents: Tensor, cause: Cause, step: int) -> dict[str, Tensor]:
-        """The history of new Gaussians, given the identities [A] of their parents."""
-        causes = torch.full_like(parents, int(cause), dtype=torch.uint8)
-        return {
-            "parents": parents,
-            "causes": causes,
-            "steps": torch.full_like(parents, step, dtype=torch.int32),
-        }
-
-    def edit(self, keep: Tensor | None, parents: Tensor | None, cause: Cause, step: int) -> None:
-        """Keep the Gaussians at the mask ``keep`` [N]; then append a child for each parent.
-
-        ``parents`` [A] are indices from before the edit. None keeps all and appends none.
-        """
-        living = self.ids if keep is None else self.ids[keep.cpu()]
-        if parents is not None:
-            self._history.append(self._entries(self.ids[parents.cpu()], cause, step))
-            living = torch.cat([living, torch.arange(self._total, self._total + len(parents))])
-            self._total += len(parents)
-        self.ids = living
-
-    def causes_of_living(self) -> dict[str, int]:
-        """Count the present Gaussians by cause."""
-        counts = torch.bincount(self.state_dict()["causes"][self.ids].long(), minlength=len(Cause))
-        return {cause.key: int(counts[cause]) for cause in Cause}
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """Return the tensors ``ids``, ``parents``, ``causes``, ``steps``, as in ``lineage.npz``."""
-        return {"ids": self.ids} | {
-            name: torch.cat([entries[name] for entries in self._history])
-            for name in self._history[0]
-        }
-
-    @classmethod
-    def from_state(cls, state: dict[str, Tensor]) -> Lineage:
-        history = {name: tensor.cpu() for name, tensor in state.items()}
-        lineage = cls(0)
-        lineage.ids = history.pop("ids")
-        lineage._history, lineage._total = [history], len(history["parents"])
-        lineage.initial_count = int((history["parents"] < 0).sum())
-        return lineage
-
 
 CPU = torch.device("cpu")
 NEVER = 10**9  # an iteration or interval longer than any training
@@ -393,45 +331,3 @@ class Densifier:
 
 class NoDensifier(Densifier):
     """``densify=none``: the initial Gaussians are only optimised."""
-
-
-def standard_normal(shape: tuple[int, ...], rng: torch.Generator, like: Tensor) -> Tensor:
-    """Draw normal numbers with the dtype and the device of ``like``.
-
-    ``rng`` is a CPU generator. For another device, it seeds a temporary generator there, which
-    draws the numbers. So no numbers are uploaded, and a checkpoint must save only the state of
-    ``rng``. The same seed gives other numbers there than on the CPU.
-    """
-    if like.device.type == "cpu":
-        return torch.randn(shape, generator=rng, dtype=like.dtype)
-    seed = int(torch.randint(2**62, (1,), generator=rng))
-    device_rng = torch.Generator(like.device).manual_seed(seed)
-    return torch.randn(shape, generator=device_rng, dtype=like.dtype, device=like.device)
-
-
-MIN_REVISED_OPACITY = 1e-6  # keeps the logit finite
-
-
-def revised_logits(opacity_logits: Tensor) -> Tensor:
-    """The logits of 1 - sqrt(1 - o) for opacities o (Revising Densification, arXiv 2404.06109).
-
-    Two Gaussians of this opacity, one behind the other, are as opaque as one of opacity o.
-    """
-    transmittance = (-opacity_logits).sigmoid().sqrt()  # sqrt(1 - o)
-    return torch.logit((1 - transmittance).clamp_min(MIN_REVISED_OPACITY))
-
-
-def faded(opacity_logits: Tensor, factor: float) -> Tensor:
-    """The logits of ``factor`` (at most 1) times the opacities."""
-    return torch.logit(factor * opacity_logits.sigmoid())
-
-
-def quantile(ordered: Tensor, q: float) -> float:
-    """The ``q``-quantile of sorted values [N], interpolated linearly.
-
-    Unlike torch.quantile, it accepts more than 16 M values.
-    """
-    position = q * (len(ordered) - 1)
-    low = math.floor(position)
-    high = min(low + 1, len(ordered) - 1)
-    return float(ordered[low] + (position - low) * (ordered[high] - ordered[low]))

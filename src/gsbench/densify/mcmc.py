@@ -10,8 +10,9 @@ from annotated_types import Interval
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor
 
-from gsbench.densify.base import Refinement, Rule, standard_normal
+from gsbench.densify.base import Refinement, Rule
 from gsbench.densify.budget import Budgeted
+from gsbench.densify.formulas import standard_normal
 from gsbench.densify.improved_gs import halves
 from gsbench.densify.scores import blended_sums, by_median, draw, draw_views, edge_scores
 from gsbench.events import Cause

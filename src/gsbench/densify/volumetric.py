@@ -15,8 +15,9 @@ from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor
 
 from gsbench.densify.adc import ADC, MAX_CHILDREN, Grown
-from gsbench.densify.base import Refinement, Rule, quantile
+from gsbench.densify.base import Refinement, Rule
 from gsbench.densify.budget import admit
+from gsbench.densify.formulas import quantile
 from gsbench.errors import InputError
 from gsbench.events import Cause
 from gsbench.gaussians.paper_values import VOLUME_THRESHOLD

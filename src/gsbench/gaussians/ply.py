@@ -207,32 +207,7 @@ def read_ply(
     with _checked(path):
         content = read_ply_data(path)
         vertices = content["vertex"].data
-    check_columns(vertices.dtype.names or (), COLUMNS, path)
-    present = set(vertices.dtype.names or ())
-    present_rest = {name for name in present if name.startswith(REST)}
-    rest = [f"{REST}{i}" for i in range(len(present_rest))]
-    required = [name for name in COLUMNS if not name.startswith((REST, "n"))]
-    missing = [name for name in required if name not in present]
-    odd = present_rest - set(rest)
-    if odd or len(rest) not in REST_COUNTS:
-        example = f", with {min(odd)}" if odd else ""
-        raise InputError(
-            f"{path}: not a 3DGS PLY; its harmonics must be f_rest_0 to 8, to 23 or to 44 (degree "
-            f"1 to 3), or none; it has {len(rest)}{example}"
-        )
-    if missing or len(vertices) == 0:
-        listed = ", ".join(missing) or "all, since it is empty"
-        is_cloud = present >= set(POSITION) and "f_dc_0" in missing
-        hint = ": it is a point cloud, which init=points reads" if is_cloud else ""
-        if missing == ["scale_2"]:
-            hint = ": it has flat Gaussians (2DGS), and gsbench draws 3D Gaussians alone"
-        raise InputError(f"{path}: not a 3DGS PLY; missing or odd properties: {listed}{hint}")
-    for name in (*required, *rest):
-        if name not in POSITION and vertices.dtype[name].kind in "iu":
-            raise InputError(
-                f"{path}: {name} has whole numbers, as in a compressed model: export it with "
-                "floating-point numbers"
-            )
+    required, rest = _checked_columns(vertices, path)
     vertices = _with_finite_opacities(vertices, path)
     for name in (*required, *rest):
         _check_finite(vertices[name], name, path)
@@ -262,3 +237,37 @@ def read_ply(
         sh_dc=columns([f"f_dc_{i}" for i in range(3)]),
         sh_rest=sh_rest,
     )
+
+
+def _checked_columns(vertices: Any, path: Path) -> tuple[list[str], list[str]]:
+    """The names of the required columns, and of the harmonics above degree 0.
+
+    Raises InputError unless they are those of a 3DGS PLY.
+    """
+    check_columns(vertices.dtype.names or (), COLUMNS, path)
+    present = set(vertices.dtype.names or ())
+    present_rest = {name for name in present if name.startswith(REST)}
+    rest = [f"{REST}{i}" for i in range(len(present_rest))]
+    required = [name for name in COLUMNS if not name.startswith((REST, "n"))]
+    missing = [name for name in required if name not in present]
+    odd = present_rest - set(rest)
+    if odd or len(rest) not in REST_COUNTS:
+        example = f", with {min(odd)}" if odd else ""
+        raise InputError(
+            f"{path}: not a 3DGS PLY; its harmonics must be f_rest_0 to 8, to 23 or to 44 (degree "
+            f"1 to 3), or none; it has {len(rest)}{example}"
+        )
+    if missing or len(vertices) == 0:
+        listed = ", ".join(missing) or "all, since it is empty"
+        is_cloud = present >= set(POSITION) and "f_dc_0" in missing
+        hint = ": it is a point cloud, which init=points reads" if is_cloud else ""
+        if missing == ["scale_2"]:
+            hint = ": it has flat Gaussians (2DGS), and gsbench draws 3D Gaussians alone"
+        raise InputError(f"{path}: not a 3DGS PLY; missing or odd properties: {listed}{hint}")
+    for name in (*required, *rest):
+        if name not in POSITION and vertices.dtype[name].kind in "iu":
+            raise InputError(
+                f"{path}: {name} has whole numbers, as in a compressed model: export it with "
+                "floating-point numbers"
+            )
+    return required, rest

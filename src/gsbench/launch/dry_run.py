@@ -98,6 +98,7 @@ def describe_plan(trials: Sequence[Trial], parallel: int = 1) -> list[str]:
             note = f"  as in {experiment}: nothing to compute"
         else:
             seconds, known_from = finished.estimate(trial.values)
+            # a stopped training goes on from its checkpoint
             done = folder.stage_and_step()[1] / max(1, trial.values["train"]["iterations"])
             remaining += seconds * (1 - min(1.0, done))
             learned_from = max(learned_from, known_from)

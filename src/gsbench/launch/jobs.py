@@ -41,7 +41,7 @@ from gsbench.system.stopping import (
     stop_on_signals,
 )
 from gsbench.tracking import Mirror
-from gsbench.words import counted
+from gsbench.words import command, counted
 
 if TYPE_CHECKING:
     from submitit import Executor, Job
@@ -204,10 +204,10 @@ def run_local(trials: Sequence[Trial], mirror: Mirror) -> list[Outcome]:
 
     # Nothing else is printed until the first trial ends, since trials write to their own logs.
     log.info(
-        "%s, %d at once; to see how far they are: gsbench status %s",
+        "%s, %d at once; to see how far they are: %s",
         counted(len(trials), "trial"),
         parallel,
-        name,
+        command("status", name),
     )
     executor = submitit.LocalExecutor(new_job_folder(values))
     executor.update_parameters(timeout_min=values["launch"]["timeout_min"] or 365 * DAYS)

@@ -73,6 +73,7 @@ def progress_frame(runs: Path, experiment: str) -> pd.DataFrame:
 
 def progress_of(home: Path) -> Progress:
     """The progress of the experiment in ``home``, from its files."""
+    # A superseded trial will never be done, so with it no sweep would end.
     states = [state for state in states_of_experiment(home) if state.state != "superseded"]
     names = names_of(states)
     cells: dict[Name, dict[str, int]] = {

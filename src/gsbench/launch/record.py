@@ -8,6 +8,7 @@ import os
 import shutil
 import time
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from functools import reduce
 from pathlib import Path
 
@@ -24,9 +25,11 @@ from gsbench.runs.experiments import (
     open_question,
     read_declarations,
     record_text,
+    unix_time,
 )
 from gsbench.runs.layout import CONFIG, DECLARED, FORGOTTEN, PER_VIEW, RESULTS, SEED
 from gsbench.runs.plan import PlannedTrial, change_plan
+from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import hold
 from gsbench.words import some_of
 
@@ -129,6 +132,7 @@ def declare(trials: Sequence[Trial]) -> None:
             if same_metric and is_covered:
                 continue
             added = declared_now(questions=(open_question(metric),), trials=dict(together))
+            added = _with_known(added, home)
             write_text(home / DECLARED, record_text([*declarations, added]))
         if same_metric:
             _warn_of_added_seeds(home, metric, before, asked)
@@ -139,6 +143,34 @@ def declare(trials: Sequence[Trial]) -> None:
                 metric,
                 latest.primary,
             )
+
+
+def _with_known(asked: Declaration, home: Path) -> Declaration:
+    """The declaration, which names those of its trials whose results are dated later than itself.
+
+    They are there, so a clock was ahead. By their time, they would look declared beforehand.
+    """
+
+    def is_known(folder: TrialFolder) -> bool:
+        record = folder.sound_record()
+        if record is None:
+            return False
+        moment = unix_time(record.measured)
+        return (moment or (folder.path / RESULTS).stat().st_mtime) >= asked.moment
+
+    known = {
+        key: there
+        for key, seeds in asked.planned.items()
+        if (there := tuple(s for s in seeds if is_known(TrialFolder(home / f"{key}{SEED}{s}"))))
+    }
+    if known:
+        log.warning(
+            "%s: results of %s are dated later than now, so a clock was wrong; they count as "
+            "measured before this command",
+            home.name,
+            some_of(sorted({key.split("/")[1] for key in known})),
+        )
+    return replace(asked, known=known)
 
 
 def _warn_of_added_seeds(home: Path, metric: str, before: Planned, added: Planned) -> None:
@@ -175,6 +207,7 @@ def declare_questions(home: Path, asked: Declaration) -> Declaration:
         same_kind = [declared for declared in declarations if declared.kind == asked.kind]
         if same_kind and same_kind[-1].hash == asked.hash:
             return same_kind[-1]
+        asked = _with_known(asked, home)
         write_text(home / DECLARED, record_text([*declarations, asked]))
     if same_kind and asked.kind == "sweep":
         before: Planned = reduce(merge_planned, (declared.planned for declared in same_kind))

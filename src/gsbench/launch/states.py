@@ -90,7 +90,7 @@ def _settings(folder: Path) -> dict[str, Any] | None:
 def _state(folder: Path, planned: PlannedTrial | None, queue: Queue | None) -> TrialState:
     """The state of the trial in ``folder``; ``planned`` is its entry in the plan."""
     files = TrialFolder(folder)
-    state, lost = files.state(), ""
+    state, lost = files.state(), ""  # ``lost``: its job has left the queue, without a result
     if state == "running":
         holder = read_holder(folder / LOCK)
         process = "process ? on ?" if holder is None else holder.description

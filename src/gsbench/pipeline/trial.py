@@ -373,7 +373,7 @@ def results_of(
         code=Code(
             sources=user_modules(values),
             stages={stage.name: stage.version for stage in keys.STAGES},
-            rooms=dict(sorted(code.items())),
+            packages=dict(sorted(code.items())),
             **training.checkout,
         ),
         versions=versions(),

@@ -16,7 +16,7 @@ from gsbench.analysis.addresses import ArmName
 from gsbench.analysis.quantities import COSTS
 from gsbench.analysis.results import TrialResult, read_experiment
 from gsbench.analysis.trial_settings import config_if_readable
-from gsbench.config.command_words import parse_word
+from gsbench.config.overrides import parse_word
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.pictures import PicturePair
@@ -184,7 +184,8 @@ def _results(destination: Destination, measured: Measured, identity: str) -> Tri
         renders=dict(measured.source),
         hashes={"config": identity, "data": measured.truth.data},
         code=Code(
-            stages={EVALUATE.name: EVALUATE.version}, rooms=states_of(CODE_OF_STAGE[EVALUATE.name])
+            stages={EVALUATE.name: EVALUATE.version},
+            packages=states_of(CODE_OF_STAGE[EVALUATE.name]),
         ),
         versions=versions(),
     )
@@ -210,8 +211,8 @@ def _config(destination: Destination, truth: ReferenceImages, runs: Path) -> dic
 
 def _has(folder: Path, settings: Mapping[str, Any]) -> bool:
     """Return whether a trial has these settings, or none that tell its arm apart."""
-    own = config_if_readable(folder)
-    return not own or all(own.get(key) == value for key, value in settings.items())
+    config = config_if_readable(folder)
+    return not config or all(config.get(key) == value for key, value in settings.items())
 
 
 def _trials(home: Path, scene: str) -> list[TrialResult]:

@@ -215,8 +215,9 @@ class Declaration(Record):
     ``error_rate`` is the chance that any answer is false. ``looks`` are the rising numbers of
     seeds at which a question may be decided; without looks, all seeds are judged at once.
     ``trials`` are the planned trials if the questions name none; None if they are not recorded.
-    ``missing`` says by question what could not be tested, and why. ``votes`` is the number of
-    people's votes at which the questions of the round ``vote_round`` are judged.
+    ``known`` are those of them whose results were there already, although their times are later: a
+    clock was set back. ``missing`` says by question what could not be tested, and why. ``votes`` is
+    the number of people's votes at which the questions of the round ``vote_round`` are judged.
     """
 
     time: str
@@ -224,6 +225,7 @@ class Declaration(Record):
     error_rate: Amount = ERROR_RATE
     looks: tuple[Count, ...] = ()
     trials: dict[TrialKey, tuple[Count, ...]] | None = None
+    known: dict[TrialKey, tuple[Count, ...]] = field(default_factory=dict)
     missing: dict[str, list[str]] = field(default_factory=dict)
     votes: Count = 0
     vote_round: str = ""
@@ -277,7 +279,7 @@ class Declaration(Record):
     @property
     def hash(self) -> str:
         """sha256 of all that affects the answers: different hashes are different declarations."""
-        return sha256_of(replace(self, time=NO_TIME, missing={}).to_json())
+        return sha256_of(replace(self, time=NO_TIME, missing={}, known={}).to_json())
 
     def summary(self) -> Declared:
         """The part that a trial's results.json repeats."""

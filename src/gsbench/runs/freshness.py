@@ -82,7 +82,7 @@ def code_of(code: Code) -> dict[Part, str]:
     return (
         {Part("module", name): digest for name, digest in code.sources.items()}
         | {Part("stage", name): str(version) for name, version in code.stages.items()}
-        | {Part("package", name): state for name, state in code.rooms.items()}
+        | {Part("package", name): state for name, state in code.packages.items()}
     )
 
 
@@ -168,7 +168,7 @@ def changes(
     if record.hashes.get("config") != present or made.config != present:
         yield Change("settings", layout.CONFIG, made.config, present)
     stages = {stage.name: "none" for stage in STAGES} | made.stages
-    code = code_of(Code(rooms=record.code.rooms)) | {
+    code = code_of(Code(packages=record.code.packages)) | {
         Part("stage", name): str(version) for name, version in stages.items()
     }
     yield from code_changes(code, partial(present_version, folder=None))

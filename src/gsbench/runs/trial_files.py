@@ -67,7 +67,8 @@ class MadeOf(Record):
     ``results.json``. ``sources`` are the user's files, ``folders`` their folders with times of
     change. ``entries`` are the stages' results in the store. ``published`` are files in the
     trial's folder; ``digests`` has the sha256 of those that tables and reports read, and of
-    small ones.
+    small ones. ``finished`` is the Unix time at which the trial first had these results; 0 if
+    unknown.
     """
 
     results: str
@@ -80,6 +81,7 @@ class MadeOf(Record):
     published: dict[str, Stamp]
     digests: dict[str, str]
     settings: dict[str, Any]
+    finished: Amount = 0.0
 
     def __post_init__(self) -> None:
         if fault := fault_of(self.settings):

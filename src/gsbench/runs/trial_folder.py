@@ -12,7 +12,9 @@ import io
 import json
 import os
 import re
+import time
 from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -39,6 +41,7 @@ from gsbench.runs.rows import Row, read_rows
 from gsbench.runs.trial_files import Building, Configuration, Failure, MadeOf, ResultsFile
 from gsbench.runs.trial_record import TrialRecord, UnfinishedError, record_from
 from gsbench.system.locks import is_held
+from gsbench.words import command
 
 MADE_OF = "made_of"  # the key in results.json
 State = Literal["done", "running", "failed", "partial", "damaged", "missing"]
@@ -174,9 +177,8 @@ class TrialFolder:
             values = from_json(content)  # compared as values: white space does not matter
             del values[MADE_OF]
             if made_of.results != sha256_of(values):
-                reason = (
-                    f"was changed after it was written: `gsbench retry {self.home.name}` repairs it"
-                )
+                repair = command("retry", self.home.name)
+                reason = f"was changed after it was written: `{repair}` repairs it"
                 raise DamagedError(path, reason)
         self._origin = made_of
         return record
@@ -231,18 +233,22 @@ class TrialFolder:
 
         ``sources`` are the user's files, ``entries`` results of stages by name, ``published`` files
         in this folder. Returns True if it already had equal results: then only ``made_of`` is
-        renewed, and the file keeps its time.
+        renewed, and the trial keeps its time.
         """
         path, content = self.path / layout.RESULTS, record.to_json()
         present = self.sound_record()
         before = path.stat() if present is not None and present.to_json() == content else None
+        # Verdicts count results from before their declaration by this time, so equal results
+        # must not look newer.
+        finished = time.time()
+        if before is not None:
+            finished = (self._origin and self._origin.finished) or before.st_mtime
         origin = origin_of(self.path, content, values, sources, entries or {}, published)
+        origin = replace(origin, finished=finished)
         with atomic(path) as temporary:
             temporary.write_text(
                 json.dumps(content | {MADE_OF: origin.to_json()}, indent=1, allow_nan=False) + "\n"
             )
-            # Verdicts count results from before their declaration by this time, so equal results
-            # must not look newer.
             if before is not None:
                 os.utime(temporary, ns=(before.st_atime_ns, before.st_mtime_ns))
         return before is not None

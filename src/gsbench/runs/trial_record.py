@@ -10,7 +10,7 @@ from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import Field, ValidationError
+from pydantic import AliasChoices, Field, ValidationError
 
 from gsbench.normalization import IDENTITY, Normalization
 from gsbench.parsing import (
@@ -49,13 +49,15 @@ class Budget(Record):
 class Code(Record):
     """The versions of the code: sha256 of a user's modules (``sources``), and of the stages.
 
-    ``rooms`` has the states of gsbench's packages (`gsbench.runs.package_code`). ``commit`` is that
-    of the checkout that trained; ``edited`` says whether files that git tracks had changed.
+    ``packages`` has the states of gsbench's packages (`gsbench.runs.package_code`). ``commit`` is
+    that of the checkout that trained; ``edited`` says whether files that git tracks had changed.
     """
 
     sources: dict[str, str] = field(default_factory=dict)
     stages: dict[str, int] = field(default_factory=dict)
-    rooms: dict[str, str] = field(default_factory=dict)
+    packages: Annotated[
+        dict[str, str], Field(validation_alias=AliasChoices("packages", "rooms"))
+    ] = field(default_factory=dict)  # "rooms" in early files
     commit: str | None = None
     edited: bool | None = None  # None without a checkout, or if git cannot tell
 

@@ -49,20 +49,22 @@ WHOLE = 0  # all parts of a path
 def list_images(folder: Path) -> list[str]:
     """The sorted image files below a folder, relative, with "/" as separator, without hidden files.
 
-    Links to folders are followed, and no folder is read twice. Raises InputError for a name that is
-    not UTF-8 or has line breaks, since no file of results could have it.
+    Links to folders are followed, but not to those above, and no folder is read twice. Raises
+    InputError for a name that is not UTF-8 or has line breaks, since no file of results could have
+    it.
     """
     names: list[str] = []
     unread: Counter[str] = Counter()
-    folders, links, seen = [folder], list[Path](), set[tuple[int, int]]()
+    folders, links = [folder], list[Path]()
+    # A stranger's capture with a link to / would be a search of the whole disk for photographs.
+    seen = {_identity(parent) for parent in folder.resolve().parents}
     while folders or links:
         # Links come last, so that images are listed under their real folder rather than under a
         # link to it.
         parent = folders.pop() if folders else links.pop(0)
-        status = parent.stat()
-        if (status.st_dev, status.st_ino) in seen:  # also ends circles of links
+        if (identity := _identity(parent)) in seen:  # also ends circles of links
             continue
-        seen.add((status.st_dev, status.st_ino))
+        seen.add(identity)
         for entry in sorted(_entries(parent), key=lambda entry: entry.name):
             if entry.name.startswith("."):
                 continue
@@ -84,6 +86,11 @@ def list_images(folder: Path) -> list[str]:
             f"{folder}: names that are not UTF-8, or have line breaks: {some_of(strange)}: {advice}"
         )
     return sorted(names)
+
+
+def _identity(folder: Path) -> tuple[int, int]:
+    status = folder.stat()
+    return status.st_dev, status.st_ino
 
 
 def _entries(folder: Path) -> list[os.DirEntry[str]]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from gsbench.errors import InputError
-from gsbench.scene.colmap_files import PARAMETERS
+from gsbench.scene.colmap_checks import PARAMETERS
 from gsbench.scene.transforms_cameras import PosedCamera, nearest_rotation
 from gsbench.scene.types import CameraModel
 

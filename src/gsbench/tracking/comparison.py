@@ -21,6 +21,7 @@ from gsbench.analysis.quantities import metric_keys
 from gsbench.analysis.results import Experiment, TrialResult, newest_code, read_experiment
 from gsbench.analysis.table_formats import to_markdown
 from gsbench.analysis.tables import build_table
+from gsbench.analysis.verdict_words import headline
 from gsbench.errors import InputError
 from gsbench.tracking.mlflow_sink import DESCRIPTION, connect, ensure_experiment
 from gsbench.tracking.trial import EVAL, arm_name, eval_name
@@ -83,8 +84,8 @@ def addresses(server: str, experiment_id: str, version: str) -> dict[str, str]:
 
 def description(experiment: Experiment) -> str:
     """Verdict, table and its notes in Markdown, cut to what a tag may hold."""
-    sentences = compare(experiment).sentences
-    verdicts = [f"- {line}" for line in sentences]
+    comparison = compare(experiment)
+    verdicts = [f"- {line}" for line in comparison.sentences]
     try:
         lines = to_markdown(build_table(experiment)).splitlines()
     except InputError as error:  # cells would average unlike trials
@@ -92,8 +93,8 @@ def description(experiment: Experiment) -> str:
     rest = [line for line in lines if not line.startswith((f"- {VERDICT}", "#"))]
     # The page shows only the first line until it is clicked: decided pairs of arms come first
     # there.
-    short = [line.partition(" (")[0] for line in sentences]
-    answer = "; ".join(sorted(short, key=lambda text: "undecided" in text)) or NO_VERDICT
+    ordered = sorted(comparison.answers, key=lambda one: one.undecided)
+    answer = "; ".join(map(headline, ordered)) or NO_VERDICT
     end = f"\n\n{OWN_NOTE} {experiment.name}` shows more."
     text = "\n".join([f"**{answer}**", "", *verdicts, "", *rest]).strip()
     if len(text) + len(end) > MAX_TAG:

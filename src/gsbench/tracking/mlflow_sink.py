@@ -20,6 +20,7 @@ from filelock import FileLock
 
 from gsbench.errors import InputError
 from gsbench.files import atomic, require_no_links
+from gsbench.parsing import read_tail
 from gsbench.runs.layout import ARTIFACTS, DATABASE
 from gsbench.tracking.sinks import Run, Status
 from gsbench.tracking.trial import NOTE, Picture, Scalar, TrackedTrial
@@ -127,22 +128,40 @@ def require_own_artifacts(client: MlflowClient, address: str, runs: Path) -> Non
     require_no_links(runs, place, below=True)
 
 
+JOURNAL_END = bytes.fromhex("d9d505f920a163d7")  # of a journal that names another file
+
+
+def require_own_journal(uri: str) -> Path | None:
+    """The file of a SQLite address; InputError if the journal beside it names another file.
+
+    SQLite would delete that file when it opens the database, and the runs folder may be a
+    stranger's. Neither MLflow nor gsbench writes such journals; others are rolled back.
+    """
+    import sqlalchemy
+
+    name = sqlalchemy.engine.make_url(uri).database if uri.startswith("sqlite:") else None
+    if not name or name == ":memory:":
+        return None
+    journal = Path(f"{name}-journal")
+    with suppress(FileNotFoundError):
+        if read_tail(journal, len(JOURNAL_END)) == JOURNAL_END:
+            raise InputError(f"{journal} would delete another file: remove it")
+    return Path(name)
+
+
 def _create_sqlite(uri: str) -> None:
     """Make the database file of a SQLite address if it is missing, completely or not at all.
 
     MLflow's migrations of SQLite are no transaction: a process that is killed during them leaves
     tables that no later process can use.
     """
-    import sqlalchemy
+    database = require_own_journal(uri)
+    if database is None or database.exists():
+        return
     from mlflow.store.tracking.sqlalchemy_store import SqlAlchemyStore
 
-    if not uri.startswith("sqlite:"):
-        return
-    name = sqlalchemy.engine.make_url(uri).database
-    if not name or name == ":memory:" or Path(name).exists():
-        return
-    with atomic(Path(name)) as temporary:
-        store = SqlAlchemyStore(f"sqlite:///{temporary}", str(Path(name).parent / ARTIFACTS))
+    with atomic(database) as temporary:
+        store = SqlAlchemyStore(f"sqlite:///{temporary}", str(database.parent / ARTIFACTS))
         store.engine.dispose()
 
 

@@ -8,13 +8,13 @@ from typing import Any
 from gsbench.analysis.results import read_experiment
 from gsbench.app.command import compose_trials, run_trials
 from gsbench.claims import ablation
-from gsbench.config.command_words import value_text
 from gsbench.config.compose import Trial
+from gsbench.config.overrides import value_text
 from gsbench.errors import InputError
 from gsbench.launch.dry_run import describe_plan
 from gsbench.runs.layout import SEED
 from gsbench.verbs.arguments import ArgumentParser, names
-from gsbench.words import counted
+from gsbench.words import command, counted
 
 DEFAULT_METRIC = "psnr"
 
@@ -33,8 +33,8 @@ def ablate(argv: Sequence[str], runs: Path) -> int:
     first = _trials(words)
     densify = _only_densifier(first)
     values = first[0].values
-    own = getattr(type(Parts(values).trainer), "SWITCHES", {})
-    declared = ablation.declared_switches(own, values["densify"])
+    of_class = getattr(type(Parts(values).trainer), "SWITCHES", {})
+    declared = ablation.declared_switches(of_class, values["densify"])
     switches = ablation.choose_switches(declared, options.switches, densify)
     by_run = {}
     for run in ablation.runs_to_train(switches):
@@ -62,7 +62,7 @@ def ablate(argv: Sequence[str], runs: Path) -> int:
         metric = options.metric or values["eval"].get("primary") or DEFAULT_METRIC
         judged = ablation.judge_runs(read_experiment(home).trials, keys, metric)
         print("\n".join(ablation.markdown_table(judged)))
-        print(f"all metrics and pictures: gsbench report {home.name}")
+        print(f"all metrics and pictures: {command('report', home.name)}")
     return code
 
 

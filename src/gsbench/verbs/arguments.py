@@ -3,13 +3,15 @@
 import argparse
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Annotated, Any, NoReturn
+
+from annotated_types import Interval
+from pydantic import TypeAdapter, ValidationError
 
 from gsbench.errors import InputError
+from gsbench.settings import CONFIG, describe
 from gsbench.verbs import VERBS
 from gsbench.words import did_you_mean, is_path, split_outside_brackets
-
-MAX_PORT = 65535
 
 
 class ArgumentParser(argparse.ArgumentParser):
@@ -45,24 +47,30 @@ class ArgumentParser(argparse.ArgumentParser):
         raise InputError(f"{verb}{': ' if verb else ''}{message} (see {self.prog} --help)")
 
 
-def port(text: str) -> int:
-    """A TCP port, or 0 for any free one; an argument's ``type``."""
-    if not text.isascii() or not text.isdigit() or int(text) > MAX_PORT:
-        raise argparse.ArgumentTypeError(f"must be a number from 0 to {MAX_PORT}, got {text!r}")
-    return int(text)
+def number(hint: Any) -> Callable[[str], Any]:
+    """The reader of a number as an annotation allows; an argument's ``type``."""
+    adapter = TypeAdapter(hint, config=CONFIG)
 
-
-def whole_number(most: int) -> Callable[[str], int]:
-    """The reader of a whole number from 1 to ``most``; an argument's ``type``."""
-
-    def read(text: str) -> int:
-        if not text.isascii() or not text.isdigit() or not 1 <= int(text) <= most:
-            raise argparse.ArgumentTypeError(
-                f"must be a whole number from 1 to {most}, got {text!r}"
-            )
-        return int(text)
+    def read(text: str) -> Any:
+        try:
+            return adapter.validate_python(text)
+        except ValidationError:
+            raise argparse.ArgumentTypeError(f"must be {describe(hint)}, got {text!r}") from None
 
     return read
+
+
+port = number(Annotated[int, Interval(ge=0, le=65535)])  # of TCP; 0: any free one
+
+
+def whole_number(most: int) -> Callable[[str], Any]:
+    """The reader of a whole number from 1 to ``most``."""
+    return number(Annotated[int, Interval(ge=1, le=most)])
+
+
+def comma_separated(read: Callable[[str], Any]) -> Callable[[str], list[Any]]:
+    """The reader of values with commas between."""
+    return lambda text: [read(part) for part in text.split(",")]
 
 
 def path(text: str) -> Path:

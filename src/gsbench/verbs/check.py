@@ -141,7 +141,7 @@ def _run(check: Check) -> None:
         if unfinished:
             run_batch(unfinished)
 
-    checked = check.checked(check.asked.answer(run))
+    checked = check.checked(check.test.answer(run))
     write_text(check.home / HTML, to_html(make_page(checked)))
     for verdict in checked.verdicts:
         print(f"{verdict.word:<19}  {verdict.claim.id}: {verdict.sentence}")

@@ -9,18 +9,26 @@ from typing import Any
 
 from gsbench.analysis.judgement import judge
 from gsbench.analysis.ledger_table import describe_ledger, difference_text, ledger_tables, why
-from gsbench.analysis.looks import FIRST_LOOK
 from gsbench.analysis.notes import texts
 from gsbench.analysis.results import read_experiment
 from gsbench.analysis.table_formats import to_markdown
 from gsbench.analysis.unfinished import unfinished
-from gsbench.app.command import compose_trials, require_waiting, run_trials
+from gsbench.app.command import run_trials
+from gsbench.app.ledger_trials import (
+    Trials,
+    check_words,
+    compose_words,
+    keys_by_scene,
+    merged,
+    permitted_words,
+    seeds_of,
+)
 from gsbench.claims import ledger as rules
 from gsbench.claims.gate import asked_difference
 from gsbench.claims.ledger import IDEAS, RATE
 from gsbench.claims.stopping import KeyAndSeed, finished_trials
-from gsbench.config.command_words import key_of, typed_permissions
 from gsbench.config.compose import Trial
+from gsbench.config.overrides import key_of
 from gsbench.errors import GsbenchError, InputError
 from gsbench.eval.options import EvalConfig
 from gsbench.files import checked_runs_folder, make_runs_folder
@@ -29,27 +37,13 @@ from gsbench.runs.config_hash import config_hash
 from gsbench.runs.experiments import Declaration, make_home, stamp_now
 from gsbench.runs.layout import IN_RUNS, LEDGER
 from gsbench.runs.ledger import BASELINE, DROPPED, FAILED, KEPT, UNDECIDED, Ledger
-from gsbench.settings import is_folder_name
-from gsbench.verbs.arguments import ArgumentParser, names, whole_number
+from gsbench.settings import OpenFraction, is_folder_name
+from gsbench.verbs.arguments import ArgumentParser, names, number, whole_number
 from gsbench.words import did_you_mean, listed
 
 EXIT_CODES = {KEPT: 0, DROPPED: 1, FAILED: 1, UNDECIDED: 3}
 MOST_IDEAS = 10_000
-OWN = ("name", "runs", "eval.primary")  # settings that the ledger gives itself
-# An idea may change how a model is made, not what it is measured on.
-OF_IDEAS = (
-    "densify",
-    "init",
-    "train",
-    "raster",
-    "allow_targets",
-    "launch",
-    "device",
-    "threads",
-    "tracking",
-)
 
-Trials = dict[KeyAndSeed, Trial]
 
 log = logging.getLogger(__name__)
 
@@ -59,9 +53,9 @@ def ledger(argv: Sequence[str], runs: Path) -> int:
     options = _parser().parse_args(argv)
     if not is_folder_name(options.name) or options.name in IN_RUNS:
         raise InputError(f"ledger: {options.name!r} cannot be the name of an experiment")
-    action, own = ACTIONS[options.action]
+    action, taken = ACTIONS[options.action]
     for option, flag in FLAGS.items():
-        if getattr(options, option) and option not in own:
+        if getattr(options, option) and option not in taken:
             raise InputError(f"ledger {options.action} takes no {flag}")
     return action(options, runs / options.name)
 
@@ -87,7 +81,9 @@ def _parser() -> ArgumentParser:
         help=f"new: the most ideas that will be tried ({IDEAS})",
     )
     parser.add_argument(
-        "--fdr", type=_rate, help=f"new: the false discovery rate, from 0 to 1 ({RATE})"
+        "--fdr",
+        type=number(OpenFraction),
+        help=f"new: the false discovery rate, from 0 to 1 ({RATE})",
     )
     parser.add_argument("--against", help="try: a kept idea to start from (default: the baseline)")
     parser.add_argument("--as", dest="idea", help="try: the idea's name (default: densify.name)")
@@ -98,8 +94,8 @@ def _parser() -> ArgumentParser:
 
 def new(options: argparse.Namespace, home: Path) -> int:
     """Declare a ledger; the same command again changes nothing."""
-    trials = _compose(options.name, options.settings, options.settings)
-    keys, seeds = _keys(trials, options.name), _seeds(trials)
+    trials = compose_words(options.name, options.settings, options.settings)
+    keys, seeds = keys_by_scene(trials, options.name), seeds_of(trials)
     values = next(iter(trials.values())).values
     metric = options.metric or "psnr"
     sign, least = asked_difference(metric, options.least, values)
@@ -137,23 +133,26 @@ def try_idea(options: argparse.Namespace, home: Path) -> int:
         raise InputError(
             f"--against {against}: it must be one of {kept}{did_you_mean(against, book.kept)}"
         )
-    _check_words(options.settings)
-    start = _permitted(book, against, options.settings)
-    trials = _compose(home.name, start, options.settings)
-    if _keys(trials, home.name) != book.keys_of(against):
+    check_words(options.settings)
+    start = permitted_words(book, against, options.settings)
+    trials = compose_words(home.name, start, options.settings)
+    # The idea's new seeds need new trials of the baseline, so it must be what it was.
+    if keys_by_scene(trials, home.name) != book.keys_of(against):
         raise InputError(
             f"the settings or the code of {against} have changed since its trials ran: bring them "
             "back"
         )
-    words = _merged(start, options.settings)
-    own = _compose(home.name, words, options.settings)
-    idea, book = _start(home, own, against, options)
+    words = merged(start, options.settings)
+    of_idea = compose_words(home.name, words, options.settings)
+    idea, book = _start(home, of_idea, against, options)
     if not book.is_decided(idea) and idea not in book.tests:
-        book = _screen(home, book, idea, trials | own)
+        book = _screen(home, book, idea, trials | of_idea)
     if not book.is_decided(idea) and idea in book.tests:
         seeds = [f"seed={','.join(map(str, book.tests[idea].seeds))}"]
-        both = [_merged(own_words, seeds) for own_words in (start, words)]
-        baseline, new = (_compose(home.name, one, options.settings) for one in both)
+        baseline, new = (
+            compose_words(home.name, merged(side, seeds), options.settings)
+            for side in (start, words)
+        )
         book = _test(home, book, idea, baseline | new)
     _print_idea(book, idea, options.json)
     return EXIT_CODES[book.ended[idea].result]
@@ -163,7 +162,8 @@ def _start(
     home: Path, trials: Trials, against: str, options: argparse.Namespace
 ) -> tuple[str, Ledger]:
     """Enter an idea unless the ledger has it; return its name and the ledger."""
-    keys, values = _keys(trials, home.name), next(iter(trials.values())).values
+    keys, values = keys_by_scene(trials, home.name), next(iter(trials.values())).values
+    # An idea under another name is the same idea: it must not be tried twice.
     nameless = values | {part: values[part] | {"name": ""} for part in ("init", "densify")}
     identity = config_hash(nameless)
     chosen: list[str] = []
@@ -181,9 +181,9 @@ def _start(
             ended = book.ended.get(same[0].idea)
             begun = ended is None and not book.shares_seeds
             if not begun and not book.is_decided(same[0].idea):
-                rules.check_room(book)  # other ideas may have taken its place
+                rules.check_ideas_left(book)  # other ideas may have taken its place
             return None
-        rules.check_room(book)
+        rules.check_ideas_left(book)
         name = options.idea or values["densify"]["name"]
         if name in (*book.started, BASELINE):
             if options.idea:
@@ -195,7 +195,7 @@ def _start(
             idea=name,
             against=against,
             identity=identity,
-            words=tuple(_merged(book.words_of(against), options.settings)),
+            words=tuple(merged(book.words_of(against), options.settings)),
             keys=keys,
         )
 
@@ -252,11 +252,11 @@ def _answer(
     tested = idea in book.tests
     if not fails or verdict.final:
         return rules.end_of(idea, verdict, stamp_now(), tested)
-    own = set(book.keys_of(idea).values())
+    of_idea = set(book.keys_of(idea).values())
     failed = {key for key, trial in trials.items() if trial.files.has_failed()}
     measured = {trial.key for trial in finished_trials(home, trials.values())}
     # An idea of which something is known cannot be tried anew as if it were not.
-    if tested or own & measured or not {key for key, _ in failed} <= own:
+    if tested or of_idea & measured or not {key for key, _ in failed} <= of_idea:
         raise GsbenchError(f"{idea}: {fails}; to go on, give the same command again")
     reason = next((trials[key].files.failure().reason for key in sorted(failed)), fails)
     return records.Ended(time=stamp_now(), idea=idea, result=FAILED, reason=reason, seeds=0)
@@ -274,15 +274,15 @@ def confirm(options: argparse.Namespace, home: Path) -> int:
     if not any(key_of(word) == "scene" for word in options.settings):
         raise InputError("confirm needs captures that no idea has seen: scene=…")
     by_idea = {
-        idea: _compose(
+        idea: compose_words(
             home.name,
-            _merged(_permitted(book, idea, options.settings), options.settings),
+            merged(permitted_words(book, idea, options.settings), options.settings),
             options.settings,
         )
         for idea in (BASELINE, *ideas)
     }
-    keys = {idea: _keys(trials, home.name) for idea, trials in by_idea.items()}
-    asked = records.Confirming(time=stamp_now(), seeds=_seeds(by_idea[BASELINE]), keys=keys)
+    keys = {idea: keys_by_scene(trials, home.name) for idea, trials in by_idea.items()}
+    asked = records.Confirming(time=stamp_now(), seeds=seeds_of(by_idea[BASELINE]), keys=keys)
 
     def make(now: Ledger) -> records.Confirming | None:
         if now.number_of(asked) is not None:
@@ -308,7 +308,7 @@ def _run_confirmation(
     _run_all(first)
     # Only now are the photographs' hashes known, which show a copy under another name.
     rules.check_untouched(book, read_experiment(home).trials, asked)
-    trials = {key: trial for own in by_idea.values() for key, trial in own.items()}
+    trials = {key: trial for of_idea in by_idea.values() for key, trial in of_idea.items()}
     _run_all(trials)
     declaration = rules.confirmation_of(book.opened, asked)
     done = finished_trials(home, trials.values())
@@ -326,8 +326,8 @@ def show(options: argparse.Namespace, home: Path) -> int:
     """Print the ledger."""
     book, trials = records.read_ledger(home), read_experiment(home).trials
     rules.check_unknown_trials(book, trials)
-    for line in rules.contradictions(book, trials):
-        log.warning("%s", line)
+    for note in rules.contradictions(book, trials):
+        log.warning("%s", note)
     if options.json:
         ideas = [_facts(book, idea) for idea in book.started]
         confirmations = [one.to_json() for pair in book.confirmations for one in pair if one]
@@ -357,72 +357,6 @@ ACTIONS = {  # with the options that each of them takes
     "confirm": (confirm, ("settings", "only")),
     "show": (show, ("json",)),
 }
-
-
-# ---- trials of the ledger's words
-
-
-def _compose(name: str, words: Sequence[str], typed: Sequence[str]) -> Trials:
-    """The trials of words by key and seed; only the ``typed`` ones give permissions.
-
-    Raises InputError for settings that the ledger sets.
-    """
-    for word in words:
-        if key_of(word) in OWN:
-            raise InputError(f"ledger: {key_of(word)} follows from the ledger: leave it out")
-    trials = compose_trials([*words, f"name={name}"], multirun=True, typed=typed)
-    require_waiting("ledger", trials)
-    return {(trial.files.key, trial.values["seed"]): trial for trial in trials}
-
-
-def _keys(trials: Trials, name: str) -> dict[str, str]:
-    """The key of the trials on each scene; raises InputError for several arms."""
-    keys: dict[str, set[str]] = {}
-    for (key, _), trial in trials.items():
-        keys.setdefault(trial.values["scene"]["name"], set()).add(key)
-    if any(len(own) > 1 for own in keys.values()):
-        raise InputError(f"{name} compares one arm at a time: only scene and seed may list values")
-    return {scene: own.pop() for scene, own in keys.items()}
-
-
-def _seeds(trials: Trials) -> tuple[int, ...]:
-    seeds = tuple(dict.fromkeys(seed for _, seed in trials))
-    if len(seeds) < FIRST_LOOK:
-        raise InputError(f"a ledger needs at least {FIRST_LOOK} seeds, such as seed=0,1,2,3,4,5")
-    return seeds
-
-
-def _permitted(book: Ledger, idea: str, typed: Sequence[str]) -> tuple[str, ...]:
-    """The recorded settings of an idea, or of the baseline, with what is typed about tracking.
-
-    Raises InputError if they would run code that the ``typed`` words do not allow: the ledger is a
-    file, and may be somebody else's.
-    """
-    words = book.words_of(idea)
-    needed = set(typed_permissions(words)) - set(typed_permissions(typed))
-    if needed:
-        names = ",".join(sorted(needed | set(typed_permissions(typed))))
-        raise InputError(f"{idea} runs code of yours: add allow_targets=[{names}]")
-    tracking = [word for word in typed if key_of(word).partition(".")[0] == "tracking"]
-    if any(key_of(word) == "tracking" for word in tracking):  # settings of another tracker
-        words = tuple(word for word in words if not key_of(word).startswith("tracking"))
-    return tuple(_merged(words, tracking))
-
-
-def _merged(words: Sequence[str], changes: Sequence[str]) -> list[str]:
-    """The words with ``changes``: each replaces the word of the same key, ``~KEY`` removes it."""
-    given, changed = set(map(key_of, words)), set(map(key_of, changes))
-    kept = [word for word in words if key_of(word) not in changed]
-    return kept + [word for word in changes if not (word.startswith("~") and key_of(word) in given)]
-
-
-def _check_words(words: Sequence[str]) -> None:
-    """Raise InputError for a setting that an idea may not change, and for no settings at all."""
-    for key in map(key_of, words):
-        if key.partition(".")[0].partition("/")[0] not in OF_IDEAS:
-            raise InputError(f"{key}: an idea may change {listed(OF_IDEAS[:4])}, not what decides")
-    if not words:
-        raise InputError("ledger try needs the idea's settings, such as densify=volumetric")
 
 
 def _run_all(trials: Mapping[KeyAndSeed, Trial]) -> None:
@@ -461,13 +395,3 @@ def _facts(book: Ledger, idea: str) -> dict[str, Any]:
 
 def _left(book: Ledger) -> dict[str, Any]:
     return {"tried": book.tried, "planned": book.opened.ideas, "kept": book.kept}
-
-
-def _rate(text: str) -> float:
-    try:
-        rate = float(text)
-    except ValueError:
-        rate = 0.0
-    if not 0 < rate < 1:
-        raise argparse.ArgumentTypeError(f"must be above 0 and below 1, got {text!r}")
-    return rate

@@ -18,7 +18,7 @@ from gsbench.scene.options import MIN_SIZE
 from gsbench.system.install import install_command, version_of
 from gsbench.system.own_modules import allow_modules
 from gsbench.system.resources import available_threads, installed_gpus
-from gsbench.verbs.arguments import ArgumentParser, path
+from gsbench.verbs.arguments import ArgumentParser, comma_separated, path, whole_number
 from gsbench.words import counted, readable_bytes
 
 LITTLE_SPACE = 5_000_000_000  # bytes
@@ -239,12 +239,25 @@ def check_runs(runs: Path) -> Iterator[Finding]:
 
 def _bench_parser() -> ArgumentParser:
     names = ", ".join(executor.name for executor in EXECUTORS)
+    count = whole_number(MAX_COUNT)
     parser = ArgumentParser("bench", "Times are medians of steps that take turns.")
     parser.add_argument(
         "--raster", default="cpu", help=f"names, comma between: {names} or your own, mine.MyRaster"
     )
-    parser.add_argument("--size", default="500x375", help="image sizes, comma between")
-    parser.add_argument("--count", default="100000", help="numbers of Gaussians, comma between")
+    parser.add_argument(
+        "--size",
+        type=comma_separated(_size),
+        default="500x375",
+        metavar="WIDTHxHEIGHT,…",
+        help="image sizes",
+    )
+    parser.add_argument(
+        "--count",
+        type=comma_separated(count),
+        default="100000",
+        metavar="N,…",
+        help="numbers of Gaussians",
+    )
     parser.add_argument(
         "--scene",
         default="trained",
@@ -253,9 +266,9 @@ def _bench_parser() -> ArgumentParser:
         "few places, or with a twentieth of it over one tile",
     )
     parser.add_argument("--ply", type=path, help="time this model instead of a synthetic scene")
-    parser.add_argument("--repeats", type=_count, default=5, help="turns that count (default 5)")
+    parser.add_argument("--repeats", type=count, default=5, help="turns that count (default 5)")
     parser.add_argument(
-        "--threads", type=_count, help="CPU threads (default: as many as torch takes)"
+        "--threads", type=count, help="CPU threads (default: as many as torch takes)"
     )
     parser.flag("--json", "print JSON")
     parser.flag("--host", "what a step of raster=triton costs the host; needs no GPU")
@@ -267,11 +280,6 @@ def _bench_parser() -> ArgumentParser:
 def bench(argv: Sequence[str], _runs: Path | None = None) -> int:
     """Print the table, or with ``--json`` the list of results."""
     options = _bench_parser().parse_args(argv)
-    try:
-        sizes = [_size(text) for text in options.size.split(",")]
-        counts = [_count(text) for text in options.count.split(",")]
-    except argparse.ArgumentTypeError as error:
-        raise InputError(str(error)) from error
     if options.host:
         return _bench_host(options.json)
     if options.ply is not None and not options.ply.is_file():
@@ -288,8 +296,8 @@ def bench(argv: Sequence[str], _runs: Path | None = None) -> int:
 
     rows = run_bench(
         rasters,
-        sizes,
-        counts,
+        options.size,
+        options.count,
         ply=options.ply,
         repeats=options.repeats,
         threads=options.threads,
@@ -339,11 +347,3 @@ def _size(text: str) -> tuple[int, int]:
             f"500x375, got {text!r}"
         )
     return int(width), int(height)
-
-
-def _count(text: str) -> int:
-    if not (text.isascii() and text.isdigit() and 1 <= int(text) <= MAX_COUNT):
-        raise argparse.ArgumentTypeError(
-            f"a count is at least 1 and at most {MAX_COUNT}, got {text!r}"
-        )
-    return int(text)

@@ -1,11 +1,12 @@
 """``gsbench plan``: how many scenes and seeds show a difference (docs/claims.md)."""
 
-import argparse
 import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
+from pydantic import PositiveFloat
 
 from gsbench.analysis.comparison import compare
 from gsbench.analysis.designs import Components, Design, estimate_components
@@ -18,7 +19,7 @@ from gsbench.analysis.statistics import MIN_SCENES
 from gsbench.claims.ledger import GIVE_UP, IDEAS, RATE, SCREEN, level_of_test
 from gsbench.errors import InputError
 from gsbench.runs.experiments import ERROR_RATE, Question
-from gsbench.verbs.arguments import ArgumentParser, whole_number
+from gsbench.verbs.arguments import ArgumentParser, number, whole_number
 from gsbench.words import counted
 
 MAX_DESIGNS = 5  # combinations of scenes and seeds that `plan` shows
@@ -65,7 +66,7 @@ def _parser() -> ArgumentParser:
     )
     parser.add_argument(
         "--difference",
-        type=_above_zero,
+        type=number(PositiveFloat),
         help="to be seen; default: what papers count as an improvement",
     )
     parser.add_argument(
@@ -103,7 +104,7 @@ def plan(argv: Sequence[str], runs: Path) -> int:
         try:
             components = _components(trials, question, metric)
         except InputError as error:
-            if len(comparison.pairs) == 1:
+            if len(comparison.pairs) == 1:  # with several, the others may be planned for
                 raise
             lines.append(str(error))
             plans[-1]["no_plan"] = str(error)
@@ -186,13 +187,3 @@ def _designs_line(group: str, designs: Sequence[Design], difference: float) -> s
     shown = [f"{design.scenes} × {design.seeds} ({design.trials} trials)" for design in designs]
     what = f"  to see {difference:g} on {group}, scenes × seeds"
     return f"{what}: {', '.join(shown) or 'none that can be run'}"
-
-
-def _above_zero(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not value > 0 or not math.isfinite(value):
-        raise argparse.ArgumentTypeError(f"must be a number above 0, got {text!r}")
-    return value

@@ -6,14 +6,10 @@ from contextlib import suppress
 from pathlib import Path
 
 from gsbench.app.hydra_main import run_main
-from gsbench.config.command_words import (
-    check_search_path,
-    check_single,
-    parse_word,
-    search_path,
-    typed_permissions,
-)
+from gsbench.config.command_words import check_single, typed_permissions
 from gsbench.config.compose import Composer
+from gsbench.config.overrides import parse_word
+from gsbench.config.search_path import check_search_path, search_path
 from gsbench.errors import InputError
 from gsbench.verbs.arguments import ArgumentParser
 

@@ -36,12 +36,7 @@ from gsbench.analysis.results import (
     newest_code,
 )
 from gsbench.analysis.table_formats import FORMATS, csv_of
-from gsbench.analysis.tables import (
-    DEFAULT_ROWS,
-    build_table,
-    format_cell,
-    with_agreement,
-)
+from gsbench.analysis.tables import DEFAULT_ROWS, build_table, format_cell, with_agreement
 from gsbench.errors import InputError
 from gsbench.files import own_output, writable_output, write_text
 from gsbench.runs.experiments import list_experiments
@@ -355,7 +350,7 @@ def _origin(trial: TrialResult) -> dict[str, str]:
         origin["since"] = "; ".join(map(str, edits))
     if record.code.commit:
         origin["commit"] = f"{record.code.commit}{', edited' if record.code.edited else ''}"
-    packages = record.code.rooms
+    packages = record.code.packages
     differing = list(edited(packages))
     # before the first release all packages count as edited
     if differing and len(differing) < len(packages):

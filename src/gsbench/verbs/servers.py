@@ -23,7 +23,13 @@ from gsbench.system.isolate import end_descendants
 from gsbench.system.programs import NEUTRAL, own_folder, safe_environment
 from gsbench.system.stopping import stop_on_signals
 from gsbench.tracking.comparison import addresses, publish
-from gsbench.tracking.mlflow_sink import SETTINGS, absolute_address, default_uri, tracker_uri
+from gsbench.tracking.mlflow_sink import (
+    SETTINGS,
+    absolute_address,
+    default_uri,
+    require_own_journal,
+    tracker_uri,
+)
 from gsbench.verbs.arguments import ArgumentParser, port
 
 VIEWER_PORT, DASHBOARD_PORT = 8080, 5000
@@ -154,6 +160,7 @@ def _announce(server: str, lines: str, page: str) -> None:
 
 def serve(uri: str, port: int) -> int:
     """Run ``mlflow ui`` with one worker and no job runner, until a signal or Ctrl-C."""
+    require_own_journal(uri)
     mlflow_spec = importlib.util.find_spec("mlflow")
     assert mlflow_spec is not None
     assert mlflow_spec.origin is not None

@@ -17,8 +17,9 @@ from rich.table import Table
 
 from gsbench.analysis.differences import find_superseded
 from gsbench.analysis.results import read_experiment
-from gsbench.config.command_words import key_of, makes_other_trials, typed_permissions
+from gsbench.config.command_words import makes_other_trials, typed_permissions
 from gsbench.config.compose import Trial, compose_one
+from gsbench.config.overrides import key_of
 from gsbench.config.permissions import PERMISSIONS
 from gsbench.errors import GsbenchError, InputError
 from gsbench.launch.dry_run import describe_plan

@@ -91,7 +91,8 @@ def gate(argv: Sequence[str], runs: Path) -> int:
         made = [*asked.read()]
         left_out = texts(unused_trials(made, [verdict]))
         new_trials = [trial for trial in made if trial.config_hash == gates.NEW]
-        print("\n".join([gates.describe(verdict), *left_out, *gates.deviations(old, new_trials)]))
+        deviations = map(str, gates.deviations(old, new_trials))
+        print("\n".join([gates.describe(verdict), *left_out, *deviations]))
     return EXIT_CODES[gates.result_of(verdict)]
 
 
@@ -263,7 +264,7 @@ def _begin(
     # of each step, so that all together err in 5 % at most; only "worse" can be wrong, so the
     # interval with both sides has twice the share
     share = ERROR_RATE / gates.most_steps(len(commits) - 1)
-    seeds = range(max(0, options.seeds))
+    seeds = range(max(0, options.seeds))  # too few are refused below
     declaration = gates.declare_gate(
         options.metric, options.least, arms, seeds, example.values, 2 * share
     )

@@ -23,7 +23,7 @@ from gsbench.runs.experiments import Declaration, Question
 from gsbench.runs.layout import VOTE_KEY, VOTES
 from gsbench.runs.votes import Ballot, RoundKey, StoredBallot, check_ballot, read_key, store_ballots
 from gsbench.verbs.arguments import ArgumentParser, names, path, whole_number
-from gsbench.words import counted
+from gsbench.words import command, counted
 
 PAIRS, PEOPLE = 40, 9  # nine: the sign test then lets one person disagree
 MOST = 1000  # pairs, and people
@@ -156,13 +156,13 @@ def judge(experiment: Experiment, files: Sequence[Path]) -> None:
             raise InputError(
                 f"{file}: this person handed in other votes before, which stay ({place})"
             )
-    for folder, (key, own) in new.items():
-        store_ballots(folder, key, own)
+    for folder, (key, handed_in) in new.items():
+        store_ballots(folder, key, handed_in)
     verdicts = load_rounds(experiment.folder)
     if not verdicts:
         raise InputError(
-            f"{experiment.name} has no round of votes: gsbench vote make {experiment.name} --out "
-            "DIR"
+            f"{experiment.name} has no round of votes: "
+            + command("vote", "make", experiment.name, "--out", "DIR")
         )
     comparison = compare(experiment)
     trials, judged = comparison.trials, comparison.answers

@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from gsbench.scene.colmap import read_model
-from gsbench.scene.courtyard.layout import BOX, SPHERE, build_layout
+from gsbench.scene.courtyard.layout import build_layout
 from gsbench.scene.courtyard.render import (
     courtyard_cameras,
     render_courtyard,
@@ -100,34 +100,6 @@ def test_the_images_change_only_with_the_version():
         picture = render_view(build_layout(1), ring_camera(angle, 80, 60), 1)
         made.append([fingerprint(picture[..., channel]) for channel in range(3)])
     assert_allclose(made, PICTURES, atol=0.02, err_msg=str(np.round(made, 3).tolist()))
-
-
-def test_surface_distance_is_zero_on_surfaces_and_correct_above_the_lawn():
-    layout = build_layout(0)
-    rng = np.random.default_rng(1)
-    spheres, boxes = np.flatnonzero(layout.kind == SPHERE), np.flatnonzero(layout.kind == BOX)
-    directions = rng.normal(size=(len(spheres), 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    on_spheres = layout.center[spheres] + layout.size[spheres, :1] * directions
-    faces = rng.uniform(-1, 1, (len(boxes), 3))
-    faces[np.arange(len(boxes)), rng.integers(0, 3, len(boxes))] = 1.0
-    on_boxes = layout.center[boxes] + np.einsum(
-        "bij,bj->bi", layout.rotation[boxes], faces * layout.size[boxes, :3]
-    )
-    # the well
-    on_tube = np.array(
-        [[0.8, 0.0, 0.4], [0.58, 0.0, 0.6], [0.7 * np.cos(2), 0.7 * np.sin(2), 0.81]]
-    )
-    assert (
-        surface_distance(np.concatenate([on_spheres, on_boxes, on_tube, [[3.1, 3.1, 0.0]]])).max()
-        < 1e-9
-    )
-    # The ground is nearest to points of the open lawn, roofs to a point high above.
-    assert_allclose(
-        surface_distance(np.array([[-2.5, 3.6, 0.2], [-2.5, 3.6, -0.1]])), [0.2, 0.1], atol=1e-9
-    )
-    assert surface_distance(np.array([[0.0, 0.0, 8.0]]))[0] > 4
-    assert surface_distance(np.array([[0.0, 0.0, 8.0]]), limit=0.5)[0] == 0.5
 
 
 def test_too_few_views_and_too_small_images_are_refused():

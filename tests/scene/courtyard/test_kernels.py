@@ -82,7 +82,7 @@ def test_a_ray_hits_a_solid_where_samples_along_it_enter_the_solid(name):
 
 
 @pytest.mark.parametrize("name", SHAPES)
-def test_normals_are_the_gradient_of_the_distance(name):
+def test_the_distance_is_zero_at_a_hit_and_its_gradient_is_the_normal(name):
     kind, size = SHAPES[name]
     tried = 0
     for origin, direction in [*rays(2, 80, 2.0), *(rays(3, 40, 0.0) if size[2] == 0.5 else [])]:
@@ -91,6 +91,7 @@ def test_normals_are_the_gradient_of_the_distance(name):
             continue
         tried += 1
         point = origin + t * direction
+        assert PLAIN.signed_distance(kind, size, *point) == pytest.approx(0, abs=1e-9)
         moved = [
             [PLAIN.signed_distance(kind, size, *(point + s * step)) for s in (1, -1)]
             for step in 1e-6 * np.eye(3)

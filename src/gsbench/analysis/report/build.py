@@ -37,7 +37,7 @@ from gsbench.runs import layout
 from gsbench.runs.experiments import TuningRecord
 from gsbench.runs.ledger import read_ledger
 from gsbench.scene.images import read_image
-from gsbench.words import counted, signed
+from gsbench.words import command, counted, signed
 
 COSTS_COMPARED = ("gaussians", "train_time")
 
@@ -70,6 +70,7 @@ def build_report(
         "report.html.j2",
         script=files("gsbench.analysis.report").joinpath("script.js").read_text(encoding="utf-8"),
         name=experiment.name,
+        explained=command("explain", f"{experiment.name}:SCENE:METRIC:ARM"),
         arms=[str(arm) for arm in arms],
         scenes=sorted({trial.scene for trial in trials}),
         seeds=experiment.seeds,

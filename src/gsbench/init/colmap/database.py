@@ -175,7 +175,7 @@ def create_database(path: Path, groups: CameraGroups) -> dict[str, int]:
     same database on any number of threads. Each camera gets its own rig.
     """
     # An interrupted run may have left a database whose ids belong to other images.
-    path.unlink(missing_ok=True)
+    remove_database(path)
     ids_of: dict[str, tuple[int, int]] = {}  # of camera and rig
     image_ids: dict[str, int] = {}
     with writable(path) as database:
@@ -193,6 +193,15 @@ def create_database(path: Path, groups: CameraGroups) -> dict[str, int]:
             database.write_frame(frame)
             image_ids[name] = image.image_id
     return image_ids
+
+
+def remove_database(path: Path) -> None:
+    """Remove a database and the files of SQLite beside it, if there are any.
+
+    SQLite would roll back a journal that a stranger left for a new database of this name.
+    """
+    for suffix in ("", "-journal", "-wal", "-shm"):
+        path.with_name(f"{path.name}{suffix}").unlink(missing_ok=True)
 
 
 def write_keypoints(path: Path, keypoints: Mapping[str, NDArray[np.float32]]) -> None:

@@ -157,6 +157,7 @@ class _Mapper:
         The pairs are verified again under these focal lengths.
         """
         copy = self.database.with_name(f"assumed-{factor:g}.db")
+        colmap_database.remove_database(copy)
         shutil.copy(self.database, copy)
         pairs = colmap_database.assume_focal_lengths(copy, factor)
         options = geometry.verification_options(self.options)

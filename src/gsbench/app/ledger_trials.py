@@ -1,0 +1,91 @@
+"""The trials of a ledger's words: which settings an idea may have, and what may run."""
+
+from collections.abc import Sequence
+
+from gsbench.analysis.looks import FIRST_LOOK
+from gsbench.app.command import compose_trials, require_waiting
+from gsbench.claims.stopping import KeyAndSeed
+from gsbench.config.command_words import typed_permissions
+from gsbench.config.compose import Trial
+from gsbench.config.overrides import key_of
+from gsbench.errors import InputError
+from gsbench.runs.ledger import Ledger
+from gsbench.words import listed
+
+GIVEN = ("name", "runs", "eval.primary")  # settings that the ledger sets itself
+# An idea may change how a model is made, not what it is measured on.
+OF_IDEAS = (
+    "densify",
+    "init",
+    "train",
+    "raster",
+    "allow_targets",
+    "launch",
+    "device",
+    "threads",
+    "tracking",
+)
+Trials = dict[KeyAndSeed, Trial]
+
+
+def compose_words(name: str, words: Sequence[str], typed: Sequence[str]) -> Trials:
+    """The trials of words by key and seed; only the ``typed`` ones give permissions.
+
+    Raises InputError for settings that the ledger sets.
+    """
+    for word in words:
+        if key_of(word) in GIVEN:
+            raise InputError(f"ledger: {key_of(word)} follows from the ledger: leave it out")
+    trials = compose_trials([*words, f"name={name}"], multirun=True, typed=typed)
+    require_waiting("ledger", trials)
+    return {(trial.files.key, trial.values["seed"]): trial for trial in trials}
+
+
+def keys_by_scene(trials: Trials, name: str) -> dict[str, str]:
+    """The key of the trials on each scene; raises InputError for several arms."""
+    keys: dict[str, set[str]] = {}
+    for (key, _), trial in trials.items():
+        keys.setdefault(trial.values["scene"]["name"], set()).add(key)
+    if any(len(on_scene) > 1 for on_scene in keys.values()):
+        raise InputError(f"{name} compares one arm at a time: only scene and seed may list values")
+    return {scene: on_scene.pop() for scene, on_scene in keys.items()}
+
+
+def seeds_of(trials: Trials) -> tuple[int, ...]:
+    seeds = tuple(dict.fromkeys(seed for _, seed in trials))
+    if len(seeds) < FIRST_LOOK:
+        raise InputError(f"a ledger needs at least {FIRST_LOOK} seeds, such as seed=0,1,2,3,4,5")
+    return seeds
+
+
+def permitted_words(book: Ledger, idea: str, typed: Sequence[str]) -> tuple[str, ...]:
+    """The recorded settings of an idea, or of the baseline, with what is typed about tracking.
+
+    Raises InputError if they would run code that the ``typed`` words do not allow: the ledger is a
+    file, and may be somebody else's.
+    """
+    words = book.words_of(idea)
+    needed = set(typed_permissions(words)) - set(typed_permissions(typed))
+    if needed:
+        names = ",".join(sorted(needed | set(typed_permissions(typed))))
+        raise InputError(f"{idea} runs code of yours: add allow_targets=[{names}]")
+    tracking = [word for word in typed if key_of(word).partition(".")[0] == "tracking"]
+    if any(key_of(word) == "tracking" for word in tracking):  # settings of another tracker
+        words = tuple(word for word in words if not key_of(word).startswith("tracking"))
+    return tuple(merged(words, tracking))
+
+
+def merged(words: Sequence[str], changes: Sequence[str]) -> list[str]:
+    """The words with ``changes``: each replaces the word of the same key, ``~KEY`` removes it."""
+    given, changed = set(map(key_of, words)), set(map(key_of, changes))
+    kept = [word for word in words if key_of(word) not in changed]
+    return kept + [word for word in changes if not (word.startswith("~") and key_of(word) in given)]
+
+
+def check_words(words: Sequence[str]) -> None:
+    """Raise InputError for a setting that an idea may not change, and for no settings at all."""
+    for key in map(key_of, words):
+        if key.partition(".")[0].partition("/")[0] not in OF_IDEAS:
+            raise InputError(f"{key}: an idea may change {listed(OF_IDEAS[:4])}, not what decides")
+    if not words:
+        raise InputError("ledger try needs the idea's settings, such as densify=volumetric")
