@@ -30,7 +30,7 @@ def script(name):
     """Load a file of scripts/ as a module; it may import others there."""
     if str(ROOT / "scripts") not in sys.path:
         sys.path.append(str(ROOT / "scripts"))
-    specification = importlib.util.spec_from_file_location(name, ROOT / "scripts" / f"{name}.py")
+    specification = importlib.util.spec_from_file_location(name, ROOT / f"scripts/{name}.py")
     assert specification is not None
     assert specification.loader is not None
     module = importlib.util.module_from_spec(specification)

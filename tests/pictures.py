@@ -33,7 +33,7 @@ def write_pictures(path, densify, seed, views):
             render[:40, :40] += 20
         for folder, image in (("renders", render), ("ground_truth", truth)):
             pixels = np.clip(image + 0.5, 0, 255).astype(np.uint8)
-            Image.fromarray(pixels).save(path / folder / f"view{view:03d}.png")
+            Image.fromarray(pixels).save(path / f"{folder}/view{view:03d}.png")
 
 
 def write_point_cloud(path, densify, seed):

@@ -36,13 +36,13 @@ def place(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [entry for entry in sys.path if entry])
     (tmp_path / "bomb.py").write_text(BOMB)
-    write(tmp_path / "bombs" / "__init__.py", BOMB)
-    (tmp_path / "bombs" / "one.yaml").write_text("name: one\n")
+    write(tmp_path / "bombs/__init__.py", BOMB)
+    (tmp_path / "bombs/one.yaml").write_text("name: one\n")
     (tmp_path / "mine.py").write_text(MINE)
     (tmp_path / "hydra_plugins").mkdir()  # Hydra imports whatever it finds below this name
-    (tmp_path / "hydra_plugins" / "bomb.py").write_text(BOMB)
+    (tmp_path / "hydra_plugins/bomb.py").write_text(BOMB)
     yield tmp_path
-    for module in ("bomb", "bombs", "mine", "helper"):
+    for module in split("bomb bombs mine helper"):
         sys.modules.pop(module, None)
     allowed_modules().clear()
 

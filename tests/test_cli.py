@@ -14,13 +14,7 @@ from gsbench.system.stopping import Stopped
 from gsbench.verbs import load_verb
 from tests.processes import completed
 
-
-@pytest.fixture(autouse=True)
-def runs(tmp_path, monkeypatch):
-    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
-    monkeypatch.chdir(tmp_path)
-    return tmp_path / "runs"
-
+pytestmark = pytest.mark.usefixtures("runs")
 
 # ---- the frame
 
@@ -147,19 +141,17 @@ def test_without_its_current_folder_a_command_says_so_in_one_line(
         assert cli.run(words) == 0
 
 
-def test_help_lists_verbs_and_choices_also_of_the_users_folders(tmp_path, capsys):
-    (tmp_path / "own" / "densify").mkdir(parents=True)
-    (tmp_path / "own" / "densify" / "calm.yaml").touch()
-    assert cli.run(split("--config-dir own --help")) == 0
-    said = capsys.readouterr().out
-    assert said.startswith(cli.USAGE)
-    assert [name for name in cli.VERBS if f"\n  {name} " not in said] == []
-    assert "calm" in said
+def test_help_lists_verbs_and_choices_also_of_the_users_folders(tmp_path, said):
+    (tmp_path / "own/densify").mkdir(parents=True)
+    (tmp_path / "own/densify/calm.yaml").touch()
+    shown = said("--config-dir own --help")
+    assert shown.startswith(cli.USAGE)
+    assert [name for name in cli.VERBS if f"\n  {name} " not in shown] == []
+    assert "calm" in shown
 
 
-def test_unknown_verb_names_the_nearest(capsys):
-    assert cli.run(["statsu"]) == 2
-    assert "did you mean status?" in capsys.readouterr().err
+def test_unknown_verb_names_the_nearest(refused):
+    assert "did you mean status?" in refused("statsu")
 
 
 def test_hydra_shows_the_configuration(capfd):
@@ -202,6 +194,5 @@ def test_ctrl_c_while_the_first_modules_load_is_one_line(module, tmp_path):
     assert done.stderr == "gsbench: stopped before it began\n"
 
 
-def test_the_version_is_printed(capsys):
-    assert cli.run(["--version"]) == 0
-    assert capsys.readouterr().out == f"gsbench {__version__}\n"
+def test_the_version_is_printed(said):
+    assert said("--version") == f"gsbench {__version__}\n"

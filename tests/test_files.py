@@ -6,6 +6,7 @@ import os
 import socket
 from collections import namedtuple
 from contextlib import suppress
+from shlex import split
 
 import pytest
 
@@ -81,7 +82,7 @@ def _refuse(number):
 
 
 def test_an_output_gets_its_folder_and_another_is_asked_for_if_it_cannot_be_written(tmp_path):
-    out = tmp_path / "new" / "below" / "page.html"
+    out = tmp_path / "new/below/page.html"
     with writable_output(out):
         out.write_text("a")
     for place, said in (
@@ -95,15 +96,15 @@ def test_an_output_gets_its_folder_and_another_is_asked_for_if_it_cannot_be_writ
 @pytest.fixture
 def special(tmp_path):
     """A runs folder with a file, a folder, and below it what may not be there."""
-    place = tmp_path / "runs" / "x"
+    place = tmp_path / "runs/x"
     place.mkdir(parents=True)
-    write(tmp_path / "outside" / "file", "kept")
+    write(tmp_path / "outside/file", "kept")
     (place / "file").write_text("a")
     (place / "folder").mkdir()
-    os.mkfifo(place / "folder" / "pipe")
-    (place / "folder" / "link").symlink_to(tmp_path / "outside" / "file")
-    (place / "folder" / "linked").symlink_to(tmp_path / "outside")
-    (place / "folder" / "dangling").symlink_to(tmp_path / "nowhere")
+    os.mkfifo(place / "folder/pipe")
+    (place / "folder/link").symlink_to(tmp_path / "outside/file")
+    (place / "folder/linked").symlink_to(tmp_path / "outside")
+    (place / "folder/dangling").symlink_to(tmp_path / "nowhere")
     return {path.name: path for path in place.rglob("*")}
 
 
@@ -129,9 +130,9 @@ def test_only_regular_files_are_opened(special):
 
 def test_links_are_found_on_the_way_and_only_if_asked_below(special):
     runs = special["file"].parents[1]
-    for place in (runs / "x", runs / "x" / "none" / "a", runs / "x" / "file" / "a"):
+    for place in (runs / "x", runs / "x/none/a", runs / "x/file/a"):
         require_no_links(runs, place)
-    require_no_links(runs, runs / "x" / "none", below=True)
+    require_no_links(runs, runs / "x/none", below=True)
     require_no_links(runs, special["file"], below=True)
     for name in SPECIAL:
         with refusal(f"{name} is a link"):
@@ -151,7 +152,7 @@ def test_links_are_found_on_the_way_and_only_if_asked_below(special):
 
 
 def test_a_users_pipe_or_socket_is_refused_and_a_link_is_not(special):
-    for name in ("file", "folder", "link", "linked", "dangling"):
+    for name in split("file folder link linked dangling"):
         require_regular(special[name])
     with socket.socket(socket.AF_UNIX) as server:
         address = special["file"].with_name("s")
@@ -162,10 +163,10 @@ def test_a_users_pipe_or_socket_is_refused_and_a_link_is_not(special):
 
 
 def test_the_remains_of_killed_writers_are_removed_and_no_other_files(tmp_path):
-    kept = [".a.tmp-", ".a.tmp-1x", "a.tmp-1", ".tmp", ".hidden", "a"]
+    kept = split(".a.tmp- .a.tmp-1x a.tmp-1 .tmp .hidden a")
     for name in (".a.json.tmp-17", ".a.tmp", *kept):
         (tmp_path / name).touch()
-    write(tmp_path / "below" / ".b.tmp-1", b"")
+    write(tmp_path / "below/.b.tmp-1", b"")
     (tmp_path / ".c.tmp-1").mkdir()
     remove_temporaries(tmp_path)
     assert {path.name for path in tmp_path.rglob("*")} == {"below", ".c.tmp-1", *kept}
@@ -194,8 +195,8 @@ def test_the_digest_of_a_file_is_its_sha256(tmp_path):
 def test_the_runs_folder_is_absolute_and_can_be_made(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    assert checked_runs_folder("a/../b/c") == tmp_path / "b" / "c"
-    assert checked_runs_folder("~/runs") == tmp_path / "home" / "runs"
+    assert checked_runs_folder("a/../b/c") == tmp_path / "b/c"
+    assert checked_runs_folder("~/runs") == tmp_path / "home/runs"
     (tmp_path / "file").touch()
     for name, said in (
         ("file", r"cannot be made, because .*/file is a file: set runs=FOLDER"),
@@ -209,7 +210,7 @@ def test_the_runs_folder_is_absolute_and_can_be_made(tmp_path, monkeypatch):
 
 
 def test_a_runs_folder_is_made_and_tried(tmp_path, monkeypatch):
-    folder = tmp_path / "a" / "runs"
+    folder = tmp_path / "a/runs"
     for _ in range(2):
         make_runs_folder(folder)
         assert list(folder.iterdir()) == []
@@ -253,7 +254,7 @@ def test_on_a_disk_without_free_space_any_failed_write_counts_as_a_full_disk(tmp
     asked = []
     usage = Usage(10**9, 0, 65_535)
     monkeypatch.setattr(files.shutil, "disk_usage", lambda path: asked.append(path) or usage)
-    error, missing = RuntimeError("a library's text"), tmp_path / "not" / "there"
+    error, missing = RuntimeError("a library's text"), tmp_path / "not/there"
     assert isinstance(explain_storage(error, missing), DiskFullError)
     assert isinstance(explain_storage(OSError(errno.ENOENT, "x"), missing), DiskFullError)
     assert asked == [tmp_path, tmp_path]

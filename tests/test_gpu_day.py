@@ -11,6 +11,7 @@ import tarfile
 import time
 from importlib.metadata import version
 from pathlib import Path
+from shlex import split
 
 import pytest
 import torch
@@ -19,7 +20,7 @@ from tests.composed import composed
 from tests.raster.conftest import interpreter_fault
 
 ROOT = Path(__file__).resolve().parents[1]
-SCRIPT = ROOT / "scripts" / "gpu_day.sh"
+SCRIPT = ROOT / "scripts/gpu_day.sh"
 # Stands in for Python: parts fail, hang or are killed as a test wants, and others print what real
 # ones print. Python runs everything else, such as the script itself.
 STAND_IN = r"""#!{python} -IS
@@ -168,18 +169,8 @@ def test_parts_that_fail_hang_or_are_killed_do_not_harm_other_parts(day):
         "bench-triton-3": 1,
         "train-volumetric-0": "out of time",
     }
-    well = {
-        "install",
-        "bits",
-        "compilation",
-        "compilation-faster_gs",
-        "host",
-        "bench-faster_gs",
-        "train-adc-0",
-        "train-volumetric_once-0",
-        "bench-cpu",
-        "proof-cpu",
-    }
+    well = "install bits compilation compilation-faster_gs host bench-faster_gs train-adc-0 "
+    well = {*split(well + "train-volumetric_once-0 bench-cpu proof-cpu")}
     well |= {f"bench-triton-{name}-{way}" for name in LISTS for way in ("split", "whole")}
     assert ends.keys() - faults.keys() == well | {"contract-cpu", "memcheck", "racecheck"}
     assert {
@@ -189,7 +180,7 @@ def test_parts_that_fail_hang_or_are_killed_do_not_harm_other_parts(day):
     } <= set(files)
     assert "broken on purpose" in said  # the end of what it wrote
     for name in ("proof-triton", "train-volumetric-0"):  # the child of a part has ended, too
-        child = Path("/proc") / (day.state / "results" / f"{name}.out").read_text().strip()
+        child = Path("/proc") / (day.state / f"results/{name}.out").read_text().strip()
         assert not child.exists() or "\nState:\tZ" in (child / "status").read_text()
     table = (day.out / "table.md").read_text()
     assert "- proof-triton: NO (out of time), " in table
@@ -209,7 +200,7 @@ def test_parts_that_fail_hang_or_are_killed_do_not_harm_other_parts(day):
 
 def test_a_killed_command_leaves_the_results_so_far_and_no_process(day):
     process = day.start("all", "300", faults={"train-adc-0": ("densify=adc ", "hang")})
-    marker = day.state / "results" / "train-adc-0.out"
+    marker = day.state / "results/train-adc-0.out"
     until = time.monotonic() + 60
     while not (marker.exists() and marker.read_text()) and time.monotonic() < until:
         time.sleep(0.1)
@@ -291,14 +282,15 @@ def test_without_a_compiled_gsplat_its_parts_are_not_tried(day):
     }
 
 
+@pytest.mark.slow
 def test_the_archive_has_packages_scene_and_weights(tmp_path, shared):
     """The scene has no tracks, but gives a training the same points."""
     from gsbench.scene.colmap import model_points, read_reference
     from gsbench.scene.readers import read_colmap
 
     day = Day(tmp_path)
-    scene = shared / "data" / "herz_jesus_p25"
-    source = tmp_path / "checkout" / "FasterGSCudaBackend" / "FasterGSCudaBackend"
+    scene = shared / "data/herz_jesus_p25"
+    source = tmp_path / "checkout/FasterGSCudaBackend/FasterGSCudaBackend"
     source.mkdir(parents=True)
     (source / "blend.cuh").write_text("Reduce(used, cub::Max());")
     more = {"GPU_DAY_SCENE": str(scene), "GSBENCH_WEIGHTS": str(shared / "weights")}
@@ -306,7 +298,7 @@ def test_the_archive_has_packages_scene_and_weights(tmp_path, shared):
     code, said = day.run("wheels", **more)
     assert code == 0, said
     assert re.search(r"brought.tar.xz: \d\.\d MiB, 2 files of weights", said)
-    with tarfile.open(tmp_path / "brought" / "brought.tar.xz") as archive:
+    with tarfile.open(tmp_path / "brought/brought.tar.xz") as archive:
         archive.extractall(tmp_path / "there", filter="data")
     there = tmp_path / "there"
     assert {file.name for file in (there / "site").iterdir()} >= {
@@ -314,9 +306,7 @@ def test_the_archive_has_packages_scene_and_weights(tmp_path, shared):
         "pycolmap",
         "antlr4_python3_runtime",
     }
-    assert len(list((there / "bonsai" / "images").iterdir())) == len(
-        list((scene / "images").iterdir())
-    )
+    assert len(list((there / "bonsai/images").iterdir())) == len(list((scene / "images").iterdir()))
     before, after = (
         read_reference(read_colmap("scene", folder)) for folder in (scene, there / "bonsai")
     )
@@ -326,7 +316,7 @@ def test_the_archive_has_packages_scene_and_weights(tmp_path, shared):
         image.name for image in before.images.values()
     }
     assert len(list((there / "weights").iterdir())) == 2
-    text = (there / "faster_gs" / "blend.cuh").read_text()
+    text = (there / "faster_gs/blend.cuh").read_text()
     assert text == "Reduce(used, [](auto a, auto b) { return a < b ? b : a; });"
 
 

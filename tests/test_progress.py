@@ -36,7 +36,10 @@ def test_a_log_gets_a_line_from_time_to_time(caplog, monkeypatch):
             report("a", done, None, f"note {done}")
         report("a", 0, 0)
     assert [message.rstrip() for message in caplog.messages] == [
-        *("fetch: a 0/?", "fetch: a 2/? note 2", "fetch: a 4/? note 4", "fetch: a 0/0")
+        "fetch: a 0/?",
+        "fetch: a 2/? note 2",
+        "fetch: a 4/? note 4",
+        "fetch: a 0/0",
     ]
     no_progress("a", 1, 2)
 

@@ -56,7 +56,10 @@ def test_numbers_and_names_are_put_into_sentences():
     names = ["a", "b", "c", "d", "e"]
     assert [listed(names[:n]) for n in range(4)] == ["", "a", "a and b", "a, b and c"]
     assert [some_of(names[:n]) for n in (2, 3, 4, 5)] == [
-        *("a, b", "a, b, c", "a, b, c and 1 more", "a, b, c and 2 more")
+        "a, b",
+        "a, b, c",
+        "a, b, c and 1 more",
+        "a, b, c and 2 more",
     ]
 
 
@@ -88,7 +91,9 @@ def test_the_counts_of_a_refinement_explain_the_number_after_it():
     event.volume_threshold, event.target, event.strictness = 0.1, 0, float("inf")
     record = event.as_dict()
     assert {key: record.get(key) for key in ("volume_threshold", "target", "opacity_reset")} == {
-        **{"volume_threshold": 0.1, "target": 0, "opacity_reset": False}
+        "volume_threshold": 0.1,
+        "target": 0,
+        "opacity_reset": False,
     }
     assert not {"strictness", "cull"} & set(record)
     counts = sum_events([record, {"cloned": 5, "step": 9}])
@@ -98,8 +103,12 @@ def test_the_counts_of_a_refinement_explain_the_number_after_it():
 
 def test_causes_have_fixed_numbers_and_colours_apart():
     assert {cause.key: int(cause) for cause in Cause} == {
-        **{"initial": 0, "clone": 1, "split_gradient": 2},
-        **{"split_volume": 3, "relocated": 4, "added": 5},
+        "initial": 0,
+        "clone": 1,
+        "split_gradient": 2,
+        "split_volume": 3,
+        "relocated": 4,
+        "added": 5,
     }
     assert Cause(3).words == "split by volume"
     assert len({cause.color for cause in Cause}) == len(Cause)

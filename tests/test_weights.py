@@ -38,13 +38,13 @@ def spec(content=None, url=None, digits=64, name="net.pth"):
 def empty_caches(tmp_path, monkeypatch):
     monkeypatch.delenv("GSBENCH_WEIGHTS", raising=False)
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
-    return tmp_path / "torch" / "hub" / "checkpoints"
+    return tmp_path / "torch/hub/checkpoints"
 
 
 def test_search_order_is_argument_environment_cache(tmp_path, empty_caches, monkeypatch):
     places = [
-        tmp_path / "argument" / "deep" / "below",
-        tmp_path / "environment" / "other",
+        tmp_path / "argument/deep/below",
+        tmp_path / "environment/other",
         empty_caches,
     ]
     for place in places:
@@ -72,7 +72,7 @@ def test_every_name_counts_and_the_first_right_file_is_taken(tmp_path):
 
 
 def test_only_the_cache_is_not_searched_below(empty_caches, monkeypatch):
-    write(empty_caches / "deep" / "net.pth", b"x")
+    write(empty_caches / "deep/net.pth", b"x")
     with pytest.raises(MissingWeightsError, match="it has no address to download from"):
         find_weights(spec())
     monkeypatch.setenv("GSBENCH_WEIGHTS", str(empty_caches.parent))

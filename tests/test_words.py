@@ -5,12 +5,12 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
+from shlex import split
 
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from gsbench import cli
 from gsbench.app.command import compose_trials
 from gsbench.config.schema import GROUP_SCHEMAS
 from gsbench.errors import InputError
@@ -179,7 +179,7 @@ def place(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "path", list(sys.path))
     (tmp_path / "own.py").write_text(OWN)
     (tmp_path / "broken.py").write_text("def (:\n")
-    experiments = tmp_path / "conf" / "experiment"
+    experiments = tmp_path / "conf/experiment"
     experiments.mkdir(parents=True)
     (experiments / "calls.yaml").write_text(
         "# @package _global_\nhydra:\n  callbacks:\n    x:\n      _target_: os.system\n"
@@ -189,8 +189,8 @@ def place(tmp_path, monkeypatch):
         "a0: &a0 [x]",
         *(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 10)),
     ]
-    (tmp_path / "bombs" / "experiment").mkdir(parents=True)
-    (tmp_path / "bombs" / "experiment" / "bomb.yaml").write_text(
+    (tmp_path / "bombs/experiment").mkdir(parents=True)
+    (tmp_path / "bombs/experiment/bomb.yaml").write_text(
         "\n".join(["# @package _global_", *bomb]) + "\n"
     )
     for module in ("own", "broken"):
@@ -199,50 +199,44 @@ def place(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("command", REFUSED)
-def test_a_wrong_command_is_refused_in_one_line(command, place, capsys):
-    assert cli.run(shlex.split(command)) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("gsbench: ")
-    assert REFUSED[command] in line
+def test_a_wrong_command_is_refused_in_one_line(command, place, refused):
+    assert REFUSED[command] in refused(*split(command))
     assert not (place / "runs").exists()  # nothing was begun
 
 
 @pytest.mark.parametrize("command", ["", "-m", "--multirun"])
-def test_a_command_without_settings_prints_the_usage(command, place, capsys):
-    assert cli.run(shlex.split(command)) == 0
-    assert "gsbench --help" in capsys.readouterr().out
+def test_a_command_without_settings_prints_the_usage(command, place, said):
+    assert "gsbench --help" in said(command)
     assert not (place / "runs").exists()
 
 
 @pytest.mark.parametrize(
     "command", ["check {} --dry-run allow_targets=[x]", "check --dry-run allow_targets=[x] {}"]
 )
-def test_a_permission_may_stand_anywhere_in_a_command(command, capsys):
-    assert cli.run(shlex.split(command.format("nosuch.yaml"))) == 2
-    assert "nosuch.yaml cannot be read" in capsys.readouterr().err
+def test_a_permission_may_stand_anywhere_in_a_command(command, refused):
+    assert "nosuch.yaml cannot be read" in refused(command.format("nosuch.yaml"))
 
 
 @pytest.mark.parametrize("command", ["seed=1", "status", "tables x"])
 @pytest.mark.parametrize("runs", ["file", "file/below", "~nosuchuser/x", ""])
-def test_a_name_that_cannot_be_a_runs_folder_is_refused(runs, command, place, monkeypatch, capsys):
+def test_a_name_that_cannot_be_a_runs_folder_is_refused(runs, command, place, monkeypatch, refused):
     (place / "file").touch()
     monkeypatch.setenv("GSBENCH_RUNS", runs)
-    assert cli.run(shlex.split(command)) == 2
-    (line,) = capsys.readouterr().err.splitlines()
+    line = refused(command)
     assert "runs" in line
     assert "full" not in line
 
 
-def test_a_runs_folder_that_cannot_be_made_is_refused(capsys):
+def test_a_runs_folder_that_cannot_be_made_is_refused(refused):
     if not Path("/proc/self").exists():
         pytest.skip("needs /proc, where nobody can make a folder")
-    assert cli.run(["runs=/proc/nowhere", "tracking=none"]) == 2
-    assert "/proc/nowhere cannot be the runs folder" in capsys.readouterr().err
+    line = refused("runs=/proc/nowhere", "tracking=none")
+    assert "/proc/nowhere cannot be the runs folder" in line
 
 
 def test_errors_of_a_separate_process_are_one_line(place):
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    for command in ("+extra=1", "-m seed=range(0,0)", "=3"):
+    for command in ("+extra=1", "=3"):
         argv = [sys.executable, "-m", "gsbench.cli", *shlex.split(command)]
         done = subprocess.run(
             argv, capture_output=True, text=True, env=environment, timeout=120, check=False
@@ -253,18 +247,18 @@ def test_errors_of_a_separate_process_are_one_line(place):
 @pytest.mark.parametrize(
     "words",
     [
-        ["launch=slurm", "launch.sbatch={constraint: a100}"],
-        ["launch=slurm", "launch.sbatch.constraint=a100"],
-        ["train.iterations=1e3", "densify.max_gaussians=1e5"],
-        ["scene.downscale=4", "scene.max_size=100"],
-        ['name="größe"'],
-        ["~densify.cap"],
+        "launch=slurm 'launch.sbatch={constraint: a100}'",
+        "launch=slurm launch.sbatch.constraint=a100",
+        "train.iterations=1e3 densify.max_gaussians=1e5",
+        "scene.downscale=4 scene.max_size=100",
+        "'name=\"größe\"'",
+        "~densify.cap",
     ],
 )
 def test_unusual_but_right_words_are_accepted(words):
-    (trial,) = compose_trials(words)
+    (trial,) = compose_trials(split(words))
     assert trial.values["launch"]["sbatch"] == (
-        {"constraint": "a100"} if words[0] == "launch=slurm" else {}
+        {"constraint": "a100"} if split(words)[0] == "launch=slurm" else {}
     )
 
 

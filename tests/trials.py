@@ -34,7 +34,10 @@ def trial_values(runs, seed=0, name="tracked", **groups):
     """The configuration of a trial, which is not composed; ``groups`` are names of choices."""
     named = {group: f"a_{group}" for group in ("scene", "init", "densify")} | groups
     return {
-        **{"name": name, "seed": seed, "runs": str(runs), "train": {"iterations": STEPS}},
+        "name": name,
+        "seed": seed,
+        "runs": str(runs),
+        "train": {"iterations": STEPS},
         **{group: {"name": choice} for group, choice in named.items()},
     }
 
@@ -55,11 +58,18 @@ def results_of(values, **changes):
         "status": "complete",
         "experiment": values["name"],
         **{group: values[group]["name"] for group in ("scene", "init", "densify")},
-        **{"seed": values["seed"], "raster": "cpu", "protocol": "paper-1"},
+        "seed": values["seed"],
+        "raster": "cpu",
+        "protocol": "paper-1",
         "iterations": values.get("train", {}).get("iterations", 10),
-        **{"metrics": {"psnr": 20.5}, "unavailable": {}, "seconds": {"train": 1.0}},
-        **{"num_init_points": 5, "num_gaussians": 10, "peak_memory_mb": 1.5},
-        **{"hashes": {}, "versions": {}},
+        "metrics": {"psnr": 20.5},
+        "unavailable": {},
+        "seconds": {"train": 1.0},
+        "num_init_points": 5,
+        "num_gaussians": 10,
+        "peak_memory_mb": 1.5,
+        "hashes": {},
+        "versions": {},
     } | changes
 
 
@@ -78,8 +88,16 @@ def write_results(folder, values, **changes):
 def search_record(points):
     """The content of ``tuning.json`` for a search with these points, for the arm ``volumetric``."""
     return {
-        **{"sweep": "vth", "arm": "sfm-volumetric", "metric": "psnr", "direction": 1, "wanted": 2},
-        **{"seeds": [100], "scenes": ["courtyard"], "ranges": {}, "log": [], "points": points},
+        "sweep": "vth",
+        "arm": "sfm-volumetric",
+        "metric": "psnr",
+        "direction": 1,
+        "wanted": 2,
+        "seeds": [100],
+        "scenes": ["courtyard"],
+        "ranges": {},
+        "log": [],
+        "points": points,
     }
 
 
@@ -122,12 +140,15 @@ def write_trial(
         seconds={"init": 5.0, "train": count / 400 + seed, "evaluate": 2.0},
         peak_memory_mb=900,
         events={
-            **{"cloned": 500, "split_gradient": 300},
+            "cloned": 500,
+            "split_gradient": 300,
             "split_volume": 100 * (densify == "volumetric"),
         },
         init_report={"registered": 48, "images": 48},
         hashes={
-            **{"config": HASH, "data": f"data-{scene}", "train": f"t{seed}"},
+            "config": HASH,
+            "data": f"data-{scene}",
+            "train": f"t{seed}",
             "init": INIT.key({"scene": scene, "init": init}),
         },
         versions={"gsbench": "0.1.0", "torch": "2.13.0", "pycolmap": "4.2.1"},
@@ -137,7 +158,7 @@ def write_trial(
     for key, value in (settings or {}).items():
         group, _, name = key.partition(".")
         config[group] = config.get(group, {}) | {name: value} if name else value
-    path = runs / experiment / scene / f"{init}-{densify}" / f"{config_hash}-seed{seed}"
+    path = runs / experiment / f"{scene}/{init}-{densify}/{config_hash}-seed{seed}"
     path.mkdir(parents=True)
     with (path / "per_view.csv").open("w", newline="") as file:
         writer = csv.writer(file)
@@ -226,7 +247,9 @@ def write_runs(runs, **plan):
             path = write_trial(
                 runs,
                 seed,
-                **{"experiment": plan.experiment, "scene": scene, "init": init},
+                experiment=plan.experiment,
+                scene=scene,
+                init=init,
                 densify=densify,
                 _num_gaussians=count + 10 * seed,
                 _seconds={"init": 5.0, "train": count / 400 + seed, "evaluate": 2.0},

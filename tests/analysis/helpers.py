@@ -32,4 +32,4 @@ def rows_of(table):
 
 
 def write_declared(runs, *declarations, experiment="exp"):
-    (runs / experiment / "declared.jsonl").write_text(record_text(declarations))
+    (runs / f"{experiment}/declared.jsonl").write_text(record_text(declarations))

@@ -148,14 +148,6 @@ def test_arms_are_compared_unless_they_share_code_in_two_versions(tmp_path, firs
     assert (said in table.notes) == (not best)
 
 
-def test_a_scene_in_another_folder_is_no_other_version(tmp_path):
-    write_trial(tmp_path, 0, "aaaaaaaa", MINE | {"scene.path": "/here"}, psnr=27.0, _code=code(NEW))
-    write_trial(
-        tmp_path, 1, "bbbbbbbb", MINE | {"scene.path": "/there"}, psnr=28.0, _code=code(NEW)
-    )
-    assert table_of(tmp_path).rows[0].entries[0].text == "27.50 ± 0.71"
-
-
 def test_explain_names_the_commit_and_the_edited_packages(tmp_path):
     made = of_gsbench(train="released", eval="a" * 16) | {"commit": "0123abcd", "edited": True}
     write_trial(tmp_path, psnr=27.0, _code=made)

@@ -2,7 +2,6 @@
 
 import html
 import itertools
-import json
 import os
 import random
 import shutil
@@ -17,7 +16,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy import stats
 
 from gsbench.analysis.attempts import share_of_version
 from gsbench.analysis.comparison import compare
@@ -70,7 +68,7 @@ class Made:
         return f"{self.scene}/{self.init}-{self.densify}/{self.hash}"
 
     def results(self, runs):
-        return runs / "exp" / f"{self.key}-seed{self.seed}" / "results.json"
+        return runs / f"exp/{self.key}-seed{self.seed}/results.json"
 
 
 def write(runs, trials, experiment="exp"):
@@ -81,8 +79,10 @@ def write(runs, trials, experiment="exp"):
             one.seed,
             one.hash,
             {f"densify.{name}": value for name, value in one.options},
-            **{"experiment": experiment, "scene": one.scene},
-            **{"init": one.init, "densify": one.densify},
+            experiment=experiment,
+            scene=one.scene,
+            init=one.init,
+            densify=one.densify,
             **{metric: 20.0 + rng.gauss(0, 0.1) for metric in ("psnr", "ssim")},
             _measured=midnight(one.day),
             _code={"sources": {"mine": one.code} if one.code else {}, "stages": {"train": 2}},
@@ -234,15 +234,6 @@ BOTH_CAPS = ("sfm-adc[cap=2]", "sfm-adc[cap=1]")
 ADC_CAPS = [grid("adc", cap=cap) for cap in (1, 2)]
 
 
-def test_a_sweep_in_looks_keeps_its_verdict_when_a_baseline_is_added(tmp_path):
-    first, second = grid("absgs"), grid("mine")
-    write(tmp_path, [*first, *second])
-    declare_looks(tmp_path, (first, second))
-    (before,) = answer(tmp_path).sentences
-    write(tmp_path, grid("adc", day=5))
-    assert before in answer(tmp_path).sentences
-
-
 @pytest.mark.parametrize("missing", [["adc", "mine"], ["mine"]], ids=["not begun", "failed"])
 def test_a_look_waits_for_every_scene(tmp_path, missing):
     """The scenes that have finished are not judged by themselves, as if there were no looks."""
@@ -255,13 +246,6 @@ def test_a_look_waits_for_every_scene(tmp_path, missing):
     assert found.sentences[0].startswith(words)
     assert "(a look waits for all of its trials)" in texts(found.unused)[0]
     assert found.answers[0].verdicts[0].question.seeds == (0, 1, 2)
-
-
-def test_a_look_whose_first_seed_failed_says_that_it_waits(tmp_path):
-    first, second = grid("adc"), grid("mine")
-    write(tmp_path, [*first, *second[1:]])
-    declare_looks(tmp_path, (first, second))
-    assert "no verdict yet, not all of the first 2 seeds" in answer(tmp_path).sentences[0]
 
 
 def test_another_metric_declared_for_a_later_arm_keeps_the_verdict_on_an_earlier_one(tmp_path):
@@ -435,32 +419,18 @@ def test_a_metric_without_a_direction_is_named(tmp_path):
     assert "the declared metric fancy has no direction (unknown" in answer(tmp_path).sentences[0]
 
 
-def test_settings_of_the_baseline_stay_compared_when_an_arm_is_added(tmp_path):
-    write(tmp_path, [*grid("adc", cap=2), *grid("adc", day=3, cap=1)])
-    before = answer(tmp_path).sentences
-    write(tmp_path, [*grid("absgs", day=4), *grid("mine", day=4, cap=1)])
-    after = answer(tmp_path)
-    assert before[0].startswith("sfm-adc[cap=1] against sfm-adc[cap=2]")  # the older one
-    assert set(before) < set(after.sentences)
-
-
-def test_initialisers_stay_compared_when_an_arm_is_added(tmp_path):
-    other = [replace(one, init="random", day=3) for one in grid("adc")]
-    write(tmp_path, [*grid("adc"), *other])
-    (before,) = answer(tmp_path).sentences
-    assert before.startswith("random-adc against sfm-adc")
-    write(tmp_path, grid("mine", day=4))
-    assert before in answer(tmp_path).sentences
-    write(tmp_path, [replace(one, init="random", day=5) for one in grid("mine")])
-    assert before in answer(tmp_path).sentences
-
-
 @pytest.mark.parametrize(
     "arms, pairs",
     [
         # the settings that both have decide
         ([*ADC_CAPS, grid("mine", cap=2, lr=3)], [("sfm-mine", "sfm-adc[cap=2]"), BOTH_CAPS]),
         ([ADC_CAPS[0], grid("mine", cap=2)], [("sfm-mine", "sfm-adc")]),
+        # the older one is the baseline, and of initialisers the paper's
+        ([grid("adc", cap=2), grid("adc", day=3, cap=1)], [BOTH_CAPS[::-1]]),
+        (
+            [grid("adc"), [replace(one, init="random", day=3) for one in grid("adc")]],
+            [("random-adc", "sfm-adc")],
+        ),
         (
             [*ADC_CAPS, grid("mine", cap=4)],
             [("sfm-mine", "sfm-adc[cap=1]"), ("sfm-mine", "sfm-adc[cap=2]"), BOTH_CAPS],
@@ -489,7 +459,7 @@ def test_an_arm_without_a_baseline_is_named_everywhere(tmp_path, capsys):
     assert said.count(reason) == 2
     write_archive(experiment, tmp_path / "exp.zip")
     write_site([tmp_path / "exp.zip"], tmp_path / "site", "title", tmp_path / "scratch")
-    site = (tmp_path / "site" / "index.html").read_text()
+    site = (tmp_path / "site/index.html").read_text()
     notes = "\n".join(table_of(tmp_path).notes)
     for text in (page_of(tmp_path), site, description(experiment), notes):
         assert reason in text
@@ -571,12 +541,12 @@ def test_forgotten_trials_of_earlier_code_still_count_as_seen(tmp_path):
     old, new = grid("mine", code=OLD), grid("mine", day=6, code=NEW)
     failed = Made("mine", (), seed=0, code="3" * 64)
     write(tmp_path, [*adc, *momentum, *old, *new, failed])
-    (tmp_path / "exp" / f"{failed.key}-seed0" / "results.json").unlink()
+    (tmp_path / f"exp/{failed.key}-seed0/results.json").unlink()
     declare(tmp_path, (1, [*adc, *momentum, *old, failed]), (5, new))
     before = answer(tmp_path)
     assert "2 versions of the arm's code" in before.sentences[0]
     assert forget(tmp_path) == 3
-    remove(tmp_path / "exp", [tmp_path / "exp" / f"{failed.key}-seed0"])
+    remove(tmp_path / "exp", [tmp_path / f"exp/{failed.key}-seed0"])
     after = answer(tmp_path)
     assert after.experiment.warnings == ()
     assert after.sentences == before.sentences
@@ -627,10 +597,8 @@ def test_a_capture_under_two_names_is_one_scene(tmp_path, looks):
     if looks:
         declare_looks(tmp_path, (first, second), scenes="ab")
     before = answer(tmp_path).answers[0].verdicts[0]
-    for file in (tmp_path / "exp" / "b").glob("*/*/results.json"):
-        data = json.loads(file.read_text())
-        data["hashes"]["data"] = "data-a"
-        file.write_text(json.dumps(data))
+    for file in (tmp_path / "exp/b").glob("*/*/results.json"):
+        change_json(file, hashes=read_json(file)["hashes"] | {"data": "data-a"})
     found = answer(tmp_path)
     verdict, note = found.answers[0].verdicts[0], "b has the photographs of a, so it is no further"
     assert note in "\n".join(texts(found.remarks)) + found.sentences[0]
@@ -650,12 +618,13 @@ def test_settings_without_an_effect_are_named(tmp_path, differs):
     arms = [grid("momentum", decay=decay) for decay in (0.9, 0.99)]
     write(tmp_path, [*grid("adc"), *arms[0]])
     for one in arms[0]:
-        here = tmp_path / "exp" / f"{one.key}-seed{one.seed}"
+        here = tmp_path / f"exp/{one.key}-seed{one.seed}"
         copied = here.with_name(f"{arms[1][0].hash}-seed{one.seed}")
         shutil.copytree(here, copied)
-        config = json.loads((copied / "config.yaml").read_text())
-        config["densify"]["decay"] = 0.99
-        (copied / "config.yaml").write_text(json.dumps(config))
+        change_json(
+            copied / "config.yaml",
+            densify=read_json(here / "config.yaml")["densify"] | {"decay": 0.99},
+        )
     if differs:
         gain(tmp_path, arms[1][:1])
     note = "scene and seed: sfm-momentum[decay=0.9] and sfm-momentum[decay=0.99]."
@@ -718,6 +687,8 @@ def test_each_version_of_the_code_on_the_same_seeds_has_a_smaller_error_rate(tmp
         "3 versions of the arm's code were measured on these seeds, so the error rate is 0.83 % "
         "(with other seeds under another name: 5 %)."
     )
+    # however often the code is edited, the chance of a false "better" stays half of two rates
+    assert sum(map(share_of_version, range(1, 999))) < 2
     # of seeds that only the newest code was trained on, nothing was seen
     for one in (*adc, *third):
         shutil.rmtree(one.results(tmp_path).parent)
@@ -840,25 +811,6 @@ def test_what_was_seen_and_removed_before_the_declaration_makes_it_late(tmp_path
     declare(tmp_path, (5, [*adc, *new]))
     (found,) = answer(tmp_path).answers
     assert found.standing.doubt == "only after 3 trials of the arm had been measured"
-
-
-def test_an_arm_without_an_effect_is_rarely_called_better_however_often_its_code_is_edited():
-    """Twelve versions are tested against one baseline on one scene with three seeds."""
-    rng = np.random.default_rng(8)
-    tries, versions = 4000, 12
-    baseline, arms = rng.normal(size=(tries, 1, 3)), rng.normal(size=(tries, versions, 3))
-    differences = arms - baseline
-    error = differences.std(axis=2, ddof=1) / np.sqrt(3)
-    t = differences.mean(axis=2) / error
-    found = {}
-    for name, rates in (
-        ("whole", np.full(versions, 0.05)),
-        ("shared", [0.05 * share_of_version(number) for number in range(1, versions + 1)]),
-    ):
-        thresholds = stats.t.isf(np.asarray(rates) / 2, 2)
-        found[name] = (t > thresholds).any(axis=1).mean()
-    assert found["whole"] > 0.1
-    assert found["shared"] < 0.05
 
 
 # ---- random experiments
@@ -999,11 +951,11 @@ def test_what_is_added_never_changes_another_verdict(what):
             before = answer(runs)
             added = set(ADDED[what](made)) - set(made.trials)
             write(runs, sorted(added, key=repr))
-            file = runs / "exp" / "declared.jsonl"
+            file = runs / "exp/declared.jsonl"
             if other_metric and file.exists():
                 later = on_day(31, {one.key: (one.seed,) for one in added}, "ssim")
                 file.write_text(file.read_text() + record_text([later]))
-            (runs / "exp" / "d" / "sfm-mine" / "deadbeef-seed0").mkdir(parents=True)  # it failed
+            (runs / "exp/d/sfm-mine/deadbeef-seed0").mkdir(parents=True)  # it failed
             after = answer(runs)
             assert before.pairs
             # the new seed makes a sweep of a setting that was one value for each scene: other arms
@@ -1079,7 +1031,7 @@ def test_a_metric_where_lower_is_better_gives_the_mirrored_verdict(made):
             data, moment = read_json(file), file.stat().st_mtime
             if "psnr" in data["metrics"]:
                 data["metrics"]["flip"] = 1 - scale * data["metrics"]["psnr"]
-            file.write_text(json.dumps(data))
+            write_file(file, data)
             os.utime(file, (moment, moment))
         for pair in answer(runs).answers:
             by_metric = {one.question.metric: one for one in pair.verdicts}

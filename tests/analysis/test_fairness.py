@@ -2,9 +2,7 @@
 
 import re
 import shutil
-import subprocess
 from pathlib import Path
-from shlex import split
 from types import SimpleNamespace
 
 import pytest
@@ -15,10 +13,9 @@ from gsbench.analysis.fairness import UNLIKE, _shown, fairness_table
 from gsbench.analysis.notes import Note
 from gsbench.analysis.table_formats import to_latex
 from gsbench.runs.experiments import Arm
-from gsbench.verbs.results import tables
 from tests.analysis.helpers import page_of, trials_of
 from tests.analysis.test_attribution import densifier
-from tests.helpers import change_json, refusal, write, write_lines
+from tests.helpers import change_json, write, write_lines
 from tests.trials import search_record, write_arms
 
 LEFT, RIGHT = Arm("sfm", "adc"), Arm("sfm", "longaxis")
@@ -144,9 +141,9 @@ def test_a_search_that_proposed_the_settings_is_named(tmp_path):
         for value, threshold in ((27.6, 0.1), (27.5, 0.06841))
     ]
     record = search_record(points)
-    write(tmp_path / "vth" / "tuning.json", record)
+    write(tmp_path / "vth/tuning.json", record)
     for name, content in (("other", '{"points": [3, {"settings": []}]}'), ("broken", "{")):
-        write(tmp_path / name / "tuning.json", content)
+        write(tmp_path / f"{name}/tuning.json", content)
 
     def tuning():
         return [note for note in sheet(tmp_path, "volumetric").notes if note.startswith("Tuning.")]
@@ -155,7 +152,7 @@ def test_a_search_that_proposed_the_settings_is_named(tmp_path):
     assert "the best of 2 points by psnr of validation views (courtyard; seed 100; the" in line
     assert "is densify.volume_threshold=0.1, " in line
     assert line.endswith("Tried: 0.1 (27.6), 0.06841 (27.5). These trials have other values.")
-    write(tmp_path / "vth" / "tuning.json", record | {"points": points[1:]})
+    write(tmp_path / "vth/tuning.json", record | {"points": points[1:]})
     unequal, line = tuning()
     assert unequal == (
         "Tuning. They were not tuned alike: sfm-adc none and sfm-volumetric 1 point of 1 seed on "
@@ -163,7 +160,7 @@ def test_a_search_that_proposed_the_settings_is_named(tmp_path):
     )
     assert "These trials have other values" not in line
     nothing = [point | {"value": None} for point in points]
-    write(tmp_path / "vth" / "tuning.json", record | {"points": nothing})
+    write(tmp_path / "vth/tuning.json", record | {"points": nothing})
     assert tuning() == ["Tuning. sfm-volumetric: the search vth found nothing."]
 
 
@@ -202,20 +199,6 @@ def test_the_report_shows_the_sheet_before_the_numbers_of_the_verdict(tmp_path, 
     assert page.count("<caption>Fairness sheet") == 1
 
 
-def test_the_verb_writes_a_sheet_for_each_pair_in_every_format(tmp_path, paths, capsys):
-    assert tables(split("exp --layout fairness"), tmp_path) == 0
-    assert "### Fairness sheet: sfm-longaxis against sfm-adc" in capsys.readouterr().out
-    for format_name, suffix in (("latex", "tex"), ("csv", "csv"), ("html", "html")):
-        out = tmp_path / "out"
-        words = [*split("exp --layout fairness --format"), format_name, "--out", str(out)]
-        assert tables(words, tmp_path) == 0
-        assert (out / f"exp-fairness-sfm-longaxis-sfm-adc.{suffix}").stat().st_size > 500
-    one = tmp_path / "one"
-    write_arms(one, {"adc": densifier("adc")})
-    with refusal("one arm"):
-        tables(split("exp --layout fairness"), one)
-
-
 def test_the_latex_has_columns_that_wrap(tmp_path, paths):
     text = to_latex(sheet(tmp_path))
     assert text.startswith("% needs \\usepackage{booktabs,array}\n")
@@ -224,14 +207,3 @@ def test_the_latex_has_columns_that_wrap(tmp_path, paths):
     body = text.split("\\midrule")[1].split("\\bottomrule")[0]
     assert all(line.count(" & ") == 3 for line in body.strip().splitlines())
     assert text.count("{") - text.count("\\{") == text.count("}") - text.count("\\}")
-
-
-@pytest.mark.skipif(
-    shutil.which("pdflatex") is None, reason="pdflatex with booktabs is not installed"
-)
-def test_the_latex_compiles(tmp_path, paths):
-    document = f"\\documentclass{{article}}\\usepackage{{booktabs,array}}\\begin{{document}}{to_latex(sheet(tmp_path))}"
-    (tmp_path / "a.tex").write_text(document + "\\end{document}")
-    subprocess.run(
-        split("pdflatex -halt-on-error a.tex"), cwd=tmp_path, check=True, capture_output=True
-    )

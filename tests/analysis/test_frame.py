@@ -1,17 +1,15 @@
 """The data frame of an experiment: one row per trial, with the values of the result files."""
 
 import io
-import statistics
 from shlex import split
 
 import pandas as pd
-import pytest
 from numpy.testing import assert_array_equal
 
 from gsbench.analysis import to_frame
 from gsbench.verbs.results import tables
 from tests.analysis.helpers import loaded
-from tests.helpers import read_json, refusal
+from tests.helpers import read_json
 from tests.trials import write_trial
 
 
@@ -22,16 +20,7 @@ def test_each_row_has_the_values_of_one_trials_file(make_experiment):
     for (_, row), trial in zip(frame.iterrows(), experiment.trials, strict=True):
         data = read_json(trial.path / "results.json")
         assert row["folder"] == str(trial.path)
-        for key in (
-            "experiment",
-            "scene",
-            "init",
-            "densify",
-            "seed",
-            "raster",
-            "protocol",
-            "num_gaussians",
-        ):
+        for key in split("experiment scene init densify seed raster protocol num_gaussians"):
             assert row[key] == data[key]
         assert {key: row[key] for key in data["metrics"]} == data["metrics"]
         assert (row["width"], row["height"]) == (400, 300)
@@ -39,18 +28,6 @@ def test_each_row_has_the_values_of_one_trials_file(make_experiment):
         assert row["event_split_volume"] == data["events"]["split_volume"]
         assert row["hash_init"] == data["hashes"]["init"]
     assert frame["num_gaussians"].dtype == frame["seed"].dtype == pd.Int64Dtype()
-
-
-def test_groups_of_the_frame_average_to_the_cells_of_the_table(make_experiment):
-    experiment = make_experiment()
-    means = to_frame(experiment).groupby(["scene", "densify"])["psnr"].agg(["mean", "std"])
-    values = [
-        t.metrics["psnr"] for t in experiment.trials if (t.scene, t.densify) == ("garden", "adc")
-    ]
-    assert means.loc[("garden", "adc"), "mean"] == pytest.approx(
-        statistics.fmean(values), abs=1e-12
-    )
-    assert means.loc[("garden", "adc"), "std"] == pytest.approx(statistics.stdev(values), abs=1e-12)
 
 
 def test_a_missing_value_is_na_and_a_swept_setting_has_a_column(tmp_path):
@@ -71,12 +48,3 @@ def test_the_csv_of_trials_reads_back_as_the_frame(make_experiment, tmp_path, ca
     assert again.columns.tolist() == frame.columns.tolist()
     for name in ("psnr", "flip", "seconds_train"):
         assert_array_equal(again[name], frame[name])
-    assert (
-        tables(
-            [*split("exp --format trials --where seed=1 --out"), str(tmp_path / "out")], tmp_path
-        )
-        == 0
-    )
-    assert len(pd.read_csv(tmp_path / "out" / "exp-trials.csv")) == 4
-    with refusal("takes no --metrics"):
-        tables(split("exp --format trials --metrics psnr"), tmp_path)

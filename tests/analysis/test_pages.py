@@ -55,8 +55,8 @@ def pages(folder, monkeypatch):
     (table, *_) = sorted((folder / "tables").glob("*.html"))
     return {
         "report.html.j2": build_report(trials),
-        "site.html.j2": (folder / "site" / "index.html").read_text(),
-        "vote.html.j2": (folder / "vote" / "index.html").read_text(),
+        "site.html.j2": (folder / "site/index.html").read_text(),
+        "vote.html.j2": (folder / "vote/index.html").read_text(),
         "table_page.html.j2": table.read_text(),
         "page.html.j2": to_html(page_of(made(folder / "claims", tuple("abcdef")))),
     }

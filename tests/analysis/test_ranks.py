@@ -104,7 +104,7 @@ def test_equal_arms_do_not_differ(make_experiment):
 def test_report_and_site_have_the_plot_of_ranks(seven, tmp_path):
     write_archive(seven, tmp_path / "exp.zip")
     assert run(["site", str(tmp_path / "exp.zip"), "--out", str(tmp_path / "site")]) == 0
-    for page in (build_report(seven), (tmp_path / "site" / "index.html").read_text()):
+    for page in (build_report(seven), (tmp_path / "site/index.html").read_text()):
         assert page.count("ranks over 7 scenes</figcaption>") == 4  # PSNR, SSIM, LPIPS, FLIP
     ranking = rank_arms(seven.trials, quantity("psnr", seven.trials))
     svg = rank_plot(ranking)

@@ -3,7 +3,6 @@
 import base64
 import html
 import io
-import itertools
 import math
 import re
 import xml.etree.ElementTree as ElementTree
@@ -33,11 +32,10 @@ from gsbench.analysis.statistics import Interval
 from gsbench.analysis.verdict_words import by_scene_lines, sentence
 from gsbench.analysis.verdicts import judge_pairs
 from gsbench.runs.rows import Histogram
-from gsbench.verbs.results import report
 from tests.analysis.helpers import ADC, VOLUMETRIC, loaded, page_of, rows_of, trials_of
 from tests.helpers import refusal, write
 from tests.markup import Page
-from tests.trials import search_record, write_arms, write_runs, write_trial
+from tests.trials import search_record, write_arms, write_runs
 
 ONE_TRIAL = {"scenes": ("a",), "seeds": (0,), "pictures": True}
 
@@ -66,7 +64,7 @@ def test_a_picture_that_arms_share_is_shown_once(tmp_path):
         (path / "figures").mkdir()
         for name, level in [("initial_cloud", 90), ("ellipsoids", shade)]:
             picture = Image.fromarray(np.full((4, 4, 3), level, np.uint8))
-            picture.save(path / "figures" / f"{name}.png")
+            picture.save(path / f"figures/{name}.png")
     captions = [caption for caption, _ in trial_figures(trials_of(tmp_path))]
     assert captions == [
         "ellipsoids: garden, sfm-adc, seed 0",
@@ -184,7 +182,7 @@ def test_ignored_pixels_are_shown_as_stripes_of_four_pixels(tmp_path):
         (path / "masks").mkdir()
         mask = np.full((120, 160), 255, np.uint8)
         mask[:20, :20] = 0
-        Image.fromarray(mask).save(path / "masks" / "view000.png")
+        Image.fromarray(mask).save(path / "masks/view000.png")
     one, other = trials_of(tmp_path)
     shown = read_compared(one, other, "view000")
     for image in shown:
@@ -193,13 +191,13 @@ def test_ignored_pixels_are_shown_as_stripes_of_four_pixels(tmp_path):
         assert (image[:20, :20] == shown[0][:20, :20]).all()
     for image, name in zip(shown, ("renders", "renders", "ground_truth"), strict=True):
         own = other if image is shown[1] else one
-        stored = np.asarray(Image.open(own.path / name / "view000.png"))
+        stored = np.asarray(Image.open(own.path / f"{name}/view000.png"))
         assert (image[20:] == stored[20:]).all()
 
 
 def test_missing_or_damaged_pictures_are_named(tmp_path):
     paths = write_runs(tmp_path, views=2, pictures=True)
-    (paths[0] / "renders" / "view001.png").write_bytes(b"\x89PNG\r\n\x1a\nhalf")
+    (paths[0] / "renders/view001.png").write_bytes(b"\x89PNG\r\n\x1a\nhalf")
     (paths[1] / "point_cloud.ply").write_bytes(b"ply\nformat ascii 1.0\n")
     text = page_of(tmp_path)
     assert "view001.png: not a readable image" in text
@@ -466,14 +464,6 @@ def test_a_chart_with_nothing_to_draw_is_an_empty_string():
     assert "a from 0.25 at 0.5 to 0.25 at 0.5." in dropped
 
 
-def test_the_report_verb_writes_the_file(runs, tmp_path, capsys):
-    file = tmp_path / "sub" / "r.html"
-    assert report(["exp", "--out", str(file)], runs) == 0
-    assert file.read_text().startswith("<!doctype html>")
-    assert str(file) in capsys.readouterr().out
-    assert [*file.parent.iterdir()] == [file]
-
-
 def test_one_trial_of_each_arm_gives_no_verdict(tmp_path):
     write_runs(tmp_path, seeds=(0,), scenes=("garden",), effect={"psnr": 9.0})
     page = page_of(tmp_path)
@@ -518,14 +508,6 @@ def test_a_single_arm_and_bare_results_still_make_a_report(tmp_path):
     text = page_of(tmp_path)
     assert "Only one arm was run" in text
     assert "No trained model was found" in text
-
-
-def test_swept_settings_become_arms_of_their_own(tmp_path):
-    for cap, densify, seed in itertools.product((10_000, 20_000), ("adc", "volumetric"), (0, 1)):
-        settings = {"densify.max_gaussians": cap}
-        write_trial(tmp_path, seed, f"{cap:08}", settings, densify=densify, psnr=20.0 + seed)
-    page = page_of(tmp_path)
-    assert "sfm-volumetric[max_gaussians=10000] against sfm-adc[max_gaussians=10000]" in page
 
 
 def test_arms_that_never_differ_are_called_equal_and_not_undecided(tmp_path):
@@ -576,7 +558,7 @@ def test_points_of_a_search_are_not_compared(tmp_path):
     write_runs(tmp_path)
     assert "Verdicts, " in page_of(tmp_path)
     points = [{"value": 27.5, "settings": {"densify.volume_threshold": 0.6841}}]
-    write(tmp_path / "exp" / "tuning.json", search_record(points))
+    write(tmp_path / "exp/tuning.json", search_record(points))
     page = page_of(tmp_path)
     assert "Verdicts, " not in page
     assert "so there is no verdict" in page

@@ -33,9 +33,9 @@ def test_trials_are_in_the_order_of_seeds_then_of_configurations(tmp_path):
 
 def test_hydra_and_report_files_beside_the_trials_are_ignored(tmp_path):
     write_runs(tmp_path)
-    (tmp_path / "exp" / ".hydra").mkdir()
-    (tmp_path / "exp" / "report.html").write_text("")
-    (tmp_path / "exp" / "multirun.yaml").write_text("")
+    (tmp_path / "exp/.hydra").mkdir()
+    (tmp_path / "exp/report.html").write_text("")
+    (tmp_path / "exp/multirun.yaml").write_text("")
     assert loaded(tmp_path).warnings == ()
 
 

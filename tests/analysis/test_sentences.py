@@ -13,7 +13,15 @@ FIELD = re.compile(r"\{(\w+)(?::([^{}]*))?\}")
 # words of the source that a reader does not know, and abbreviations of its authors
 PRIVATE = ("room", "rooms", "ingredient", "verdicts.py", "None", "record", "kwargs", "cfg", "impl")
 COUNTED = (
-    *("trials", "pairs", "seeds", "scenes", "rounds", "points", "photographs", "choices", "views"),
+    "trials",
+    "pairs",
+    "seeds",
+    "scenes",
+    "rounds",
+    "points",
+    "photographs",
+    "choices",
+    "views",
 )
 NUMBERS = ("missing", "near", "tested", "trials", "more", "limit", "largest")  # facts
 PLURAL = "(are|were|have|count|differ|do)"

@@ -27,7 +27,10 @@ from gsbench.analysis.statistics import (
     t_test,
 )
 from tests.analysis.untruths import KINDS, rates
+from tests.conftest import script
 from tests.helpers import refusal
+
+shared_baseline = script("shared_baseline")  # all draws at once; test_comparison.py compares them
 
 
 def test_the_test_of_one_scene_is_the_paired_t_test():
@@ -49,16 +52,6 @@ def test_scenes_have_equal_weights_and_their_own_variances():
     assert found.region.even == pytest.approx(np.log2(3 / 2))
     one_noisy = t_test(np.array([[1.0, 2.0, 3.0], [1.0, 1.0, 1.0]]))
     assert one_noisy.p == pytest.approx(2 * scipy.stats.t.sf(1.5 / (1 / 12) ** 0.5, 2))
-
-
-def test_the_error_is_that_of_welch():
-    rng = np.random.default_rng(0)
-    one, other = rng.normal(0, 1, 5), rng.normal(0, 4, 5)
-    found, welch = (
-        t_test(np.stack([one, other])),
-        scipy.stats.ttest_ind(one, -other, equal_var=False),
-    )
-    assert found.mean / found.error == pytest.approx(welch.statistic)
 
 
 def test_two_pairs_suffice_and_single_ones_have_the_spread_of_scenes_for_that_of_trainings():
@@ -193,11 +186,10 @@ def test_all_looks_together_err_in_at_most_5_percent_also_with_a_noisy_scene(sce
     assert all(0 < level <= share for level, share in zip(levels, shares, strict=True))
     deviations = np.where(np.arange(scenes) == 0, noise, 1.0)
     sweeps = np.random.default_rng(1).normal(0, 1, (4000, scenes, looks[-1])) * deviations[:, None]
-    false = [
-        any(t_test(sweep[:, :seeds]).p < level for seeds, level in zip(looks, levels, strict=True))
-        for sweep in sweeps
-    ]
-    assert np.mean(false) < 0.05 + 3 * (0.05 * 0.95 / len(sweeps)) ** 0.5
+    p_values = np.stack([shared_baseline.p_values(sweeps[..., :seeds]) for seeds in looks])
+    assert (p_values < np.array(levels)[:, None]).any(axis=0).mean() < 0.05 + 3 * (
+        0.05 * 0.95 / len(sweeps)
+    ) ** 0.5
 
 
 def test_levels_of_looks_and_numbers_of_seeds_at_looks():
@@ -220,27 +212,15 @@ LIMIT = 0.05 + 3 * (0.05 * 0.95 / CHECKS) ** 0.5  # three standard errors above 
 
 @pytest.mark.parametrize(
     "kind",
-    [
-        "normal",
-        pytest.param("one scene in eight stands out", marks=pytest.mark.slow),
-        pytest.param("a training in ten fails, either arm", marks=pytest.mark.slow),
-    ],
+    ["normal", "one scene in eight stands out", "a training in ten fails, either arm"],
 )
 def test_no_outcome_is_false_in_more_than_5_percent(kind):
+    """By the fast simulator, which test_decision_rules.py compares with the judge."""
     for effect in (0.0, 0.5, 1.0, 2.0):
-        found = rates(KINDS[kind], effect, CHECKS)
+        found = rates(KINDS[kind], effect, CHECKS, fast=True)
         assert max(found.untrue.values()) < LIMIT, (effect, found)
         assert found.like_these < LIMIT, (effect, found)
-
-
-def test_a_noisy_scene_with_few_seeds_causes_no_false_verdicts():
-    found = rates(KINDS["2, 10 and 10 pairs, the small scene noisy"], 0.0, CHECKS)
-    assert max(found.untrue.values()) < LIMIT
-
-
-def test_an_effect_that_matters_is_found():
-    found = rates(KINDS["normal"], 2.0, CHECKS)
-    assert found.outcomes["supported"] > 0.8
+    assert kind != "normal" or found.outcomes["supported"] > 0.8
 
 
 def test_seeds_needed_give_the_promised_power():
@@ -248,7 +228,8 @@ def test_seeds_needed_give_the_promised_power():
     rng = np.random.default_rng(0)
 
     def power(count):
-        return np.mean([t_test(one).p < ALPHA for one in rng.normal(0.1, 0.1, (2000, 2, count))])
+        found = shared_baseline.p_values(rng.normal(0.1, 0.1, (2000, 2, count)))
+        return (found < ALPHA).mean()
 
     assert 0.76 < power(seeds) < 0.93
     assert power(seeds - 1) < 0.82
@@ -299,7 +280,7 @@ def test_power_is_the_share_of_simulated_sweeps_that_see_the_difference(like_ask
         agree = (values.mean(axis=2) > 0).sum(axis=1)
         seen = [scipy.stats.binomtest(int(count), design.scenes).pvalue <= 0.05 for count in agree]
     else:
-        seen = [t_test(one).p < 0.05 for one in values]
+        seen = shared_baseline.p_values(values) < 0.05
     assert power(design, effect, KNOWN, like_asked) == pytest.approx(np.mean(seen), abs=0.03)
 
 

@@ -49,13 +49,6 @@ def texts(table):
     ]
 
 
-def test_a_cell_is_mean_and_sample_deviation_over_trials(tmp_path):
-    for seed, psnr in enumerate((27.0, 27.1, 27.5)):
-        write_trial(tmp_path, seed, psnr=psnr)
-    # mean 27.2, deviation sqrt((0.04 + 0.01 + 0.09) / 2) = 0.2646
-    assert texts(table_of(tmp_path, "psnr")) == [["garden", "sfm", "adc", "27.20 ± 0.26"]]
-
-
 def test_the_best_is_bold_and_ties_after_rounding_are_both_best(tmp_path):
     write_trial(tmp_path, psnr=27.001, flip=0.1)
     write_trial(tmp_path, densify="none", psnr=26.0, flip=0.3)

@@ -25,12 +25,12 @@ def test_textured_error_is_the_mean_error_in_the_most_textured_fifth(tmp_path):
     render = truth - column // 10
     for folder, pixels in (("ground_truth", truth), ("renders", render)):
         picture = np.repeat(pixels[..., None], 3, axis=2).astype(np.uint8)
-        Image.fromarray(picture).save(trial.path / folder / "view000.png")
+        Image.fromarray(picture).save(trial.path / f"{folder}/view000.png")
     assert textured_error(trial) == pytest.approx(8.5, abs=0.2)  # of the last twenty columns
     counts = np.full((20, 100), 255, np.uint8)
     counts[:, 50:] = 0
     (trial.path / MASKS).mkdir()
-    Image.fromarray(counts).save(trial.path / MASKS / "view000.png")
+    Image.fromarray(counts).save(trial.path / f"{MASKS}/view000.png")
     # the last ten columns of the left half
     assert textured_error(trial) == pytest.approx(4.0, abs=0.2)
     for picture in (trial.path / "renders").iterdir():

@@ -102,9 +102,9 @@ def test_one_is_a_person():
 def test_a_linked_round_of_votes_is_left_out(tmp_path, caplog):
     """A runs folder may be a stranger's, and the link may lead anywhere."""
     (tmp_path / "elsewhere").mkdir()
-    (tmp_path / "runs" / "x" / "votes").mkdir(parents=True)
-    (tmp_path / "runs" / "x" / "votes" / "round").symlink_to(tmp_path / "elsewhere")
-    assert load_rounds(tmp_path / "runs" / "x") == []
+    (tmp_path / "runs/x/votes").mkdir(parents=True)
+    (tmp_path / "runs/x/votes/round").symlink_to(tmp_path / "elsewhere")
+    assert load_rounds(tmp_path / "runs/x") == []
     (line,) = caplog.messages
     assert "link" in line
 

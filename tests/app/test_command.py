@@ -19,8 +19,10 @@ from tests.app.stand_ins import trial
 from tests.helpers import refusal
 
 OWN_FILES = {
-    **{"run": {"dir": "."}, "sweep": {"dir": ".", "subdir": "."}},
-    **{"output_subdir": None, "job_logging": {}},
+    "run": {"dir": "."},
+    "sweep": {"dir": ".", "subdir": "."},
+    "output_subdir": None,
+    "job_logging": {},
 }
 
 

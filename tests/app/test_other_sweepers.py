@@ -1,6 +1,7 @@
 """Other sweepers than gsbench's own, with stand-ins for compositions."""
 
 import logging
+from shlex import split
 from types import SimpleNamespace
 
 import pytest
@@ -41,7 +42,7 @@ def sweep_of(words, name="optuna", **sweeper):
 )
 def test_another_sweeper_gets_all_seeds_of_a_job(caplog, sweeper, sign):
     caplog.set_level(logging.INFO, "gsbench")
-    words = ["name=x", "densify=adc,mcmc", "densify.start=1,2", "seed=3,5", "hydra.x=1"]
+    words = split("name=x densify=adc,mcmc densify.start=1,2 seed=3,5 hydra.x=1")
     sweep = sweep_of(words, **sweeper, params={"seed": "1,2", "init": "sfm,dim"})
     assert prepare_other_sweeper(sweep) == (
         [*words[:3], "hydra.x=1", "~hydra.sweeper.params.seed"],
@@ -97,7 +98,7 @@ def test_hydras_grid_sweeper_asks_for_no_value_and_choices_are_limited(monkeypat
 
 
 def test_a_dry_run_of_another_sweeper_lists_a_grid_or_says_that_it_searches(capsys):
-    words = ["hydra/sweeper=x", "hydra.sweeper.n=3", "seed=1,2", "densify=adc"]
+    words = split("hydra/sweeper=x hydra.sweeper.n=3 seed=1,2 densify=adc")
     assert words_without_sweeper(sweep_of(words, "basic")) == (
         ["seed=1,2", "densify=adc", "hydra/sweeper=gsbench"],
         True,

@@ -38,8 +38,10 @@ def test_a_trial_is_judged_by_its_declared_metric(primary, found):
 
 def test_the_value_of_a_job_is_the_mean_of_its_seeds_towards_the_wanted_end(tmp_path, monkeypatch):
     for primary, sign, value in (
-        *((None, 1, 21.0), (None, -1, -21.0)),
-        *(("lpips_vgg", 1, -0.3), ("lpips_vgg", -1, 0.3)),
+        (None, 1, 21.0),
+        (None, -1, -21.0),
+        ("lpips_vgg", 1, -0.3),
+        ("lpips_vgg", -1, 0.3),
     ):
         trials = [trial(tmp_path, seed, eval={"primary": primary, "extra": {}}) for seed in (0, 1)]
         for one, psnr, lpips in zip(trials, (20.0, 22.0), (0.2, 0.4), strict=True):
@@ -230,10 +232,10 @@ def test_another_sweeper_gets_a_value_for_each_job(tmp_path):
 
     jobs = [["a=1"], ["a=2"], ["a=3"]]
     task = TrialTask(run, objective=Objective(1, ("seed=1", "seed=2")), sweep=own)
-    config = OmegaConf.create({"hydra": {"sweep": {"dir": str(tmp_path / "new" / "dir")}}})
+    config = OmegaConf.create({"hydra": {"sweep": {"dir": str(tmp_path / "new/dir")}}})
     first, second, third = task.run_jobs(jobs, config)
     assert composed == [[*job, seed] for job in jobs for seed in ("seed=1", "seed=2")]
-    assert (tmp_path / "new" / "dir").is_dir()
+    assert (tmp_path / "new/dir").is_dir()
     assert [one.overrides for one in (first, second, third)] == jobs
     assert (first.status, first.return_value) == (JobStatus.COMPLETED, 21.5)
     assert second.return_value == 31.5

@@ -259,12 +259,12 @@ def test_a_damaged_trial_is_left_out_by_name_and_the_rest_is_exported(
     first, second, *_ = write_runs(runs)
     (first / "per_view.csv").write_text("view,psnr\nview000,1.0\n")
     (second / "results.json").write_text("{")
-    assert said("export --results exp --out", tmp_path / "out" / "a.zip").startswith(
+    assert said("export --results exp --out", tmp_path / "out/a.zip").startswith(
         f"{tmp_path / 'out' / 'a.zip'}: results of exp, "
     )
     assert "does not average" in caplog.text
     assert "not JSON" in caplog.text
-    assert len(unpack_archive(tmp_path / "out" / "a.zip", tmp_path / "b").trials) == 10
+    assert len(unpack_archive(tmp_path / "out/a.zip", tmp_path / "b").trials) == 10
     for path in runs.glob("exp/*/*/*/per_view.csv"):
         path.write_text("")
     assert "no whole trial to export" in refused("export --results exp --out", tmp_path / "b.zip")

@@ -11,7 +11,7 @@ from gsbench.claims.file import Claim, parse_claims, read_claims
 from tests.conftest import ROOT
 from tests.helpers import refusal
 
-SHIPPED = sorted((ROOT / "conf" / "claims").glob("*.yaml"))
+SHIPPED = sorted((ROOT / "conf/claims").glob("*.yaml"))
 CLAIM = {
     "id": "lpips",
     "says": "it is better",
@@ -172,7 +172,7 @@ def test_a_users_own_metric_needs_its_class():
 
 
 def test_the_file_that_the_document_shows_is_sound():
-    page = (ROOT / "docs" / "claims.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs/claims.md").read_text(encoding="utf-8")
     (block,) = re.findall(r"^```yaml\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
     file = parse_claims(yaml.safe_load(block))
     for entry in dataclasses.fields(Claim):

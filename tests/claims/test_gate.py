@@ -1,6 +1,7 @@
 """The gate on made-up trials: results of the new version, and refused questions."""
 
 from dataclasses import replace
+from shlex import split
 
 import numpy as np
 import pytest
@@ -174,33 +175,33 @@ def test_questions_that_cannot_be_judged_are_refused():
 @pytest.mark.parametrize(
     "words, message",
     [
-        ([], "the following arguments are required: archive"),
-        (["nowhere.zip"], "no such file"),
-        (["exp.zip", "seed=0,1"], "seed follows from the other words"),
-        (["exp.zip", "densify=adc,volumetric"], "only scene may list values"),
-        (["exp.zip", "scene=photos", "scene.path=/"], "the archive has no trial on"),
-        (["exp.zip", "--seeds", "9"], "has 3 seeds of all scenes"),
-        (["exp.zip", "--seeds", "1"], "needs at least 2 seeds, and there is 1"),
-        (["exp.zip", "--metric", "psn"], "psn"),
-        (["exp.zip", "densify=none"], "several arms on courtyard"),
-        (["exp.zip", "--where", "densify=x"], "no trial has densify=x"),
-        (["exp.zip", "launch.wait=false"], "launch.wait"),
+        ("", "the following arguments are required: archive"),
+        ("nowhere.zip", "no such file"),
+        ("exp.zip seed=0,1", "seed follows from the other words"),
+        ("exp.zip densify=adc,volumetric", "only scene may list values"),
+        ("exp.zip scene=photos scene.path=/", "the archive has no trial on"),
+        ("exp.zip --seeds 9", "has 3 seeds of all scenes"),
+        ("exp.zip --seeds 1", "needs at least 2 seeds, and there is 1"),
+        ("exp.zip --metric psn", "psn"),
+        ("exp.zip densify=none", "several arms on courtyard"),
+        ("exp.zip --where densify=x", "no trial has densify=x"),
+        ("exp.zip launch.wait=false", "launch.wait"),
     ],
 )
-def test_bad_input_of_gate_is_refused(tmp_path, monkeypatch, capsys, words, message):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("GSBENCH_RUNS", raising=False)
+def test_bad_input_of_gate_is_refused(runs, tmp_path, refused, words, message):
     write_runs(tmp_path / "made", densifiers=("adc", "volumetric"))
     write_archive(loaded(tmp_path / "made"), tmp_path / "exp.zip")
-    given = any(word.startswith(("scene=", "densify=")) for word in words)
-    assert run(["gate", *words, *([] if given or not words else ["densify=adc", "init=sfm"])]) == 2
-    assert message in capsys.readouterr().err
+    given = not words or " scene=" in words or " densify=" in words
+    words = words if given else f"{words} densify=adc init=sfm"
+    assert message in refused("gate", *split(words))
 
 
 @pytest.mark.parametrize(
     "effect, code, words", [(-1.0, 1, "worse in PSNR"), (1.0, 0, "passed: better in PSNR")]
 )
-def test_the_exit_code_of_gate_is_its_result(tmp_path, monkeypatch, capsys, effect, code, words):
+def test_the_exit_code_of_gate_is_its_result(
+    runs, tmp_path, monkeypatch, capsys, effect, code, words
+):
     trained = []
 
     def train(planned):
@@ -209,18 +210,13 @@ def test_the_exit_code_of_gate_is_its_result(tmp_path, monkeypatch, capsys, effe
             write_as(trial, psnr=26 + effect + 0.001 * trained[-1])
         return 0
 
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("GSBENCH_RUNS", raising=False)
     monkeypatch.setattr("gsbench.verbs.versions.run_trials", train)
     # As without weights: trials lack a metric, and whether it can be computed now is asked for.
     lacking = lambda files, values, unavailable_now=None: "" if unavailable_now else "it lacks flip"  # noqa: E731
     monkeypatch.setattr("gsbench.runs.trial_folder.TrialFolder.why_not_done", lacking)
     old = trials(tmp_path / "old", 0, 0.01, scenes=("courtyard",))
     write_archive(load_experiment(tmp_path / "old", "gate"), tmp_path / "exp.zip")
-    assert (
-        run(["gate", "exp.zip", "scene=courtyard", "init=sfm", "densify=adc", "--seeds", "3"])
-        == code
-    )
+    assert run(split("gate exp.zip scene=courtyard init=sfm densify=adc --seeds 3")) == code
     assert words in capsys.readouterr().out
     assert trained == [0, 1]  # the first look decides
     assert len(old) == 4

@@ -102,8 +102,15 @@ def by_gate(scenes, seeds, trials):
 def by_ledger(scenes, seeds, trials):
     baseline, idea = ({scene: keys(scene)[side] for scene in scenes} for side in (0, 1))
     opened = Opened(
-        **{"time": EARLY, "metric": "psnr", "sign": 1, "least": LEAST, "ideas": 4, "rate": 0.1},
-        **{"words": (), "keys": baseline, "seeds": tuple(range(seeds))},
+        time=EARLY,
+        metric="psnr",
+        sign=1,
+        least=LEAST,
+        ideas=4,
+        rate=0.1,
+        words=(),
+        keys=baseline,
+        seeds=tuple(range(seeds)),
     )
     started = Started(time=EARLY, idea="mine", against="baseline", identity="", words=(), keys=idea)
     # one side of 2.5 % is an interval of 95 %

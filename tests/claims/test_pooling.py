@@ -169,16 +169,10 @@ def test_different_budgets_are_named(tmp_path, said):
 
 def test_an_archive_whose_arm_lacks_failed_trials_is_named(tmp_path):
     write_runs(tmp_path)
-    (tmp_path / "exp" / "garden" / "sfm-volumetric" / "c0ffee00-seed2" / "results.json").unlink()
+    (tmp_path / "exp/garden/sfm-volumetric/c0ffee00-seed2/results.json").unlink()
     write_archive(loaded(tmp_path), tmp_path / "a.zip")
     _, notes, _ = read_studies(tmp_path / "a.zip", WANTED, "a")
     assert any("caution, 1 trial of one arm alone failed, stopped" in line for line in notes)
-
-
-def test_three_archives_have_a_mean(tmp_path, said):
-    out = said(*POOL, *(archive(tmp_path, f"lab{k}", k) for k in range(3)))
-    for words in ("| lab0 | +", "of 3 studies", "a further one would lie between"):
-        assert words in out
 
 
 def test_two_protocols_have_no_mean_and_one_can_be_chosen(tmp_path, said):
@@ -207,6 +201,7 @@ def test_each_bad_source_has_one_line_and_the_others_are_pooled(tmp_path, capsys
     assert run(["pool", *sources, "--arm", "volumetric"]) == 1
     captured = capsys.readouterr()
     assert "of 2 studies" in captured.out
+    assert "a further one would lie between" in captured.out
     lines = captured.err.splitlines()
     for name, reason in (
         ("cut.zip", "not a complete zip"),
@@ -226,14 +221,14 @@ def test_archives_with_the_same_file_name_are_distinguished(tmp_path, said):
     for lab, seed in (("one", 0), ("two", 1)):
         (tmp_path / lab).mkdir()
         archive(tmp_path / lab, "results", seed)
-    sources = [tmp_path / lab / "results.zip" for lab in ("one", "two")]
+    sources = [tmp_path / f"{lab}/results.zip" for lab in ("one", "two")]
     assert f"| {sources[1]} |" in said(*POOL, *sources)
 
 
 def test_scenes_of_an_archive_under_other_conditions_are_noted(tmp_path):
     file = archive(tmp_path, "lab")
     runs = tmp_path / "runs_lab_0"
-    for path in (runs / "exp" / "garden").glob("*/*/results.json"):
+    for path in (runs / "exp/garden").glob("*/*/results.json"):
         change_json(path, iterations=7000)
     write_archive(loaded(runs), file)
     _, notes, _ = read_studies(file, WANTED, "lab")

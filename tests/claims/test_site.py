@@ -37,7 +37,7 @@ def archive(tmp_path, experiment="exp", claim="", **plan):
 
 def site(tmp_path, *archives):
     assert run(["site", *map(str, archives), "--out", str(tmp_path / "site")]) == 0
-    return (tmp_path / "site" / "index.html").read_text()
+    return (tmp_path / "site/index.html").read_text()
 
 
 def test_the_first_page_has_arms_scenes_claims_and_working_links(tmp_path):
@@ -55,7 +55,7 @@ def test_the_first_page_has_arms_scenes_claims_and_working_links(tmp_path):
         if target.startswith("#"):
             assert f'id="{target[1:]}"' in page
         elif target != "data:," and target:
-            assert (tmp_path / "site" / target).is_file()
+            assert (tmp_path / f"site/{target}").is_file()
     assert found.elements.count(("table", {"class": "sorts"})) > 8
     assert "http://" not in page
     assert "https://" not in page
@@ -90,7 +90,7 @@ def test_the_report_has_pictures_if_the_archive_has_them(tmp_path):
     file = archive(tmp_path, seeds=(0,), scenes=("courtyard",), pictures=True)
     site(tmp_path, file)
     # whole views
-    assert "data:image/jpeg" in (tmp_path / "site" / "reports" / "exp.html").read_text()
+    assert "data:image/jpeg" in (tmp_path / "site/reports/exp.html").read_text()
     without = tmp_path / "without.zip"
     write_archive(loaded(tmp_path / "runs-exp"), without)
     assert without.stat().st_size < file.stat().st_size / 2
@@ -127,7 +127,7 @@ def test_html_in_texts_of_a_stranger_is_escaped(tmp_path):
     file = archive(tmp_path, claim=HOSTILE)
     rewrite(file, spoil, resigned=True)
     page = site(tmp_path, file)
-    pages = [page, (tmp_path / "site" / "reports" / "exp.html").read_text()]
+    pages = [page, (tmp_path / "site/reports/exp.html").read_text()]
     for text in pages:
         elements = Page(text).elements
         assert not [tag for tag, named in elements if "onerror" in named or tag == "img"]
@@ -140,7 +140,7 @@ def test_names_of_experiments_become_plain_names_of_files(tmp_path, name):
     one, other = archive(tmp_path, name), tmp_path / "again.zip"
     other.write_bytes(one.read_bytes())
     site(tmp_path, one, other)
-    reports = sorted(path.name for path in (tmp_path / "site" / "reports").glob("*.html"))
+    reports = sorted(path.name for path in (tmp_path / "site/reports").glob("*.html"))
     assert len(reports) == 2
     assert all(re.fullmatch(r"[a-z0-9_-]+\.html", report) for report in reports)
 
@@ -151,7 +151,7 @@ def test_damaged_archives_are_left_out_and_a_site_without_any_is_refused(tmp_pat
     out = str(tmp_path / "site")
     assert run(["site", str(bad), str(good), "--out", out]) == 1
     assert "left out" in capsys.readouterr().err
-    assert "bad.zip" in (tmp_path / "site" / "index.html").read_text()
+    assert "bad.zip" in (tmp_path / "site/index.html").read_text()
     assert "no archive can be shown" in refused("site", bad, "--out", out)
     (tmp_path / "file").touch()
     assert run(["site", str(good), "--out", str(tmp_path / "file")]) == 2
@@ -193,7 +193,7 @@ def test_a_click_on_a_heading_sorts_the_table(tmp_path):
         "row.cells[0].textContent).join('')"
     )
     with Browser(
-        (tmp_path / "site" / "index.html").as_uri(), tmp_path / "profile", (400, 800)
+        (tmp_path / "site/index.html").as_uri(), tmp_path / "profile", (400, 800)
     ) as browser:
         browser.wait_until(lambda picture: bool((picture < 100).any()), "text")
         assert evaluated(browser, names) == "cab"

@@ -6,6 +6,7 @@ import random
 import re
 from dataclasses import fields, replace
 from pathlib import Path
+from shlex import split
 
 import numpy as np
 import pytest
@@ -56,10 +57,10 @@ def made(runs, tmp_path):
     """A function that makes a round of ``exp`` with its page in ``page``, and returns its key."""
 
     def make(*words, pairs="12", out="page"):
-        before = set((runs / "exp" / "votes").glob("*"))
+        before = set((runs / "exp/votes").glob("*"))
         made = ["vote", "make", "exp", "--out", str(tmp_path / out), "--pairs", pairs]
         assert run([*made, *words]) == 0
-        (folder,) = set((runs / "exp" / "votes").glob("*")) - before
+        (folder,) = set((runs / "exp/votes").glob("*")) - before
         return read_key(folder)
 
     return make
@@ -97,7 +98,9 @@ def made_up(arms, scenes, views, people=9, traps=4):
     pair = {"kind": "pair", "seed": 0}
     showings = [
         Showing(
-            **{"id": f"{scene}{view}{one}{two}", "scene": str(scene), "view": str(view)},
+            id=f"{scene}{view}{one}{two}",
+            scene=str(scene),
+            view=str(view),
             **pair | {"left": one, "right": two},
         )
         for scene in range(scenes)
@@ -120,12 +123,12 @@ def made_up(arms, scenes, views, people=9, traps=4):
 
 def test_the_page_does_not_reveal_arms(made, tmp_path):
     key = made("--people", "2")
-    text = (tmp_path / "page" / "index.html").read_text()
+    text = (tmp_path / "page/index.html").read_text()
     for word in ("sfm", "volumetric", "courtyard", "garden", "view0", key.salt, "blurred"):
         assert word not in text
     for showing in key.showings:
         assert key.commitment(showing) in text
-    files = sorted((tmp_path / "page" / "pictures").iterdir())
+    files = sorted((tmp_path / "page/pictures").iterdir())
     assert len(files) == 3 * len(key.showings)
     for file in files:
         assert not set(file.stem) - set("0123456789abcdef")
@@ -145,14 +148,14 @@ def test_each_showing_has_the_pictures_that_its_key_names(made, runs, tmp_path):
         photo, left, right = (pixels(page / entry[what]) for what in ("photo", "left", "right"))
         name = f"{showing.view}.png"
         folder = trials[showing.scene, ADC, showing.seed]
-        np.testing.assert_array_equal(photo, pixels(folder / "ground_truth" / name))
+        np.testing.assert_array_equal(photo, pixels(folder / f"ground_truth/{name}"))
         for side, shown in (("left", left), ("right", right)):
             what = getattr(showing, side)
             if showing.kind == "trap":
                 assert np.array_equal(shown, photo) == (what == "photograph")
             else:
                 folder = trials[showing.scene, what, showing.seed]
-                np.testing.assert_array_equal(shown, pixels(folder / "renders" / name))
+                np.testing.assert_array_equal(shown, pixels(folder / f"renders/{name}"))
 
 
 def pixels(file):
@@ -176,7 +179,7 @@ def test_views_sides_repeats_and_traps_follow_the_rules(made, runs):
         differences = {}
         for place in range(7):
             both = [
-                pixels(t.path / "renders" / f"view{place:03}.png").astype(float)
+                pixels(t.path / f"renders/view{place:03}.png").astype(float)
                 for t in trials_of(runs)
                 if t.scene == scene and t.seed == place % 2
             ]
@@ -193,7 +196,7 @@ def test_views_sides_repeats_and_traps_follow_the_rules(made, runs):
 
 def test_a_repeated_pair_does_not_follow_its_first_showing_soon(runs, tmp_path):
     trials = trials_of(runs)
-    for seed in range(8):
+    for seed in range(3):
         arms = [Arm("sfm", "adc"), Arm("sfm", "volumetric")]
         key = make_round(trials, arms, 12, 1, tmp_path / str(seed), random.Random(seed))
         places = {showing.id: place for place, showing in enumerate(key.showings)}
@@ -223,24 +226,24 @@ def test_a_round_is_declared_apart_from_metrics_and_claims(made, runs, tmp_path)
     archive = str(tmp_path / "exp.zip")
     assert run(["export", "--results", "exp", "--out", archive]) == 0
     assert run(["site", archive, "--out", str(tmp_path / "site")]) == 0
-    assert "vote " + key.round not in (tmp_path / "site" / "index.html").read_text()
+    assert "vote " + key.round not in (tmp_path / "site/index.html").read_text()
 
 
 @pytest.mark.parametrize(
     "words, message",
     [
-        (["make", "exp"], "needs --out"),
-        (["make", "exp", "--out", "."], "is there already"),
-        (["make", "exp", "--out", "new", "--arms", "adc"], "sfm-adc alone"),
+        ("make exp", "needs --out"),
+        ("make exp --out .", "is there already"),
+        ("make exp --out new --arms adc", "sfm-adc alone"),
         (
-            ["make", "exp", "--out", "new", "--arms", "adc,mcmc"],
+            "make exp --out new --arms adc,mcmc",
             "'mcmc' names 0 arms; choose one of sfm-adc",
         ),
-        (["make", "exp", "--out", "new", "--pairs", "0"], "in [1, 1000]"),
-        (["make", "exp", "x.json", "--out", "new"], "takes no files"),
-        (["judge", "exp", "absent.json"], "absent.json is not there"),
-        (["judge", "exp", "--arms", "adc"], "files of votes alone"),
-        (["look", "exp"], "invalid choice"),
+        ("make exp --out new --pairs 0", "in [1, 1000]"),
+        ("make exp x.json --out new", "takes no files"),
+        ("judge exp absent.json", "absent.json is not there"),
+        ("judge exp --arms adc", "files of votes alone"),
+        ("look exp", "invalid choice"),
     ],
 )
 def test_bad_input_of_vote_is_refused_in_one_line(
@@ -248,7 +251,7 @@ def test_bad_input_of_vote_is_refused_in_one_line(
 ):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").touch()
-    assert message in refused("vote", *words)
+    assert message in refused("vote", *split(words))
 
 
 def test_trials_without_pictures_are_refused_and_no_page_is_written(tmp_path):
@@ -314,7 +317,7 @@ def test_every_field_of_the_key_is_sealed_by_the_rounds_name():
 
 def test_a_changed_key_is_refused(made, runs, tmp_path, refused):
     key = made()
-    file = runs / "exp" / "votes" / key.round / "key.json"
+    file = runs / f"exp/votes/{key.round}/key.json"
     text = file.read_text()
     write(file, replace(key, traps_allowed=4).to_json())
     assert "was changed after the page was made" in refused(
@@ -363,7 +366,7 @@ def test_a_change_of_stored_votes_costs_that_file_and_is_shown(
     key = made("--people", "9")
     ballots = [ballot(key, n, prefers(VOLUMETRIC), minute=n) for n in range(2)]
     judge(*ballots)
-    change(runs / "exp" / "votes" / key.round / f"{0:016x}.json")
+    change(runs / f"exp/votes/{key.round}/{0:016x}.json")
     out = judge(ballots[1])
     assert f"Round {key.round}: {12 * people} votes of {people} p" in out
     assert re.search(f"Left out: .*{words}", out)
@@ -375,23 +378,18 @@ def test_a_stored_file_of_another_round_does_not_count(made, runs, judge):
     for key in (one, two):
         judge(ballot(key, 1, prefers(ADC)))
     name = f"{1:016x}.json"
-    folders = [runs / "exp" / "votes" / key.round for key in (one, two)]
+    folders = [runs / f"exp/votes/{key.round}" for key in (one, two)]
     (folders[1] / name).write_text((folders[0] / name).read_text())
     assert re.search(f"Left out: {name} .*of another round", judge())
 
 
-def test_a_name_cannot_write_lines_of_its_own(made, judge):
+def test_a_name_cannot_write_lines_or_elements_of_its_own(made, runs, judge):
     key = made("--people", "9")
-    forged = "Ann\nRound zero: 99 votes\u2028x\u202e\x1b[2J"
+    forged = "Ann\nRound zero: 99 votes\u2028x\u202e\x1b[2J<img src=x>"
     out = judge(ballot(key, 1, lambda showing: "same", name=forged))
     assert "\nRound zero" not in out
     assert {"\u2028", "\u202e", "\x1b"}.isdisjoint(out)
-    assert "Left out: Ann Round zero: 99 votes x[2J (000000) failed" in out
-
-
-def test_html_in_names_of_people_is_escaped(made, runs, judge):
-    key = made("--people", "1")
-    judge(ballot(key, 1, lambda showing: "left", name="<img src=x onerror=alert(1)>"))
+    assert "Left out: Ann Round zero: 99 votes x[2J<img src=x> (000000) failed" in out
     page = page_of(runs)
     assert "&lt;img src=x" in page
     assert "<img src=x" not in page
@@ -467,7 +465,7 @@ def test_a_person_who_always_answers_left_is_inconsistent():
 
 def test_several_arms_share_the_error_rate_and_are_ranked():
     key = made_up(["sfm-a", "sfm-b", "sfm-c"], scenes=2, views=2)
-    order = ["sfm-a", "sfm-c", "sfm-b", "photograph"]
+    order = split("sfm-a sfm-c sfm-b photograph")
 
     def choose(showing):
         return max(
@@ -543,7 +541,7 @@ class Voter:
 @pytest.mark.browser
 def test_two_people_vote_by_keyboard_and_are_judged(made, runs, tmp_path, capsys, said):
     key = made("--people", "2")
-    address, files, last = (tmp_path / "page" / "index.html").as_uri(), [], len(key.showings)
+    address, files, last = (tmp_path / "page/index.html").as_uri(), [], len(key.showings)
     for width, chooser in ((1200, prefers(VOLUMETRIC)), (400, prefers(ADC))):
         with Browser(address, tmp_path / f"profile{width}", (width, 800)) as browser:
             metrics = {"width": width, "height": 800, "deviceScaleFactor": 1, "mobile": False}

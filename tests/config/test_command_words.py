@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from shlex import split
 
 import pytest
 
@@ -41,23 +42,23 @@ def test_options_and_words_may_come_in_any_order(tmp_path):
 @pytest.mark.parametrize(
     "words, said",
     [
-        (["--config-name", "mine"], "--config-name: gsbench's main configuration is its own: write "
+        ("--config-name mine", "--config-name: gsbench's main configuration is its own: write "
             "yours to FOLDER/experiment/mine.yaml"),
-        (["-cn=mine"], "give --config-dir FOLDER +experiment=mine"),
-        (["-cp", "here"], "+experiment=NAME"),
-        (["--config-path=here"], "+experiment=NAME"),
-        (["--config-name"], "+experiment=NAME"),
-        (["--scene.path=x"], "a setting has no dashes: scene.path=…"),
-        (["--mutlirun"], "did you mean --multirun?"),
-        (["--config-dir", ".", "-cd", "."], "names one folder"),
-        (["--config-dir", ".", "hydra.searchpath=[a]"], "names one folder"),
-        (["--config-dir"], "--config-dir needs a folder"),
-        (["--config-dir", "/nowhere"], "--config-dir /nowhere: no such folder"),
+        ("-cn=mine", "give --config-dir FOLDER +experiment=mine"),
+        ("-cp here", "+experiment=NAME"),
+        ("--config-path=here", "+experiment=NAME"),
+        ("--config-name", "+experiment=NAME"),
+        ("--scene.path=x", "a setting has no dashes: scene.path=…"),
+        ("--mutlirun", "did you mean --multirun?"),
+        ("--config-dir . -cd .", "names one folder"),
+        ("--config-dir . hydra.searchpath=[a]", "names one folder"),
+        ("--config-dir", "--config-dir needs a folder"),
+        ("--config-dir /nowhere", "--config-dir /nowhere: no such folder"),
     ],
 )  # fmt: skip
 def test_options_that_do_not_exist_are_explained(words, said):
     with refusal(re.escape(said)):
-        parse(words)
+        parse(split(words))
 
 
 @pytest.mark.parametrize(
@@ -106,6 +107,11 @@ def test_brackets_are_counted_while_they_are_open():
             r"allow_targets=\[mine,other\]"),
         ("hydra.searchpath=[pkg://minefield.a]", r"allow_targets=\[mine,minefield\]"),
         ("hydra.searchpath=[http://a]", "neither a folder .file://…. nor a package"),
+        *(
+            (f"{key}={value}", "")  # every spelling is refused
+            for key in ("hydra.searchpath", "hydra[searchpath]")
+            for value in ("[pkg://strange]", "extend_list('pkg://strange')")
+        ),
         ("hydra.other=[pkg://other]", None),
         ("hydra.searchpath=[pkg://a],[pkg://b]", None),  # refused as a list of values
     ],
@@ -140,8 +146,8 @@ def test_a_grid_is_a_product_whose_last_list_varies_first(monkeypatch):
 @pytest.mark.parametrize(
     "key, other",
     [
-        *((key, True) for key in ("seed", "name", "densify", "densify.start", "scene.path")),
-        *((key, False) for key in ("threads", "init.threads", "eval.primary", "launch.parallel")),
+        *((key, True) for key in split("seed name densify densify.start scene.path")),
+        *((key, False) for key in split("threads init.threads eval.primary launch.parallel")),
         ("densify.primary", True),
     ],
 )
@@ -150,18 +156,25 @@ def test_settings_that_make_other_trials(key, other):
 
 
 def test_words_tell_their_key_value_and_kind():
-    assert [key_of(word) for word in ("+a.b=1", "~a.b", "++a/b=1", "a=1")] == [
-        *("a.b", "a.b", "a/b", "a")
-    ]
+    assert [key_of(word) for word in ("+a.b=1", "~a.b", "++a/b=1", "a=1")] == split("a.b a.b a/b a")
     assert [is_sweep(word) for word in ("a=1", "a=1,2", "a=[1,2]", "a=range(3)")] == [
-        *(False, True, False, True)
+        False,
+        True,
+        False,
+        True,
     ]
     assert [is_interval(parse_word(word)) for word in ("a=1", "a=1,2", "a=interval(0,1)")] == [
-        *(False, False, True)
+        False,
+        False,
+        True,
     ]
     values = [None, True, [1, [None, "a"]], 1.5, "True"]
     assert [value_text(value) for value in values] == [
-        *("null", "true", "[1,[null,a]]", "1.5", "True")
+        "null",
+        "true",
+        "[1,[null,a]]",
+        "1.5",
+        "True",
     ]
     with refusal("seed=1,2 lists several values: take one"):
         check_single(["a=1", "seed=1,2", "b=3,4"], "take one")
@@ -190,7 +203,7 @@ def test_special_characters_are_shown_quoted(word, said):
 @pytest.mark.parametrize("group, word", [("experiment", "experiment=a"), ("init", "init=[a]")])
 def test_choices_of_the_users_folder_are_listed_too(tmp_path, group, word):
     (tmp_path / group).mkdir()
-    (tmp_path / group / "of_mine.yaml").touch()
+    (tmp_path / f"{group}/of_mine.yaml").touch()
     words, *_ = parse(["--config-dir", str(tmp_path), word])
     with refusal(r"\bof_mine\b"):
         check_words(words)
@@ -202,9 +215,9 @@ def test_a_word_that_is_a_choice_gets_a_hint(tmp_path):
     assert hint_for("demo") == "; did you mean +experiment=demo?"
     assert hint_for("none").startswith("; did you mean densify=none or ")
     assert hint_for("nosuch") == ""
-    (tmp_path / "densify" / "external").mkdir(parents=True)
-    for name in ("adc", "zeta", "alpha", "external/mine"):
-        (tmp_path / "densify" / f"{name}.yaml").touch()
+    (tmp_path / "densify/external").mkdir(parents=True)
+    for name in split("adc zeta alpha external/mine"):
+        (tmp_path / f"densify/{name}.yaml").touch()
     found = options("densify", [tmp_path])
     assert found[: len(options("densify"))] == options("densify")
     assert found[len(options("densify")) :] == ["alpha", "zeta", "external/mine"]

@@ -5,6 +5,7 @@ import os
 import re
 import sys
 from pathlib import Path
+from shlex import split
 
 import pytest
 import yaml
@@ -82,10 +83,10 @@ def strange_runs(settings):
     """A stranger's failed trial that is in no plan; its configuration allows itself everything."""
     (trial,) = compose_trials(["name=x"])
     values = json.loads(json.dumps(trial.values)) | {
-        "allow_targets": ["bomb", "bash", "os", "gsbench", "bombs"]
+        "allow_targets": split("bomb bash os gsbench bombs")
     }
     nested(settings, values)
-    folder = Path(values["runs"]) / "x" / "courtyard" / "sfm-volumetric" / "01234567-seed0"
+    folder = Path(values["runs"]) / "x/courtyard/sfm-volumetric/01234567-seed0"
     write(folder / "config.yaml", yaml.safe_dump(values))
     write(folder / "failed.json", {"message": "no luck"})
     return folder
@@ -140,9 +141,9 @@ def _ledger(settings):
     append(home, lambda book: Started(**idea, **started))
     append(home, lambda book: Ended(**idea, result="kept", reason="better", seeds=4))
     return [
-        ["ledger", "try", "x", "densify.split_size=0.02"],
-        ["ledger", "try", "x", "--against", "i", "densify.split_size=0.02"],
-        ["ledger", "confirm", "x", "scene=courtyard", "scene.name=y", "seed=7,8"],
+        split("ledger try x densify.split_size=0.02"),
+        split("ledger try x --against i densify.split_size=0.02"),
+        split("ledger confirm x scene=courtyard scene.name=y seed=7,8"),
     ]
 
 
@@ -169,11 +170,21 @@ CANNOT_SET = {("plan", "a folder to write"), ("config.yaml", "a folder to write"
 CANNOT_SET |= {(file, case) for file in FILES if file != "experiment" for case in OF_AN_APP}
 CANNOT_SET |= {("config.yaml", case) for case, (own, _) in STRANGE.items() if "hydra" in str(own)}
 CANNOT_SET |= {("experiment", "a package of settings")}
+KINDS = ("an address", "a class", "a program", "a shell", "a package of settings", "a callback")
+KINDS += ("a class and its permission", "a folder to write", "a variable")
 
 
 @pytest.mark.parametrize(
     "file, case",
-    [(file, case) for file in FILES for case in STRANGE if (file, case) not in CANNOT_SET],
+    [
+        # quick tests have all cases in an experiment, and one of each kind in the other files
+        pytest.param(
+            file, case, marks=[pytest.mark.slow] * (file != "experiment" and case not in KINDS)
+        )
+        for file in FILES
+        for case in STRANGE
+        if (file, case) not in CANNOT_SET
+    ],
 )
 def test_no_file_of_a_stranger_decides_what_runs_and_where_results_go(
     file, case, monkeypatch, refused
@@ -233,9 +244,9 @@ def test_a_plan_gives_no_permission_and_no_folder_of_modules(place, monkeypatch,
     theirs = place / "theirs"
     theirs.mkdir()
     (theirs / "mine.py").write_text(f"open({str(place / 'exploded')!r}, 'w')\nclass Mine: ...\n")
-    words = ["name=x", "densify=adc", "densify._target_=mine.Mine", "seed=0,1"]
+    words = split("name=x densify=adc densify._target_=mine.Mine seed=0,1")
     add_to_plan(compose_trials([*words, "allow_targets=[mine]"], multirun=True))
-    plan = place / "runs" / "x" / "plan.json"
+    plan = place / "runs/x/plan.json"
     strange = plan.read_text().replace(f'"cwd": "{place}"', f'"cwd": "{theirs}"')
     assert str(theirs) in strange
     assert "allow_targets=[mine]" in strange
@@ -255,22 +266,22 @@ def test_a_plan_gives_no_permission_and_no_folder_of_modules(place, monkeypatch,
 
 def test_a_plan_reaches_no_other_experiment(place, refused):
     add_to_plan(compose_trials(["name=x", "seed=0,1"], multirun=True))
-    plan = place / "runs" / "x" / "plan.json"
+    plan = place / "runs/x/plan.json"
     plan.write_text(plan.read_text().replace("name=x", "name=mine"))
     for words in (["retry", "x"], ["retry", "x", "--dry-run"]):
         assert "is planned as a trial of mine, not of x" in refused(*words)
-    assert not (place / "runs" / "mine").exists()
+    assert not (place / "runs/mine").exists()
 
 
 def test_a_plan_gives_no_folder_for_packages_of_settings(place, monkeypatch):
     """Hydra imports ``pkg://conf_of_mine`` while it composes: the user's own, not the plan's."""
     theirs = place / "theirs"
     for folder, line in (("theirs", f"open({str(place / 'exploded')!r}, 'w')\n"), (".", "")):
-        (place / folder / "conf_of_mine").mkdir(parents=True)
-        (place / folder / "conf_of_mine" / "__init__.py").write_text(line)
+        (place / f"{folder}/conf_of_mine").mkdir(parents=True)
+        (place / f"{folder}/conf_of_mine/__init__.py").write_text(line)
     monkeypatch.chdir(place)
     add_to_plan(compose_trials(["name=x", "seed=0,1"], multirun=True))
-    plan = place / "runs" / "x" / "plan.json"
+    plan = place / "runs/x/plan.json"
     content = read_json(plan)
     for planned in content["trials"].values():
         planned |= {
@@ -279,7 +290,7 @@ def test_a_plan_gives_no_folder_for_packages_of_settings(place, monkeypatch):
         }
     write(plan, content)
     assert cli.run(["retry", "x", "allow_targets=[conf_of_mine]", "--dry-run"]) == 0
-    assert sys.modules.pop("conf_of_mine").__file__ == str(place / "conf_of_mine" / "__init__.py")
+    assert sys.modules.pop("conf_of_mine").__file__ == str(place / "conf_of_mine/__init__.py")
     assert not (place / "exploded").exists()
 
 
@@ -360,7 +371,7 @@ def test_an_address_counts_if_it_is_typed_or_in_the_environment(place, monkeypat
     assert compose_one([f"tracking.uri={ADDRESS}"]).values["allow_targets"] == [ADDRESS]
     words = experiment({"tracking.uri": ADDRESS})
     write(Path("conf/tracking/lab.yaml"), "name: lab\nuri: http://lab:5000\n")
-    lab = ["--config-dir", "conf", "tracking=lab", "--dry-run"]
+    lab = split("--config-dir conf tracking=lab --dry-run")
     assert cli.run(lab) == 0
     assert f"results would go to {ADDRESS}" in refused(*words, "tracking=lab")
 

@@ -5,6 +5,7 @@ import json
 import re
 from functools import cache
 from pathlib import Path
+from shlex import split
 
 import pytest
 from hydra import compose, initialize_config_dir
@@ -19,7 +20,7 @@ from gsbench.config.schema import checked_values, plain, register_schemas
 from gsbench.pipeline.parts import build_metrics
 from gsbench.runs.config_hash import config_hash
 from gsbench.system.install import conf_dir
-from gsbench.train.options import STEPS, TrainConfig
+from gsbench.train.options import STEPS
 from tests.helpers import refusal
 
 GROUPS = ("scene", "init", "densify", "raster", "train", "eval", "tracking", "launch")
@@ -78,14 +79,12 @@ def test_every_option_composes(group, option):
 
 
 @pytest.mark.parametrize("option", options("densify"))
-def test_every_densifier_can_be_built_and_matches_its_class(option):
+def test_every_densifier_can_be_built_and_shows_all_its_options(option):
     values = composed(f"densify={option}", "train=paper")["densify"]
     densifier = build("densify", values, [])
     if dataclasses.is_dataclass(densifier):
         names = {field.name for field in dataclasses.fields(densifier) if field.init}
         assert names == set(values) - {"_target_", "name"}  # the YAML shows every option
-    if option not in ("absgrad", "revised", "volumetric_once", "mrnf", "none"):
-        assert densifier == type(densifier)()  # and the values of the class
 
 
 @pytest.mark.parametrize("option", options("init"))
@@ -98,23 +97,6 @@ def test_every_initialiser_shows_all_its_options(option, tmp_path):
     assert names == set(values) - {"_target_", "name"}
 
 
-def test_the_paper_schedule_is_the_class_default():
-    defaults = dataclasses.asdict(TrainConfig(name="paper"))
-    assert plain(defaults) == plain(composed("train=paper")["train"])
-
-
-def sweep_size(experiment):
-    register_schemas()
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        config = compose(
-            "config", overrides=[f"+experiment={experiment}"], return_hydra_config=True
-        )
-    size = 1
-    for value in OmegaConf.to_container(config.hydra.sweeper.params).values():
-        size *= len(str(value).split(","))
-    return size
-
-
 def test_the_demo_downloads_little_and_declares_what_it_measures():
     trials = compose_trials(["+experiment=demo"], multirun=True)
     asked = {
@@ -124,47 +106,34 @@ def test_the_demo_downloads_little_and_declares_what_it_measures():
     assert asked == {(("squeeze",), "flip")}
 
 
-def test_experiments_have_the_size_of_the_paper():
-    assert sweep_size("table1") == 13 * 2 * 3
-    assert sweep_size("table2") == 12 * 2 * 2 * 3
-    assert sweep_size("demo") == 6
-    assert {"table1", "table2", "threshold", "budget"} <= {*options("experiment")}
-
-
 @pytest.mark.parametrize(
-    "overrides, key",
+    "words, said",
     [
-        (["scene.test_every=1"], "scene.test_every"),
-        (["train.iterations=0"], "train.iterations"),
-        (["eval.protocol=best"], "eval.protocol"),
-        (["threads=0"], "threads"),
-        (["name=a/b"], "name"),
-        (["train.background=[0,0,2]"], "train.background"),
+        ("scene.test_every=1", "scene.test_every"),
+        ("train.iterations=-1", "train.iterations must be a whole number of at least 0"),
+        ("eval.protocol=best", "eval.protocol"),
+        *((f"threads={n}", "whole number in [1, 4096] or 'auto'") for n in ("0", "4097", "1" * 13)),
+        ("name=a/b", "name"),
+        ("train.background=[0,0,2]", "train.background"),
+        ("eval.primary=lpips_vg", "did you mean lpips_vgg? (known are psnr, ssim, "),
+        ("eval.primary=sharpness", "is not a metric"),
+        ("eval.primary=lpips_alex eval.lpips=[vgg]", "is not measured: add alex to eval.lpips"),
+        ("eval.primary=flip eval.flip=false", "eval.flip=false"),
+        ("eval.more=[psnr]", "eval.more"),
+        ("eval.more=[gmsd,gmsd]", "at most once"),
+        ("eval.primary=gmsd", "add gmsd to eval.more"),
+        ("eval.primary=fps", "add eval.fps=[1920,1080]"),
+        ("eval.fps=[640]", "eval.fps must be two sides in px"),
+        ("eval.extra.fps._target_=mine.Mine allow_targets=[mine]", "none of"),
+        *(
+            (f"eval.extra.{name}._target_=mine.X allow_targets=[mine]", f"{name}: name your metric")
+            for name in split("psnr lpips view Edges a-b")
+        ),
     ],
 )
-def test_errors_name_the_key(base, overrides, key):
-    with refusal(key):
-        checked(base, *overrides)
-
-
-@pytest.mark.parametrize(
-    "words, error",
-    [
-        (
-            ["eval.primary=lpips_vg"],
-            r"is not a metric; did you mean lpips_vgg\? \(known are psnr, ssim, .*flip",
-        ),
-        (["eval.primary=sharpness"], "is not a metric .*eval.extra"),
-        (
-            ["eval.primary=lpips_alex", "eval.lpips=[vgg]"],
-            r"lpips_alex is not measured: add alex to eval\.lpips",
-        ),
-        (["eval.primary=flip", "eval.flip=false"], r"eval\.flip=false"),
-    ],
-)
-def test_a_declared_metric_must_exist_and_be_measured(base, words, error):
-    with refusal(error):
-        checked(base, *words)
+def test_errors_name_the_key(base, words, said):
+    with refusal(re.escape(said)):
+        checked(base, *words.split())
 
 
 def test_a_users_metric_can_be_declared_if_it_has_a_direction(base, tmp_path, monkeypatch):
@@ -208,20 +177,7 @@ def test_asking_for_more_metrics_changes_the_hash(base):
     assert len({config_hash(checked(base, word)) for word in words}) == 4
 
 
-@pytest.mark.parametrize(
-    "words, said",
-    [
-        (["eval.more=[psnr]"], "eval.more"),
-        (["eval.more=[gmsd,gmsd]"], "at most once"),
-        (["eval.primary=gmsd"], "add gmsd to eval.more"),
-        (["eval.primary=fps"], "add eval.fps=[1920,1080]"),
-        (["eval.fps=[640]"], "eval.fps must be two sides in px"),
-        (["eval.extra.fps._target_=mine.Mine", "allow_targets=[mine]"], "none of"),
-    ],
-)
-def test_metrics_that_are_not_measured_or_known_are_refused(base, words, said):
-    with refusal(re.escape(said)):
-        checked(base, *words)
+def test_a_speed_that_is_measured_can_be_declared(base):
     assert checked(base, "eval.primary=fps", "eval.fps=[640,480]")["eval"]["primary"] == "fps"
 
 
@@ -235,12 +191,6 @@ def test_hash_follows_the_source_of_a_users_class(base, place, tmp_path, monkeyp
         hashes.append(config_hash(checked(base, *own)))
     assert hashes[0] == hashes[2] != hashes[1]
     assert config_hash(checked(base)) not in hashes
-
-
-@pytest.mark.parametrize("name", ["psnr", "lpips", "view", "Edges", "a-b"])
-def test_a_users_metric_needs_a_plain_name_that_is_not_taken(base, name):
-    with refusal(rf"eval\.extra\.{name}: name your metric"):
-        checked(base, f"eval.extra.{name}._target_=mine.X", "allow_targets=[mine]")
 
 
 @pytest.mark.parametrize(
@@ -325,20 +275,6 @@ def test_an_own_metric_must_be_allowed_and_name_a_class():
         composed("eval.extra.edges=3")
 
 
-def test_a_run_without_training_requires_densify_none():
-    with refusal("add densify=none"):
-        composed("train=none", "densify=adc")
-    assert composed("train=none", "densify=none")["train"]["iterations"] == 0
-    with refusal(r"train\.iterations must be a whole number of at least 0"):
-        composed("train.iterations=-1")
-
-
-@pytest.mark.parametrize("threads", ["4097", "1000000000000", "0"])
-def test_an_impossible_number_of_threads_is_refused(base, threads):
-    with refusal(r"threads must be a whole number in \[1, 4096\] or 'auto'"):
-        checked(base, f"threads={threads}")
-
-
 READ = "name=1_1 name=1e3 densify.name=1e3 name=007 name=2,1_1 scene.path=1.50"
 KEPT = 'name=12 name=on name=0x10 name="1e3" name=2026-11-26 name=a_1 densify.volume_threshold=1e-3'
 
@@ -378,7 +314,7 @@ def test_all_steps_of_the_schedule_are_scaled(words, scaled):
     assert config_hash(composed("densify=adc", words[0], *own)) == config_hash(values)
 
 
-@pytest.mark.parametrize("value", ["0", "-1", "x", "true"])
+@pytest.mark.parametrize("value", split("0 -1 x true"))
 def test_a_scale_that_is_no_number_above_zero_is_refused(value):
     with refusal(r"train\.steps_scaler must be"):
         composed(f"train.steps_scaler={value}")

@@ -2,6 +2,7 @@
 
 import pickle
 import re
+from shlex import split
 
 import pytest
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
@@ -68,26 +69,26 @@ def test_every_job_has_the_configuration_of_its_words(name, compositions):
 
 
 @pytest.mark.parametrize(
-    "words", [["seed=0,-1"], ["train.iterations=5,-5"], ["seed=0,1", "scene.views=9,no"]]
+    "words", ["seed=0,-1", "train.iterations=5,-5", "seed=0,1 scene.views=9,no"]
 )
 def test_a_bad_value_is_refused_in_a_shared_composition(words):
-    with refusal(f"{words[-1].partition('=')[0]} must be"):
-        compose_trials(words, multirun=True)
+    with refusal(f"{split(words)[-1].partition('=')[0]} must be"):
+        compose_trials(split(words), multirun=True)
 
 
 @pytest.mark.parametrize(
     "words, others, seed",
     [
-        (["a.b=1", "seed=2"], ("a.b=1",), 2),
-        (["a.b=1"], ("a.b=1",), None),
-        (["seed=1", "++seed=2"], ("seed=1", "++seed=2"), None),  # the later one counts
-        (["++seed=2"], ("++seed=2",), None),
-        (["seed='${x}'"], ("seed='${x}'",), None),
-        (["seed='1'"], ("seed='1'",), None),
+        ("a.b=1 seed=2", ("a.b=1",), 2),
+        ("a.b=1", ("a.b=1",), None),
+        ("seed=1 ++seed=2", ("seed=1", "++seed=2"), None),  # the later one counts
+        ("++seed=2", ("++seed=2",), None),
+        ("'seed='\"'\"'${x}'\"'\"''", ("seed='${x}'",), None),
+        ("'seed='\"'\"'1'\"'\"''", ("seed='1'",), None),
     ],
 )
 def test_only_a_plain_seed_is_set_apart(words, others, seed):
-    assert compose._without_seed(words) == (others, seed)
+    assert compose._without_seed(split(words)) == (others, seed)
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ the class's own defaults. A file that is built on another of the same class stat
 
 import dataclasses
 import importlib
+from shlex import split
 
 import pytest
 import yaml
@@ -53,7 +54,7 @@ def class_of(path):
 
 FILES = [
     path
-    for group in ("densify", "eval", "init", "launch", "raster", "scene", "tracking", "train")
+    for group in split("densify eval init launch raster scene tracking train")
     for path in sorted(f"{group}/{file.stem}" for file in (conf_dir() / group).glob("*.yaml"))
     # other scenes only say where a capture lies and of which kind it is
     if group != "scene" or path == "scene/courtyard"

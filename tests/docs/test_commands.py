@@ -59,7 +59,7 @@ NO_SETTINGS = {"key", "stable", "grow_grad2d"}  # words of Hydra's grammar, of t
 def keys_of(group):
     """The settings of a group: those of its dataclass, its files, and the classes in the files."""
     known = {field.name for kind in CLASSES.get(group, ()) for field in dataclasses.fields(kind)}
-    for file in (ROOT / "conf" / group).rglob("*.yaml"):
+    for file in (ROOT / f"conf/{group}").rglob("*.yaml"):
         content = yaml.safe_load(file.read_text(encoding="utf-8"))
         known |= {str(key) for key in content}
         module, _, name = str(content.get("_target_", "")).rpartition(".")
@@ -152,7 +152,7 @@ def test_commands_settings_and_files_in_a_document_exist(document):
 
 def test_files_in_the_architecture_document_exist():
     """There, files may be named from ``src/gsbench``."""
-    spans = SPAN.findall((ROOT / "docs" / "architecture.md").read_text(encoding="utf-8"))
+    spans = SPAN.findall((ROOT / "docs/architecture.md").read_text(encoding="utf-8"))
     named = [span for span in spans if FILE.match(span)]
     assert len(named) > 10
     places = [

@@ -18,7 +18,7 @@ from tests.conftest import ROOT
 PROMPT = re.compile(r"^\s*>>> ", re.MULTILINE)
 SOURCES = {
     ".".join(path.relative_to(ROOT / "src").with_suffix("").parts).removesuffix(".__init__"): path
-    for path in sorted((ROOT / "src" / "gsbench").rglob("*.py"))
+    for path in sorted((ROOT / "src/gsbench").rglob("*.py"))
     if PROMPT.search(path.read_text(encoding="utf-8"))
 }
 # First words that are neither verb nor noun, nor lead to a noun: question words, pronouns,

@@ -1,6 +1,7 @@
 """The blocks and commands of the documents, and the examples, run as a reader would run them."""
 
 import csv
+import importlib
 import json
 import os
 import re
@@ -17,6 +18,7 @@ from PIL import Image
 from gsbench.cli import run
 from gsbench.scene.colmap import read_model
 from tests.conftest import ROOT
+from tests.helpers import read_json
 
 pytestmark = pytest.mark.slow
 
@@ -40,7 +42,7 @@ def run_command(page, part, small=TINY):
 
     Its seeds are replaced by those of ``small``, if any.
     """
-    text = re.sub(r" *\\\n +", " ", (ROOT / "docs" / page).read_text(encoding="utf-8"))
+    text = re.sub(r" *\\\n +", " ", (ROOT / f"docs/{page}").read_text(encoding="utf-8"))
     (found,) = [line for line in re.findall(r"^    gsbench (.*)$", text, re.M) if part in line]
     typed = [word for word in shlex.split(found) if not word.startswith("seed=")]
     keys = {word.split("=")[0] for word in typed}
@@ -67,7 +69,7 @@ def folder(tmp_path, monkeypatch):
 
 
 def test_the_code_of_the_library_document_trains_and_resumes(folder):
-    found = run_blocks(ROOT / "docs" / "library.md")
+    found = run_blocks(ROOT / "docs/library.md")
     assert sum(found["losses"][-10:]) < 0.9 * sum(found["losses"][:10])
     assert len(found["trained"]) > len(found["initial"])
     for name, tensor in found["trained"].tensors().items():
@@ -86,7 +88,7 @@ def test_the_densifier_of_its_document_runs(folder):
 
 
 def test_the_rasterizer_of_its_document_runs(folder):
-    run_blocks(ROOT / "docs" / "rasterizer.md")
+    run_blocks(ROOT / "docs/rasterizer.md")
     run_command("rasterizer.md", "raster._target_=oversampled.Oversampled")
     assert len(list(Path("runs").glob("oversampled/courtyard/*/*/results.json"))) == 1
 
@@ -103,7 +105,7 @@ def test_the_metric_of_its_document_is_measured_and_shown(folder, capsys):
     )
     assert len(trials) == 4
     for trial in trials:
-        results = json.loads((trial / "results.json").read_text())
+        results = read_json(trial / "results.json")
         assert results["metric_facts"]["gradients"]["direction"] == -1
         assert list(results["code"]["sources"]) == ["gradients"]
         with (trial / "per_view.csv").open(newline="") as stream:
@@ -135,7 +137,7 @@ SCENE = " ".join(word for word in TINY.split() if not word.startswith("init"))
 def test_the_initialiser_of_its_document_runs(folder):
     run_command("initialiser.md", "init._target_=shell.Shell", SCENE)
     (results,) = Path("runs").glob("shell/courtyard/shell-none/*/results.json")
-    values = json.loads(results.read_text())
+    values = read_json(results)
     assert values["num_init_points"] == 20_000
     assert values["init_report"]["init"] == "shell"
 
@@ -145,13 +147,13 @@ def test_a_cloud_from_a_file_keeps_as_many_points_as_asked_for(folder):
     np.savetxt("scan.xyz", points)
     assert run(f"{SCENE} init=points init.path=scan.xyz init.max_points=900 name=scan".split()) == 0
     (scan,) = Path("runs").glob("scan/courtyard/points-none/*/results.json")
-    assert json.loads(scan.read_text())["num_init_points"] == 900
+    assert read_json(scan)["num_init_points"] == 900
 
 
 def test_the_tracker_of_its_document_gets_every_trial(folder):
     run_command("hydra.md", "kept.Kept", f"{TINY.replace(' tracking=none', '')} seed=0,1")
-    shown = {one["tags"]["seed"]: one for one in map(_json, Path("runs/told/shown").iterdir())}
-    results = {one["seed"]: one for one in map(_json, Path("runs/told").rglob("results.json"))}
+    shown = {one["tags"]["seed"]: one for one in map(read_json, Path("runs/told/shown").iterdir())}
+    results = {one["seed"]: one for one in map(read_json, Path("runs/told").rglob("results.json"))}
     assert set(shown) == {"0", "1"}
     for seed, one in results.items():
         told = shown[str(seed)]
@@ -160,15 +162,11 @@ def test_the_tracker_of_its_document_gets_every_trial(folder):
         assert "kept" not in one["code"]["sources"]  # a tracker changes no result
 
 
-def _json(path):
-    return json.loads(path.read_text())
-
-
 def test_the_reader_of_its_document_finds_the_cameras(folder):
     """The same training as with the cameras' COLMAP model, but for rounding."""
-    run_blocks(ROOT / "docs" / "library.md")
-    capture = folder / "library" / "courtyard"
-    np.save(capture / "poses_bounds.npy", _llff(read_model(capture / "sparse" / "0")))
+    run_blocks(ROOT / "docs/library.md")
+    capture = folder / "library/courtyard"
+    np.save(capture / "poses_bounds.npy", _llff(read_model(capture / "sparse/0")))
     small = " ".join(word for word in TINY.split() if not word.startswith("scene"))
     own = "scene=reader scene._target_=llff.LLFF allow_targets=[llff] name=llff"
     for words in (own, "scene=colmap scene.name=courtyard name=colmap"):
@@ -176,10 +174,10 @@ def test_the_reader_of_its_document_finds_the_cameras(folder):
     (own,), (colmap,) = (
         list(Path("runs", name).rglob("results.json")) for name in ("llff", "colmap")
     )
-    assert _json(own)["metrics"]["psnr"] == pytest.approx(
-        _json(colmap)["metrics"]["psnr"], abs=1e-3
+    assert read_json(own)["metrics"]["psnr"] == pytest.approx(
+        read_json(colmap)["metrics"]["psnr"], abs=1e-3
     )
-    assert list(_json(own)["code"]["sources"]) == ["llff"]
+    assert list(read_json(own)["code"]["sources"]) == ["llff"]
 
 
 def _llff(model):
@@ -194,72 +192,27 @@ def _llff(model):
     return rows
 
 
-def test_the_densifier_of_its_document_resumes_to_the_bit(folder):
-    """It passes the checklist of the document."""
-    import largest
-
+@pytest.mark.parametrize(
+    "file, name, options",
+    [
+        ("largest", "SplitLargest", {"interval": 1, "size": 0.05, "prune_opacity": 0.3}),
+        ("careful", "Careful", {"interval": 2, "gradient_threshold": 0.5}),
+    ],
+)
+def test_the_densifiers_of_the_document_resume_to_the_bit(folder, file, name, options):
+    """They pass the checklist of the document."""
     from gsbench.densify import DensifyContext
     from gsbench.gaussians.paper_values import LearningRates
     from gsbench.gaussians.trainable import TrainableGaussians
     from gsbench.raster.base import RenderOutput
     from tests.gaussians.helpers import random_gaussians
 
+    cls = getattr(importlib.import_module(file), name)
+
     def rounds(state, first, last):
         """Run refinements ``first`` to ``last`` of a made-up training, from ``state`` if given."""
-        densifier = largest.SplitLargest(
-            start=0, stop=100, interval=1, size=0.05, prune_opacity=0.3
-        )
+        densifier, rng = cls(start=0, stop=100, **options), torch.Generator()
         context, rates = DensifyContext(2.0), LearningRates()
-        if state is None:
-            gaussians = TrainableGaussians(
-                random_gaussians(60, seed=1, dtype=torch.float32), rates, 2.0
-            )
-            densifier.begin(gaussians.values, context)
-            rng = torch.Generator().manual_seed(5)
-        else:
-            gaussians = TrainableGaussians.load(state[0], rates, 2.0)
-            densifier.load_state_dict(state[1], context)
-            rng = torch.Generator()
-            rng.set_state(state[2])
-        for step in range(first, last + 1):
-            n = len(gaussians)
-            radii = torch.randint(
-                0, 3, (n,), generator=torch.Generator().manual_seed(step), dtype=torch.int32
-            )
-            densifier.observe(
-                step, RenderOutput(torch.zeros(1), torch.zeros(1), radii, torch.zeros(n, 2))
-            )
-            event = densifier.refine(step, gaussians, rng)
-            assert (
-                event.after
-                == event.before + event.split_volume - event.pruned_opacity
-                == len(gaussians)
-            )
-            assert len(densifier.lineage.ids) == len(gaussians)
-            assert len(densifier.statistics["seen"]) == len(gaussians)
-        return gaussians.state_dict(), densifier.state_dict(), rng.get_state()
-
-    through = rounds(None, 1, 6)
-    resumed = rounds(rounds(None, 1, 3), 4, 6)
-    for name, tensor in through[0]["gaussians"].items():
-        assert torch.equal(resumed[0]["gaussians"][name], tensor), name
-    for name, tensor in through[1]["lineage"].items():
-        assert torch.equal(resumed[1]["lineage"][name], tensor), name
-
-
-def test_the_example_of_state_trains_and_resumes_to_the_bit(folder):
-    from careful import Careful
-
-    from gsbench.densify import ADC, DensifyContext
-    from gsbench.gaussians.paper_values import LearningRates
-    from gsbench.gaussians.trainable import TrainableGaussians
-    from gsbench.raster.base import RenderOutput
-    from tests.gaussians.helpers import random_gaussians
-
-    def rounds(cls, state, first, last):
-        densifier = cls(start=0, stop=100, interval=2, gradient_threshold=0.5)
-        context, rates = DensifyContext(2.0), LearningRates()
-        rng = torch.Generator()
         if state is None:
             initial = random_gaussians(60, seed=1, dtype=torch.float32)
             gaussians = TrainableGaussians(initial, rates, 2.0)
@@ -275,15 +228,17 @@ def test_the_example_of_state_trains_and_resumes_to_the_bit(folder):
             points = torch.zeros(n, 2)
             points.grad = torch.rand(n, 2, generator=own)
             densifier.observe(step, RenderOutput(torch.zeros(1), torch.zeros(1), radii, points))
-            densifier.refine(step, gaussians, rng)
+            event = densifier.refine(step, gaussians, rng)
+            assert event is None or event.balances()
+            assert len(gaussians) == len(densifier.lineage.ids)
+            assert {len(own) for own in densifier.statistics.values()} == {len(gaussians)}
         return gaussians.state_dict(), densifier.state_dict(), rng.get_state()
 
-    whole = rounds(Careful, None, 1, 8)
-    resumed = rounds(Careful, rounds(Careful, None, 1, 5), 6, 8)
-    plain = rounds(ADC, None, 1, 8)
-    for key, tensor in whole[0]["gaussians"].items():
-        assert torch.equal(resumed[0]["gaussians"][key], tensor), key
-    assert len(whole[1]["lineage"]["ids"]) != len(plain[1]["lineage"]["ids"])
+    whole, resumed = rounds(None, 1, 8), rounds(rounds(None, 1, 5), 6, 8)
+    assert len(whole[1]["lineage"]["ids"]) != 60
+    for part, key in ((0, "gaussians"), (1, "lineage")):
+        for name, tensor in whole[part][key].items():
+            assert torch.equal(resumed[part][key][name], tensor), name
 
 
 def test_the_governed_densifier_of_the_document_ends_at_its_limit(folder):

@@ -13,7 +13,7 @@ from gsbench.gaussians.ply import read_ply
 from tests.conftest import ROOT
 from tests.helpers import read_json
 
-PAGE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
 WALKS = dict(
     re.findall(r"^### (An? \w+|The loss|A column).*?^```diff\n(.*?)^```", PAGE, re.M | re.S)
 )

@@ -21,9 +21,9 @@ QUICK = [
 
 
 def test_a_trial_is_trained_again_after_an_edit_of_the_loss(gsbench, tmp_path):
-    copy = tmp_path / "copy" / "src" / "gsbench"
+    copy = tmp_path / "copy/src/gsbench"
     shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
-    shutil.copytree(conf_dir(), tmp_path / "copy" / "conf")
+    shutil.copytree(conf_dir(), tmp_path / "copy/conf")
     changes = {"PYTHONPATH": str(copy.parent), "GSBENCH_RUNS": str(tmp_path / "runs")}
 
     def train(*words):
@@ -32,13 +32,13 @@ def test_a_trial_is_trained_again_after_an_edit_of_the_loss(gsbench, tmp_path):
         return done.stdout + done.stderr
 
     def results():
-        (path,) = (tmp_path / "runs" / "edited").glob("*/*/*/results.json")
+        (path,) = (tmp_path / "runs/edited").glob("*/*/*/results.json")
         return read_json(path)
 
     train()
     first = results()
     assert first["code"]["packages"]["eval/ssim.py"]
-    loss = copy / "train" / "trainer.py"
+    loss = copy / "train/trainer.py"
     text = loss.read_text()
     assert text.count("PhotometricLoss(options.ssim_weight,") == 1
     loss.write_text(text + "# a comment\n")

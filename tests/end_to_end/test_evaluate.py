@@ -59,7 +59,7 @@ def better_renders(runs, folder, seed):
     own = trial(runs, seed=seed)
     for file in (own / "renders").glob("*.png"):
         mixed = Image.blend(
-            Image.open(file), Image.open(own / "ground_truth" / file.name), 0.5 + 0.05 * seed
+            Image.open(file), Image.open(own / f"ground_truth/{file.name}"), 0.5 + 0.05 * seed
         )
         mixed.save(folder / f"render_{int(file.stem)}.png")
     return folder
@@ -72,28 +72,15 @@ def test_renders_of_a_trial_are_measured_with_its_metrics_to_the_last_digit(gsbe
         ("small:courtyard:adc:0", []),
         ("courtyard", SCENE + EVAL),
     ):
-        done = gsbench(
-            "evaluate",
-            str(own / "renders"),
-            "--truth",
-            truth,
-            *settings,
-            "--json",
-        )
+        done = gsbench(f"evaluate {own}/renders --truth {truth} --json", *settings)
         found = json.loads(done.stdout)
         assert found["metrics"] == results(own)["metrics"]
         assert found["protocol"] == "paper-1"
         for view, row in views(own).items():
             metrics = {key: value for key, value in row.items() if key not in (ANGLE, DISTANCE)}
             assert {key: repr(value) for key, value in found["views"][view].items()} == metrics
-    shown = gsbench(
-        "evaluate",
-        str(own / "renders"),
-        "--truth",
-        str(own / "ground_truth"),
-        "--protocol",
-        "standard",
-    )
+    truth = f"--truth {own}/ground_truth --protocol standard"
+    shown = gsbench(f"evaluate {own}/renders {truth}")
     assert "protocol standard-1" in shown.stdout
 
 
@@ -111,8 +98,8 @@ def test_entered_renders_are_in_the_table_and_get_a_verdict(
     assert found["evaluated_from"] == "renders"
     assert found["num_gaussians"] is None
     assert list(views(entered)) == list(views(trial(runs)))
-    picture = np.asarray(Image.open(entered / "renders" / "0008.png"))
-    assert_array_equal(picture, np.asarray(Image.open(tmp_path / "theirs1" / "render_8.png")))
+    picture = np.asarray(Image.open(entered / "renders/0008.png"))
+    assert_array_equal(picture, np.asarray(Image.open(tmp_path / "theirs1/render_8.png")))
 
     table = gsbench("tables small")
     assert (
@@ -123,7 +110,7 @@ def test_entered_renders_are_in_the_table_and_get_a_verdict(
     assert row.count("n/a") == 3  # LPIPS (not asked for), Gaussians, time
     assert "**" in row  # compared, and best
     gsbench("report small")
-    text = (runs / "small" / "report.html").read_text()
+    text = (runs / "small/report.html").read_text()
     # Two seeds decide nothing among three metrics, however much better these renders are.
     assert "random-theirs against random-adc, on this scene: undecided in PSNR" in text
     assert "by a training elsewhere, which left no record" in text

@@ -45,7 +45,7 @@ def test_after_fetch_table1_misses_no_data(gsbench, server, tmp_path):
     after = gsbench("+experiment=table1", "--dry-run")
     assert "does not exist" not in after.stdout
     assert "fetch" not in after.stdout
-    assert (tmp_path / "data" / "tandt" / "truck" / "images" / "IMG_0001.JPG").is_file()
+    assert (tmp_path / "data/tandt/truck/images/IMG_0001.JPG").is_file()
 
 
 def test_a_killed_fetch_continues(server, tmp_path, environment, gsbench):
@@ -57,16 +57,14 @@ def test_a_killed_fetch_continues(server, tmp_path, environment, gsbench):
     command = [sys.executable, *split("-m gsbench.cli fetch mipnerf360 --mirror"), server.url]
     process = subprocess.Popen(command, cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL)
     deadline = time.monotonic() + 60
-    while (
-        not list((tmp_path / "data" / ".fetch").glob("*/*/*.JPG")) and time.monotonic() < deadline
-    ):
+    while not list((tmp_path / "data/.fetch").glob("*/*/*.JPG")) and time.monotonic() < deadline:
         time.sleep(0.01)
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
     server.manners = Manners()
     gsbench("fetch mipnerf360 --mirror", server.url)
     for name, content in archive_content("garden", photos=2).items():
-        path = tmp_path / "data" / name
+        path = tmp_path / f"data/{name}"
         assert path.exists() == name.startswith(("garden/images_4/IMG", "garden/sparse/"))
         assert not path.exists() or path.read_bytes() == content
     assert not list((tmp_path / "data").rglob("*.tmp-*"))

@@ -59,7 +59,7 @@ def test_the_gate_passes_an_equal_version_and_stops_a_worse_one(gsbench, tmp_pat
 def test_bisect_finds_the_commit_repeats_nothing_and_leaves_the_checkout_unchanged(
     gsbench, tmp_path, plain_git
 ):
-    home = tmp_path / "own" / "densifiers"  # a folder within the repository
+    home = tmp_path / "own/densifiers"  # a folder within the repository
     home.mkdir(parents=True)
 
     def git(*words):
@@ -73,7 +73,7 @@ def test_bisect_finds_the_commit_repeats_nothing_and_leaves_the_checkout_unchang
         git("commit", "-qm", f"Commit {step}")
     ran = tmp_path / "ran"
     for hook in ("post-checkout", "reference-transaction"):
-        file = home.parent / ".git" / "hooks" / hook
+        file = home.parent / f".git/hooks/{hook}"
         write(file, f"#!/bin/sh\ntouch {ran}\n")
         file.chmod(0o755)
     write_class(home, 99, worse=False)  # an edit that was not committed

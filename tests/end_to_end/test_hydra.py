@@ -57,7 +57,7 @@ def results_below(folder):
 
 
 def test_an_experiment_file_can_set_callbacks_and_a_sweep(gsbench, tmp_path):
-    write(tmp_path / "conf" / "experiment" / "own.yaml", EXPERIMENT)
+    write(tmp_path / "conf/experiment/own.yaml", EXPERIMENT)
     (tmp_path / "notes.py").write_text(CALLBACK)
     words = [
         "--config-dir",
@@ -72,7 +72,7 @@ def test_an_experiment_file_can_set_callbacks_and_a_sweep(gsbench, tmp_path):
     assert not (tmp_path / "notes.txt").exists()  # where nothing runs, no callback is called
 
     gsbench(*words)
-    results = results_below(tmp_path / "runs" / "own-none")
+    results = results_below(tmp_path / "runs/own-none")
     assert [result["seed"] for result in results] == [0, 1]
     notes = (tmp_path / "notes.txt").read_text().splitlines()
     assert (notes[0], notes[-1]) == ("sweep begins", "sweep ends")
@@ -89,14 +89,14 @@ def test_another_launcher_runs_each_trial_as_a_job(gsbench, tmp_path, package, l
         pytest.skip(f"needs {package.replace('_', '-')} (group dev)")
     words = ["-m", *TINY, f"hydra/launcher={launcher}", "name=x", "seed=0,1"]
     gsbench(*words)
-    results = sorted((tmp_path / "runs" / "x").rglob("results.json"))
+    results = sorted((tmp_path / "runs/x").rglob("results.json"))
     assert len(results) == 2
     assert "2 trials: 2 done" in gsbench("status x").stdout
     written = [path.stat().st_mtime_ns for path in results]
     gsbench(*words)
     assert [path.stat().st_mtime_ns for path in results] == written  # nothing is done twice
     # What the launcher unpickles never lies where a stranger's runs folder could have it already.
-    places = {path.parts[-4] for path in (tmp_path / "runs" / ".hydra").rglob("*_result.pkl")}
+    places = {path.parts[-4] for path in (tmp_path / "runs/.hydra").rglob("*_result.pkl")}
     assert len(places) == 2 * (launcher == "submitit_local")
     assert all(len(place) == 16 for place in places)
 
@@ -106,7 +106,7 @@ def test_another_launcher_runs_each_trial_as_a_job(gsbench, tmp_path, package, l
 def test_hydra_writes_through_no_link_of_a_strangers_runs_folder(gsbench, tmp_path, name, sweeper):
     precious = tmp_path / "precious"
     precious.mkdir() if name == ".hydra" else precious.write_text("mine")
-    link = tmp_path / "runs" / name
+    link = tmp_path / f"runs/{name}"
     link.parent.mkdir(parents=True)
     link.symlink_to(precious)
     words = ["-m", *TINY, "name=x", "seed=0,1", "hydra.output_subdir=.hydra"]

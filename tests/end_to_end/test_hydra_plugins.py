@@ -46,13 +46,13 @@ def test_optunas_sweeper_looks_for_the_best_mean_over_seeds(gsbench, tmp_path, d
     done = gsbench(*words)
     assert f"psnr of test views, {direction}d" in done.stderr
     psnr = defaultdict(list)
-    for result in results_below(tmp_path / "runs" / "x"):
+    for result in results_below(tmp_path / "runs/x"):
         psnr[result["num_init_points"]].append(result["metrics"]["psnr"])
     assert all(len(values) == 2 for values in psnr.values())
     best = max(psnr, key=lambda count: statistics.fmean(psnr[count]))
     assert f"hydra/sweeper=optuna: best: init.count={best}, psnr " in done.stderr
     assert f"init.count={best} " in done.stderr.rpartition("; again: gsbench -m ")[2]
-    found = yaml.safe_load((tmp_path / "runs" / ".hydra" / "optimization_results.yaml").read_text())
+    found = yaml.safe_load((tmp_path / "runs/.hydra/optimization_results.yaml").read_text())
     assert found["best_params"] == {"init.count": best}
     sign = 1 if direction == "maximize" else -1
     assert found["best_value"] == pytest.approx(sign * statistics.fmean(psnr[best]))
@@ -139,9 +139,7 @@ def test_ray_runs_a_sweep_on_two_nodes_and_survives_a_killed_worker(
     out, _ = program.communicate(timeout=SECONDS)
     assert (program.returncode, at_once, bool(killed)) == (0, 2, True), out
     assert "8 of 8 trials done" in out
-    assert sorted(result["seed"] for result in results_below(tmp_path / "runs" / "x")) == list(
-        range(8)
-    )
+    assert sorted(result["seed"] for result in results_below(tmp_path / "runs/x")) == list(range(8))
 
 
 # ---- Hydra's own files and logs
@@ -150,20 +148,18 @@ def test_ray_runs_a_sweep_on_two_nodes_and_survives_a_killed_worker(
 def test_hydra_writes_its_files_to_the_given_folders(gsbench, tmp_path):
     words = [*TINY, "name=x", "hydra.run.dir=own", "hydra.verbose=true", "hydra.job.chdir=true"]
     done = gsbench(*words)
-    (result,) = (tmp_path / "runs" / "x").rglob("results.json")  # and not below own/
+    (result,) = (tmp_path / "runs/x").rglob("results.json")  # and not below own/
     assert f"paths still start in {tmp_path}" in done.stderr
-    assert yaml.safe_load((tmp_path / "own" / ".hydra" / "config.yaml").read_text())["name"] == "x"
-    assert (
-        f"the trial's folder is {result.parent}" in (tmp_path / "own" / "gsbench.log").read_text()
-    )
+    assert yaml.safe_load((tmp_path / "own/.hydra/config.yaml").read_text())["name"] == "x"
+    assert f"the trial's folder is {result.parent}" in (tmp_path / "own/gsbench.log").read_text()
 
     sweep = ["-m", *TINY, "name=x", "seed=0,1", "hydra.sweep.dir=many", "hydra.output_subdir=h"]
     done = gsbench(*sweep)
     for job in ("0", "1"):
-        assert yaml.safe_load((tmp_path / "many" / job / "h" / "config.yaml").read_text())[
-            "seed"
-        ] == int(job)
-    assert len(list((tmp_path / "runs" / "x").rglob("results.json"))) == 2
+        assert yaml.safe_load((tmp_path / f"many/{job}/h/config.yaml").read_text())["seed"] == int(
+            job
+        )
+    assert len(list((tmp_path / "runs/x").rglob("results.json"))) == 2
 
 
 def test_colours_of_a_log_reach_the_terminal(gsbench, tmp_path):

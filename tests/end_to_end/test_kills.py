@@ -155,8 +155,14 @@ def test_a_killed_trial_harms_no_other_and_the_next_command_completes_it(start, 
 
 
 TUNED = [
-    *("+experiment=tuned", "seed=0", *SMALL, "train.iterations=120", "eval.lpips=[]"),
-    *("tracking=none", "hydra.sweeper.tune.points=2", "name=small"),
+    "+experiment=tuned",
+    "seed=0",
+    *SMALL,
+    "train.iterations=120",
+    "eval.lpips=[]",
+    "tracking=none",
+    "hydra.sweeper.tune.points=2",
+    "name=small",
 ]
 
 
@@ -176,7 +182,7 @@ def test_a_killed_tuning_continues_and_its_values_are_trained(gsbench, start, tm
                 first.send_signal(signal.SIGKILL)
                 break
         first.stdout.read()
-    home = tmp_path / "runs" / "small"
+    home = tmp_path / "runs/small"
     assert not home.exists()
 
     done = gsbench(*TUNED, "launch=local", "launch.parallel=2")  # by another launcher, too
@@ -186,15 +192,15 @@ def test_a_killed_tuning_continues_and_its_values_are_trained(gsbench, start, tm
     )
     assert len(arms) == 2
     for arm in arms:
-        points = read_json(home.parent / f"small-tune-{arm}" / "tuning.json")["points"]
+        points = read_json(home.parent / f"small-tune-{arm}/tuning.json")["points"]
         assert len(points) == 2
         best = max(points, key=lambda point: point["value"])
         (results,) = home.glob(f"courtyard/{arm}/*/results.json")
         text = results.read_text()
         assert all(str(value) in text for value in best["settings"].values())
-        assert views(home / "courtyard" / arm)
-        assert not views(home / "courtyard" / arm) & views(
-            home.parent / f"small-tune-{arm}" / "courtyard" / arm
+        assert views(home / f"courtyard/{arm}")
+        assert not views(home / f"courtyard/{arm}") & views(
+            home.parent / f"small-tune-{arm}/courtyard/{arm}"
         )
 
     sheet = gsbench("tables small --layout fairness")
@@ -204,7 +210,7 @@ def test_a_killed_tuning_continues_and_its_values_are_trained(gsbench, start, tm
 
 def page_of(runs):
     """The lines of the page without the time of the declaration, and without times and memory."""
-    lines = (runs / "check_it" / "claims.html").read_text().splitlines()
+    lines = (runs / "check_it/claims.html").read_text().splitlines()
     assert sum(" were declared " in line for line in lines) == 1
     measured = (" were declared ", "seconds of training</th>", "memory (MB)</th>")
     assert all(sum(words in line for line in lines) == 1 for words in measured)
@@ -238,9 +244,9 @@ def test_a_killed_check_continues_and_ends_with_the_same_page(tmp_path):
         process.kill()
         assert process.wait() == -signal.SIGKILL
         assert count_done(killed) >= trials
-        assert not (killed / "check_it" / "claims.html").exists()
+        assert not (killed / "check_it/claims.html").exists()
     before = {path: path.read_bytes() for path in killed.glob("check_it/*/*/*/results.json")}
     complete(killed)
     assert page_of(killed) == page_of(whole)
     assert all(path.read_bytes() == content for path, content in before.items())  # done once
-    assert len((killed / "check_it" / "declared.jsonl").read_text().splitlines()) == 1
+    assert len((killed / "check_it/declared.jsonl").read_text().splitlines()) == 1

@@ -144,7 +144,7 @@ def rename(folder, model):
     (folder / "images/a").mkdir()
     for image in model.images.values():
         new = f"a/IMG {image.name}"
-        (folder / "images" / image.name).rename(folder / "images" / new)
+        (folder / f"images/{image.name}").rename(folder / f"images/{new}")
         image.name = new
 
 
@@ -264,7 +264,7 @@ def test_lenses_are_told_apart_by_exif_as_by_folders(tmp_path):
     quick = "train=none densify=none eval.lpips=[] tracking=none threads=1 init=sfm_preview"
     found = []
     for sharing in ("exif", "per_folder"):
-        runs = tmp_path / "runs" / sharing
+        runs = tmp_path / f"runs/{sharing}"
         words = [*split(quick), f"init.camera={sharing}"]
         trial = trial_of(words, runs, tmp_path / "photos", "scene=photos")
         found.append(read_json(trial / "init_report.json")["focal_lengths"])

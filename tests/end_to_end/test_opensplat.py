@@ -55,7 +55,7 @@ def test_renders_of_opensplat_are_neither_mirrored_nor_shifted(trial):
     assert len(files) == 2
     for file in files:
         render = np.asarray(Image.open(file).convert("RGB"))
-        truth = np.asarray(Image.open(trial / "ground_truth" / file.name).convert("RGB"))
+        truth = np.asarray(Image.open(trial / f"ground_truth/{file.name}").convert("RGB"))
         moved = [np.roll(render, shift, axis) for shift in (-SHIFT, SHIFT) for axis in (0, 1)]
         for other in (render[::-1], render[:, ::-1], *moved):
             assert error(render, truth) < error(other, truth), file.name

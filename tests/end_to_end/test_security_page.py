@@ -23,8 +23,8 @@ from tests.end_to_end.conftest import FINISHED
 from tests.end_to_end.test_hydra import TINY
 from tests.helpers import write
 
-PAGE = Path(__file__).parents[2] / "docs" / "security.md"
-CLAIMS = PAGE.parents[1] / "conf" / "claims" / "volumetric.yaml"
+PAGE = Path(__file__).parents[2] / "docs/security.md"
+CLAIMS = PAGE.parents[1] / "conf/claims/volumetric.yaml"
 pytestmark = pytest.mark.slow
 
 

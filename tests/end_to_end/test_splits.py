@@ -38,12 +38,12 @@ def captures(tmp_path_factory):
         read_colmap("courtyard", clean), folder / "sfm"
     )
     shutil.rmtree(clean / "sparse")
-    shutil.copytree(folder / "sfm" / MODEL_FOLDER, clean / "sparse" / "0")
+    shutil.copytree(folder / f"sfm/{MODEL_FOLDER}", clean / "sparse/0")
     shutil.copytree(clean, noisy)
     rng = np.random.default_rng(0)
     for name in sorted(path.name for path in (noisy / "images").iterdir())[::8]:
         Image.fromarray(rng.integers(0, 256, (144, 192, 3), dtype=np.uint8)).save(
-            noisy / "images" / name
+            noisy / f"images/{name}"
         )
     return clean, noisy
 
@@ -68,7 +68,7 @@ def test_test_photographs_do_not_change_one_bit_of_a_training(captures, tmp_path
     assert clean["hashes"]["data"] != noisy["hashes"]["data"]
     assert clean["metrics"]["psnr"] > noisy["metrics"]["psnr"] + 3
     for render in (folders[0] / "renders").iterdir():
-        assert_array_equal(Image.open(render), Image.open(folders[1] / "renders" / render.name))
+        assert_array_equal(Image.open(render), Image.open(folders[1] / f"renders/{render.name}"))
 
 
 def test_a_sector_is_recorded_with_its_views_and_their_distances(captures, tmp_path):

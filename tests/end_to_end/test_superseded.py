@@ -86,7 +86,7 @@ def test_trials_of_an_edited_densifier_are_not_averaged_with_earlier_ones(
     assert "iteration" not in train("0,1")
     assert "3 trials: 2 done, 1 superseded" in ask("status edited")
 
-    (folder,) = (tmp_path / "runs" / "edited").glob("*/*/*-seed0")
+    (folder,) = (tmp_path / "runs/edited").glob("*/*/*-seed0")
     shutil.rmtree(folder)
     again = gsbench("retry edited allow_targets=[mine,helper]")
     assert "configuration has changed" not in again.stderr

@@ -30,7 +30,7 @@ def capture(tmp_path):
             (folder / f"{name}.py").write_text(BOMB.format(mark=str(mark)))
     (folder / "hydra_plugins.py").unlink(missing_ok=True)
     (folder / "hydra_plugins").mkdir()  # a namespace, which Hydra imports as a whole
-    (folder / "hydra_plugins" / "extra.py").write_text(BOMB.format(mark=str(mark)))
+    (folder / "hydra_plugins/extra.py").write_text(BOMB.format(mark=str(mark)))
     # the console script, as pip writes it
     (tmp_path / "gsbench").write_text("from gsbench.cli import main\nmain()\n")
     return folder
@@ -68,7 +68,7 @@ def test_no_module_of_the_current_folder_is_imported(capture):
             words,
             (capture.parent / "exploded").read_text(),
         )
-    assert len(list((capture.parent / "runs" / "one").rglob("results.json"))) == 2
+    assert len(list((capture.parent / "runs/one").rglob("results.json"))) == 2
 
 
 def test_an_isolated_process_imports_no_module_of_the_current_folder(capture):

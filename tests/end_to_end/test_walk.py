@@ -66,7 +66,7 @@ def test_a_way_is_counted_by_its_folders():
         [(1, "app/a.py"), (2, "config/b.py")],
         [(1, "app/a.py"), (3, "app/c.py"), (4, "launch/d.py")],
     )
-    assert way([outer, inner]) == ["config/b.py", "app/a.py", "app/c.py", "launch/d.py"]
+    assert way([outer, inner]) == split("config/b.py app/a.py app/c.py launch/d.py")
     assert crossings(way([outer, inner])) == 3  # conf, config, app, launch
 
 

@@ -14,6 +14,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from shlex import split
 
 import numpy as np
 import pycolmap
@@ -21,22 +22,9 @@ from PIL import Image
 from scipy.spatial import cKDTree
 
 SH_DC = 0.28209479177387814  # of the constant harmonic, 1 / (2 sqrt(pi))
-COLUMNS = [
-    "x",
-    "y",
-    "z",
-    "f_dc_0",
-    "f_dc_1",
-    "f_dc_2",
-    "opacity",
-    "scale_0",
-    "scale_1",
-    "scale_2",
-    "rot_0",
-    "rot_1",
-    "rot_2",
-    "rot_3",
-]
+COLUMNS = split(
+    "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
+)
 
 
 def project(image, camera, points):
@@ -53,7 +41,7 @@ def colors_of(data, model, points):
     """The median colour [P, 3] in [0, 1] of every point over the training images that show it."""
     seen = []
     for image in model.images.values():
-        picture = np.asarray(Image.open(data / "images" / image.name)) / 255.0
+        picture = np.asarray(Image.open(data / f"images/{image.name}")) / 255.0
         camera = model.cameras[image.camera_id]
         assert picture.shape[:2] == (camera.height, camera.width)
         pixels, depth = project(image, camera, points)
@@ -125,7 +113,7 @@ def main():
     confess(options.data.parent)
     own = sorted(name for name in os.environ if name.startswith("GSBENCH"))
     print("environment", own, os.environ.get("PAINTER"))
-    model = pycolmap.Reconstruction(options.data / "sparse" / "0")
+    model = pycolmap.Reconstruction(options.data / "sparse/0")
     print("observations", sum(len(point.track.elements) for point in model.points3D.values()))
     if options.mode == "exit":
         sys.exit("Error: the painter has no paint")

@@ -3,6 +3,7 @@
 import json
 import logging
 import time
+from shlex import split
 
 import pytest
 
@@ -21,17 +22,10 @@ from tests.trials import write_trial
 ARMS = ("adc", "mine")
 
 # later words win: a trial of seconds
-TINY = [
-    *(
-        *SMALL,
-        "train.iterations=2",
-        "scene.views=9",
-        "scene.width=48",
-        "scene.height=36",
-        "init.count=200",
-    ),
-    *("raster=reference", "eval.lpips=[]", "eval.flip=false", "tracking=none", "densify=none"),
-]
+TINY = SMALL + split(
+    "train.iterations=2 scene.views=9 scene.width=48 scene.height=36 init.count=200 "
+    "raster=reference eval.lpips=[] eval.flip=false tracking=none densify=none"
+)
 
 
 def declaring(runs, primary, seed=0, **densify):
@@ -58,7 +52,7 @@ def test_trials_are_declared_with_the_metric_and_those_of_later_commands_are_add
 ):
     def say(*trials):
         declare(trials)
-        lines = (tmp_path / "exp" / "declared.jsonl").read_text().splitlines()
+        lines = (tmp_path / "exp/declared.jsonl").read_text().splitlines()
         return [json.loads(line)["trials"] for line in lines]
 
     first_seed, second_seed = (declaring(tmp_path, "psnr", seed) for seed in (0, 1))
@@ -75,7 +69,7 @@ def test_trials_are_declared_with_the_metric_and_those_of_later_commands_are_add
     assert sorted(after[-1].values()) == [[0], [0, 1, 2]]
     assert "first result" not in caplog.text
     # the time is that of the first declaration of the metric, which the verdict counts
-    record = tmp_path / "exp" / "declared.jsonl"
+    record = tmp_path / "exp/declared.jsonl"
     moments = iter(("2020-01-01", "2020-01-02"))
     lines = [
         json.loads(line) | {"time": f"{next(moments)}T00:00:00Z"}

@@ -10,6 +10,7 @@ import signal
 import sys
 from contextlib import contextmanager
 from pathlib import Path
+from shlex import split
 from types import SimpleNamespace
 from typing import Any
 
@@ -39,9 +40,16 @@ from tests.trials import bare_trial as trial
 
 SLURM = {
     **dict.fromkeys(("partition", "account", "qos", "mem_gb"), None),
-    **{"name": "slurm", "parallel": 2, "timeout_min": 60, "wait": False},
-    **{"cpus_per_trial": 4, "gpus_per_trial": 0, "signal_seconds": 90},
-    **{"setup": [], "sbatch": {}, "max_requeues": 5},
+    "name": "slurm",
+    "parallel": 2,
+    "timeout_min": 60,
+    "wait": False,
+    "cpus_per_trial": 4,
+    "gpus_per_trial": 0,
+    "signal_seconds": 90,
+    "setup": [],
+    "sbatch": {},
+    "max_requeues": 5,
 }
 
 
@@ -179,7 +187,7 @@ def machine(monkeypatch):
     monkeypatch.setattr(jobs, "run_one", run_one)
     monkeypatch.setattr(jobs, "take_slot", take_slot)
     monkeypatch.setattr(jobs, "Mirror", Mirrored)
-    for name in ("adopt_modules", "set_up_logging", "assign_gpu", "assign_threads"):
+    for name in split("adopt_modules set_up_logging assign_gpu assign_threads"):
         monkeypatch.setattr(jobs, name, note(name))
     monkeypatch.setattr(
         jobs, "stop_on_signals", lambda signals: note("signals")(*signals) or nothing()
@@ -292,7 +300,7 @@ def test_local_jobs_run_as_many_at_once_as_asked(tmp_path, monkeypatch, caplog, 
     executor = Jobs(tmp_path, [3, 1, 2, 1])
     monkeypatch.setattr(submitit, "LocalExecutor", lambda folder: executor)
     launch = LOCAL | {"timeout_min": minutes}
-    scenes = ["a", "a", "b", "b"]
+    scenes = split("a a b b")
     trials = [trial(tmp_path, seed, launch, scene={"name": scenes[seed]}) for seed in range(4)]
     mirror = Mirrored()
     outcomes = jobs.run_local(trials, mirror)
@@ -320,7 +328,7 @@ def test_ctrl_c_is_passed_on_to_the_processes_that_still_run(tmp_path):
 def test_submitits_link_is_removed_and_any_other_link_is_refused(tmp_path):
     values = trial_values(tmp_path, name="cluster")
     folder = job_folder(values)
-    assert folder == tmp_path / ".jobs" / "cluster"
+    assert folder == tmp_path / ".jobs/cluster"
     script = new_job_folder(values) / "2_submission.sh"
     script.write_text("#!/bin/bash\n")
     left = script.with_name(".submission_file_aaa46bf3.sh")
@@ -331,13 +339,13 @@ def test_submitits_link_is_removed_and_any_other_link_is_refused(tmp_path):
     (folder / "2_0_0_log.out").symlink_to(tmp_path / "elsewhere")
     with refusal(r"2_0_0_log\.out is a link"):
         job_folder(values)
-    (tmp_path / ".jobs" / "other").symlink_to(tmp_path)
+    (tmp_path / ".jobs/other").symlink_to(tmp_path)
     with refusal(r"other is a link"):
         job_folder(trial_values(tmp_path, name="other"))
 
 
 def test_through_a_link_no_file_of_another_folder_is_removed(tmp_path):
-    kept = tmp_path / "elsewhere" / ".submission_file_aaa46bf3.sh"
+    kept = tmp_path / "elsewhere/.submission_file_aaa46bf3.sh"
     kept.parent.mkdir()
     kept.symlink_to(tmp_path)
     runs = tmp_path / "runs"
@@ -437,8 +445,13 @@ def test_settings_become_options_of_slurm(tmp_path, monkeypatch):
 
     monkeypatch.setattr(submitit, "SlurmExecutor", Executor)
     expected = {
-        **{"folder": tmp_path, "requeues": 5, "job_name": "gsbench", "time": 60},
-        **{"cpus_per_task": 4, "signal_delay_s": 90, "array_parallelism": 2},
+        "folder": tmp_path,
+        "requeues": 5,
+        "job_name": "gsbench",
+        "time": 60,
+        "cpus_per_task": 4,
+        "signal_delay_s": 90,
+        "array_parallelism": 2,
     }
     slurm_jobs.make_executor(SLURM, tmp_path)
     assert given == expected
@@ -446,7 +459,8 @@ def test_settings_become_options_of_slurm(tmp_path, monkeypatch):
     sizes = {"gpus_per_trial": 1, "mem_gb": 16, "sbatch": {"constraint": "a100"}}
     slurm_jobs.make_executor(SLURM | more | sizes, tmp_path)
     assert given == expected | more | {
-        **{"gpus_per_node": 1, "mem": "16GB"},
+        "gpus_per_node": 1,
+        "mem": "16GB",
         "additional_parameters": {"constraint": "a100"},
     }
 

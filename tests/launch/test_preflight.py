@@ -90,7 +90,7 @@ def test_unfinished_trials_go_to_their_launcher_once_checked_and_planned(
     one, two = (trial(runs, seed, launch, **declaring) for seed in (0, 1))
     monkeypatch.setattr(batch, "_why_not_done", lambda trial: trial.folder != one.folder)
     write_results(one.folder, one.values)
-    left = runs / "store" / "init" / ".a.removed"
+    left = runs / "store/init/.a.removed"
     left.mkdir(parents=True)
     done, failed = run_batch([one, two, two])
     assert (done.folder, done.status, done.message) == (one.folder, "done", "psnr 20.5")
@@ -160,7 +160,9 @@ def test_each_missing_folder_is_named_once_with_the_way_to_get_it(tmp_path, monk
         trial(tmp_path, **{group: {"name": "a", "weights": folder}}) for group, folder in named
     ]
     assert [line.partition(":")[0] for line in missing_weights(trials)] == [
-        *("eval.weights=y", "eval.weights=z", "init.weights=z")
+        "eval.weights=y",
+        "eval.weights=z",
+        "init.weights=z",
     ]
     assert missing_folders(trials) == missing_weights(trials)
 

@@ -40,13 +40,13 @@ def sweep(tmp_path):
 
 def test_states_speed_time_left_and_leader(sweep, tmp_path):
     running = sweep["volumetric", 2]
-    building = tmp_path / "store" / "train" / "now"
+    building = tmp_path / "store/train/now"
     rows = [{"step": 50, "seconds": 5.0}, {"step": 75, "seconds": 10.0}]
     write_lines(building / "metrics.jsonl", rows)
     write(running / "building.json", {"stage": "train", "folder": str(building)})
     with hold(running / ".lock", "a trial"):
         frame = progress_frame(tmp_path, "swept").set_index("arm")
-    counts = frame[["done", "running", "failed", "waiting"]]
+    counts = frame[split("done running failed waiting")]
     assert counts.loc["a_init-adc"].to_list() == [3, 0, 0, 0]
     assert counts.loc["a_init-volumetric"].to_list() == [1, 1, 1, 0]
     assert frame.loc["a_init-volumetric", "iterations_per_second"] == pytest.approx(7.5)
@@ -90,7 +90,7 @@ def test_an_arm_of_several_settings_is_named_with_their_values(tmp_path, planned
             "/".join(folder.parts[-3:]): {"overrides": own, "cwd": ".", "time": 0.0}
             for folder, own in words.items()
         }
-        write(tmp_path / "swept" / "plan.json", {"trials": trials})
+        write(tmp_path / "swept/plan.json", {"trials": trials})
         arms = ["a_init-adc[start=7]", "a_init-adc[start=5]"]
     progress = progress_of(tmp_path / "swept")
     assert {name: cell["waiting"] for name, cell in progress.cells.items()} == {

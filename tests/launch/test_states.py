@@ -99,7 +99,7 @@ def test_the_state_of_a_submitted_trial_is_that_of_its_job(
         assert states_of_experiment(tmp_path / "x") == []
         planned = PlannedTrial(overrides=("a=1",), cwd="", time=5)
         record = PlanFile(trials={"/".join(one.folder.parts[-3:]): planned})
-        write(tmp_path / "x" / "plan.json", record.to_json())
+        write(tmp_path / "x/plan.json", record.to_json())
         (found,) = states_of_experiment(tmp_path / "x")
         assert (found.state, found.since) == ("missing", 5)
         assert found.note == "never started; Slurm job 7_1 has ended, log: a.log"
@@ -126,7 +126,11 @@ def test_states_have_the_time_of_the_file_that_tells_them(tmp_path, monkeypatch)
         unknown = {state.folder: state for state in states_of_experiment(tmp_path / "x")}
     found = [seen[one.folder] for one in (done, damaged, failed, running, stopped)]
     assert {one.state: one.since for one in found} == {
-        **{"done": 1, "damaged": 2, "failed": 3, "running": since, "partial": 4}
+        "done": 1,
+        "damaged": 2,
+        "failed": 3,
+        "running": since,
+        "partial": 4,
     }
     assert "results.json is not JSON" in found[1].note
     assert [found[2].note, found[4].note] == ["no luck", "stopped"]

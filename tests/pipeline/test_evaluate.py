@@ -40,7 +40,9 @@ def parts_of(fps, evaluator=None, **changes):
         "device": torch.device("cpu"),
         "train": SimpleNamespace(background=(0.1, 0.2, 0.3)),
         "eval": SimpleNamespace(maps=False, fps=fps),
-        **{"measured_earlier": [], "user_code": UserCode(), "program": None},
+        "measured_earlier": [],
+        "user_code": UserCode(),
+        "program": None,
     }
     return SimpleNamespace(**parts | changes)
 
@@ -126,7 +128,7 @@ def test_an_evaluation_measures_the_pixels_of_its_png_files(tmp_path, truth, tin
 
     means = {"last": 0.0, "earlier": 0.0}
     for view in scene.test:
-        picture = np.asarray(Image.open(folder / "renders" / view.name)).astype(float)
+        picture = np.asarray(Image.open(folder / f"renders/{view.name}")).astype(float)
         assert_array_equal(picture, rendered(truth, view))
         counted = np.ones((32, 40), dtype=bool) if view.mask is None else view.mask
         row = rows[view.name]
@@ -149,9 +151,9 @@ def test_an_evaluation_measures_the_pixels_of_its_png_files(tmp_path, truth, tin
     assert metrics["at"]["7"]["num_gaussians"] == 50
     assert metrics["at"]["7"]["metrics"]["psnr"] == pytest.approx(means["earlier"], abs=1e-3)
     assert len(list((folder / "renders").iterdir())) == 2
-    figure = np.asarray(Image.open(folder / "figures" / "ellipsoids.png"))[:32].astype(int)
+    figure = np.asarray(Image.open(folder / "figures/ellipsoids.png"))[:32].astype(int)
     unlike = [
-        np.abs(figure - np.asarray(Image.open(folder / "renders" / view.name))).mean()
+        np.abs(figure - np.asarray(Image.open(folder / f"renders/{view.name}"))).mean()
         for view in scene.test
     ]
     assert figure.shape == (32, 40, 3)

@@ -182,4 +182,4 @@ def test_source_files_are_the_users_files_of_a_capture(tmp_path):
     with_model = source_files(replace(capture, model=tmp_path / "model"), store)
     assert with_model[:2] == images
     assert {path.name for path in with_model[2:]} >= model
-    assert source_files(replace(capture, images=store.root / "scene" / "key"), store) == []
+    assert source_files(replace(capture, images=store.root / "scene/key"), store) == []

@@ -2,6 +2,7 @@
 
 import logging
 from dataclasses import replace
+from shlex import split
 from types import SimpleNamespace
 
 import pytest
@@ -66,7 +67,7 @@ def test_a_trial_runs_unless_it_is_done_and_one_process_at_a_time(tmp_path, monk
 )
 def test_a_failure_is_recorded_and_raised(tmp_path, monkeypatch, error, kind, message, bad_input):
     monkeypatch.setattr("time.time", lambda: 12.5)
-    folder = TrialFolder(tmp_path / "a" / "b" / "c" / "d")
+    folder = TrialFolder(tmp_path / "a/b/c/d")
     folder.path.mkdir(parents=True)
     for _ in range(2):
         with pytest.raises(kind), _recorded_failures({"seed": 4, "device": "cuda"}, folder):
@@ -74,7 +75,10 @@ def test_a_failure_is_recorded_and_raised(tmp_path, monkeypatch, error, kind, me
         failure = folder.failure()
         assert failure.message.startswith(message)
         assert (failure.error, failure.seed, failure.time, failure.bad_input) == (
-            *(kind.__name__, 4, 12.5, bad_input),
+            kind.__name__,
+            4,
+            12.5,
+            bad_input,
         )
         assert type(error).__name__ in failure.traceback
 
@@ -135,8 +139,12 @@ def made(monkeypatch):
     monkeypatch.setattr(trials, "evaluate_step", note("evaluate", step(EVALUATE)))
     initializer = SimpleNamespace(needs_reference=lambda capture: state.needs)
     state.parts = SimpleNamespace(
-        **{"scene": SimpleNamespace(transparent="white"), "initializer": initializer},
-        **{"threads": 3, "program": None, "user_code": "code", "reader": None},
+        scene=SimpleNamespace(transparent="white"),
+        initializer=initializer,
+        threads=3,
+        program=None,
+        user_code="code",
+        reader=None,
     )
     return state
 
@@ -147,15 +155,19 @@ def test_the_steps_of_photographs_follow_each_other(made, tmp_path):
     assert [one.stage for one in own.steps()] == [INIT, TRAIN, GROUND_TRUTH, EVALUATE]
     assert own.photographs == own.capture == "given"
     init = step(INIT, of=str(made.parts.initializer))
-    assert [word for word, *_ in made.told] == [
-        *("read", "masking", "normalizing", "init", "train", "truth", "evaluate")
-    ]
+    assert [word for word, *_ in made.told] == split(
+        "read masking normalizing init train truth evaluate"
+    )
     by_name = {name: rest for name, *rest in made.told}
     assert by_name["read"] == [None]
     assert by_name["masking"] == ["given", "white"]
     assert by_name["init"] == ["given", made.parts.initializer, None, "code"]
     assert [given if not isinstance(given, Step) else given.key for given in own.views] == [
-        *("views", store, "given", init.key, made.parts.scene)
+        "views",
+        store,
+        "given",
+        init.key,
+        made.parts.scene,
     ]
     assert by_name["train"] == [own.views, made.parts]
     assert by_name["truth"] == [own.views]
@@ -208,8 +220,8 @@ def test_files_of_the_steps_are_published_in_the_trials_folder(tmp_path, normali
             write(place / name, f"{stage.name} {name}")
         entries[stage.name] = SimpleNamespace(path=place)
     gaussians = random_gaussians(5, dtype=torch.float32)
-    write_ply(gaussians, tmp_path / "train" / "point_cloud.ply")
-    (tmp_path / "init" / trials.PICTURE_FILE).write_text("init picture.png")
+    write_ply(gaussians, tmp_path / "train/point_cloud.ply")
+    (tmp_path / f"init/{trials.PICTURE_FILE}").write_text("init picture.png")
     folder = tmp_path / "trial"
     folder.mkdir()
     published = _publish(folder, entries, normalization)
@@ -217,8 +229,8 @@ def test_files_of_the_steps_are_published_in_the_trials_folder(tmp_path, normali
         **{name: f"train {name}" for name in ("lineage.npz", "metrics.jsonl", "events.jsonl")},
         **{name: f"evaluate {name}" for name in content[EVALUATE].split()[:4]},
         **{f"ground_truth/{name}": f"ground_truth {name}" for name in ("a.png", "b.png")},
-        **{"masks/b.png": "ground_truth masks/b.png"},
-        **{"figures/initial_cloud.png": "init picture.png"},
+        "masks/b.png": "ground_truth masks/b.png",
+        "figures/initial_cloud.png": "init picture.png",
     }
     found = {path.relative_to(folder).as_posix() for path in published}
     assert found == {*texts, "point_cloud.ply"}
@@ -227,7 +239,7 @@ def test_files_of_the_steps_are_published_in_the_trials_folder(tmp_path, normali
     model = read_ply(folder / "point_cloud.ply")
     given = gaussians.means / normalization.scale + torch.tensor(normalization.center)
     assert_close(model.means, given.float())
-    is_linked = (folder / "point_cloud.ply").samefile(tmp_path / "train" / "point_cloud.ply")
+    is_linked = (folder / "point_cloud.ply").samefile(tmp_path / "train/point_cloud.ply")
     assert is_linked == (normalization is IDENTITY)
 
 

@@ -19,7 +19,7 @@ from tests.helpers import read_json, refusal
 
 @pytest.mark.parametrize("code", [0, None, 3, "text"])
 def test_code_that_ends_the_process_counts_as_a_failure(code, tmp_path):
-    folder = TrialFolder(tmp_path / "a" / "b" / "c" / "d" / "x")
+    folder = TrialFolder(tmp_path / "a/b/c/d/x")
     folder.path.mkdir(parents=True)
     with (
         pytest.raises(TrainingError, match="ended the process"),
@@ -32,19 +32,19 @@ def test_code_that_ends_the_process_counts_as_a_failure(code, tmp_path):
 @pytest.mark.parametrize(
     "words, here, said",
     [
-        (["raster=auto"], True, None),
-        (["raster=cpu"], True, None),
-        (["raster=gsplat"], False, None),  # the machine on which it will run may have a GPU
-        (["raster=gsplat"], True, "raster=gsplat runs on device=cuda"),
-        (["raster=gsplat", "densify=taming"], False, "densify=taming .*; take raster=reference or"),
-        (["raster=auto", "densify=taming"], False, None),
-        (["raster=cpu", "densify=taming"], True, None),
+        ("raster=auto", True, None),
+        ("raster=cpu", True, None),
+        ("raster=gsplat", False, None),  # the machine on which it will run may have a GPU
+        ("raster=gsplat", True, "raster=gsplat runs on device=cuda"),
+        ("raster=gsplat densify=taming", False, "densify=taming .*; take raster=reference or"),
+        ("raster=auto densify=taming", False, None),
+        ("raster=cpu densify=taming", True, None),
     ],
 )
 def test_a_rasterizer_that_cannot_run_or_lacks_a_needed_feature_is_refused_before_any_work(
     words, here, said
 ):
-    parts = Parts(compose_one(["scene=courtyard", "device=cpu", *words]).values)
+    parts = Parts(compose_one(["scene=courtyard", "device=cpu", *split(words)]).values)
     with refusal(said):
         parts.check(here)
 
@@ -195,7 +195,7 @@ def test_code_whose_version_results_cannot_record_is_named(tmp_path, monkeypatch
     ]
 
 
-@pytest.mark.parametrize("place", ["scene", "trial", "log.txt", "store/views"])
+@pytest.mark.parametrize("place", split("scene trial log.txt store/views"))
 def test_nothing_is_written_through_a_link_in_the_runs_folder(tmp_path, place):
     """A runs folder from somebody else could have links to any file."""
     trial = compose_one(["scene=courtyard", f"runs={tmp_path / 'runs'}"])

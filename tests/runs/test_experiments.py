@@ -31,21 +31,21 @@ def test_experiments_are_folders_that_are_not_hidden(tmp_path):
     for name in ("b", "a/scene/arm/trial", ".hidden", "store", "a/scene/.hidden/trial"):
         (tmp_path / name).mkdir(parents=True)
     (tmp_path / "file").touch()
-    (tmp_path / "a" / "scene" / "file").touch()
+    (tmp_path / "a/scene/file").touch()
     assert list_experiments(tmp_path) == ["a", "b"]
-    assert list(trial_folders(tmp_path / "a")) == [str(tmp_path / "a" / "scene" / "arm" / "trial")]
+    assert list(trial_folders(tmp_path / "a")) == [str(tmp_path / "a/scene/arm/trial")]
     assert experiment_home(tmp_path, "b") == tmp_path / "b"
     with refusal(r"no experiment 'c' in .*; there: a, b"):
         experiment_home(tmp_path, "c")
 
 
 def test_the_folder_of_an_experiment_is_made_unless_it_is_a_link(tmp_path):
-    make_home(tmp_path / "runs" / "x")
-    make_home(tmp_path / "runs" / "x")
-    assert (tmp_path / "runs" / "x").is_dir()
-    (tmp_path / "runs" / "link").symlink_to(tmp_path / "runs" / "x")
+    make_home(tmp_path / "runs/x")
+    make_home(tmp_path / "runs/x")
+    assert (tmp_path / "runs/x").is_dir()
+    (tmp_path / "runs/link").symlink_to(tmp_path / "runs/x")
     with refusal("follows no links"):
-        make_home(tmp_path / "runs" / "link")
+        make_home(tmp_path / "runs/link")
 
 
 def tuning(tmp_path, **changes):

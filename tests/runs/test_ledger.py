@@ -26,7 +26,12 @@ from tests.helpers import refusal
 
 TIME = "2026-11-27T06:00:00Z"
 OPENED = Opened(
-    **{"time": TIME, "metric": "psnr", "sign": 1, "least": 0.1, "ideas": 3, "rate": 0.1},
+    time=TIME,
+    metric="psnr",
+    sign=1,
+    least=0.1,
+    ideas=3,
+    rate=0.1,
     seeds=(0, 1, 2),
     words=("densify=adc",),
     keys={"garden": "garden/sfm-adc/00000000"},
@@ -68,7 +73,7 @@ ENTRIES = [
 
 @pytest.fixture
 def home(tmp_path):
-    home = tmp_path / "runs" / "night"
+    home = tmp_path / "runs/night"
     home.mkdir(parents=True)
     begin_ledger(home, OPENED)
     for entry in ENTRIES:

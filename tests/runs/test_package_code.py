@@ -128,7 +128,7 @@ def changed(before):
 
 def test_the_next_process_notices_an_edit_but_not_a_comment(package):
     before = states_of([*CODE_OF_STAGE["train"], "gone"])
-    loss = package / "train" / "loss.py"
+    loss = package / "train/loss.py"
     text = loss.read_text()
     loss.write_text(text + "# more\n")
     again()
@@ -147,7 +147,7 @@ def test_the_next_process_notices_an_edit_but_not_a_comment(package):
 def test_the_digest_of_a_package_is_the_recorded_one(tmp_path, monkeypatch):
     """Recorded before the code of the digests was moved: stores of edited checkouts stay valid."""
     monkeypatch.setattr(package_code, "PACKAGE", tmp_path)
-    (tmp_path / "pack" / "inner").mkdir(parents=True)
+    (tmp_path / "pack/inner").mkdir(parents=True)
     for name in ("pack/b.py", "pack/inner/deep.py", "one.py"):
         (tmp_path / name).write_text(
             f"{name} ("
@@ -170,9 +170,9 @@ def test_released_code_adds_nothing_to_keys(package, monkeypatch):
         released = states_of(CODE_OF_STAGE["train"])
     assert set(released.values()) == {AS_RELEASED}
     assert edited(released) == {}
-    with (package / "densify" / "adc.py").open("a") as file:
+    with (package / "densify/adc.py").open("a") as file:
         file.write("# a comment\n")
-    (package / "eval" / "ssim.py").write_text("C1 = 2\n")
+    (package / "eval/ssim.py").write_text("C1 = 2\n")
     again()
     assert list(edited(states_of(CODE_OF_STAGE["train"]))) == changed(released) == ["eval/ssim.py"]
     # the next release, for which the version of the stage was bumped, or the numbers are the same
@@ -184,7 +184,7 @@ def test_released_code_adds_nothing_to_keys(package, monkeypatch):
 def test_an_edit_while_this_process_works_is_noticed(package):
     states_of(["train", "scene"])
     assert changed_since_asked(["train", "scene"]) == []
-    with (package / "train" / "loss.py").open("a") as file:
+    with (package / "train/loss.py").open("a") as file:
         file.write("MORE = 1\n")
     assert changed_since_asked(["train", "scene"]) == ["train"]
 

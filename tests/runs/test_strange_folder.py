@@ -38,7 +38,7 @@ def outside(tmp_path):
 @pytest.fixture
 def trial(tmp_path):
     """A finished trial in the runs folder, with results alone."""
-    folder = tmp_path / "runs" / "x" / "s" / "a-b" / "01234567-seed0"
+    folder = tmp_path / "runs/x/s/a-b/01234567-seed0"
     write_results(folder, trial_values("runs", name="x", scene="s", init="a", densify="b"))
     return folder
 
@@ -137,7 +137,7 @@ def test_no_link_and_no_pipe_is_read(make, trial, outside):
 
 def test_the_store_builds_nothing_in_a_linked_folder(tmp_path, outside):
     store, step = (
-        Store(tmp_path / "runs" / "store"),
+        Store(tmp_path / "runs/store"),
         Step(TOY, toy_inputs(1), lambda folder: build(folder, 1, 0.0)),
     )
     partial = store.partial(step.stage, step.key)
@@ -160,11 +160,11 @@ def _edited(made):
 
 def _linked(made):
     (made / "lines.txt").unlink()
-    (made / "lines.txt").symlink_to(made.parents[3] / "outside" / "private")
+    (made / "lines.txt").symlink_to(made.parents[3] / "outside/private")
 
 
 def _linked_beside(made):
-    (made / "more.txt").symlink_to(made.parents[3] / "outside" / "private")
+    (made / "more.txt").symlink_to(made.parents[3] / "outside/private")
 
 
 @pytest.mark.parametrize(
@@ -179,7 +179,7 @@ def _linked_beside(made):
 )
 def test_a_stored_result_that_is_shown_is_as_it_was_written(tmp_path, outside, spoil, words):
     """`gsbench view` and `gsbench export` read the initial model of somebody's trial."""
-    store = Store(tmp_path / "runs" / "store")
+    store = Store(tmp_path / "runs/store")
     step = Step(TOY, toy_inputs(1), lambda folder: build(folder, 1, 0.0))
     made = store.get(step).path
     assert store.existing(TOY, step.key) == made
@@ -196,14 +196,14 @@ def test_a_stored_result_that_is_shown_is_as_it_was_written(tmp_path, outside, s
 )
 def test_a_folder_that_gsbench_could_not_have_made_is_no_trial(tmp_path, trial, caplog, name):
     trial.parents[1].rename(trial.parents[2] / name)
-    assert read_experiment(tmp_path / "runs" / "x").trials == ()
+    assert read_experiment(tmp_path / "runs/x").trials == ()
     assert "gsbench gives no folder such a name" in caplog.text
 
 
 def test_links_of_a_killed_build_are_removed_and_their_targets_stay(tmp_path, outside):
     partial = tmp_path / "partial"
     (partial / "work").mkdir(parents=True)
-    (partial / "work" / "images").symlink_to(outside)
+    (partial / "work/images").symlink_to(outside)
     (partial / "kept").write_text("")
     remove_special_files(partial)
     assert sorted(path.name for path in partial.iterdir()) == ["kept", "work"]

@@ -65,8 +65,8 @@ def test_the_code_of_a_users_class_includes_all_allowed_modules(home):
 
 
 def test_a_package_is_hashed_by_all_its_code_files(home):
-    (home / "pack" / "inner").mkdir(parents=True)
-    (home / "pack" / "folder.py").mkdir()
+    (home / "pack/inner").mkdir(parents=True)
+    (home / "pack/folder.py").mkdir()
     files = {
         "mine.py": CLASS,
         "inner/deep.py": "X = 1\n",
@@ -74,16 +74,16 @@ def test_a_package_is_hashed_by_all_its_code_files(home):
         "notes.txt": "a",
     }
     for name, text in files.items():
-        (home / "pack" / name).write_text(text)  # without __init__.py: a namespace
+        (home / f"pack/{name}").write_text(text)  # without __init__.py: a namespace
     first = module_digest("pack")
-    (home / "pack" / "notes.txt").write_text("b")
+    (home / "pack/notes.txt").write_text("b")
     assert module_digest("pack") == first
-    (home / "pack" / "inner" / "deep.py").write_text('"""A docstring."""\nX  = 1  # a comment\n')
+    (home / "pack/inner/deep.py").write_text('"""A docstring."""\nX  = 1  # a comment\n')
     assert module_digest("pack") == first
     for name, other in {"inner/deep.py": "X = 2\n", "inner/kernel.cu": "int x;\n\n"}.items():
-        (home / "pack" / name).write_text(other)
+        (home / f"pack/{name}").write_text(other)
         assert module_digest("pack") != first
-        (home / "pack" / name).write_text(files[name])
+        (home / f"pack/{name}").write_text(files[name])
     assert module_digest("pack") == first
 
 
@@ -118,7 +118,7 @@ def test_imported_modules_that_are_not_named_are_listed(home):
     (home / "own_code.py").write_text(
         "import sys\nsys.path.insert(0, 'lib')\nimport late, json.tool, helper\n" + CLASS
     )
-    write(home / "lib" / "late.py", b"")
+    write(home / "lib/late.py", b"")
     (home / "helper.py").touch()
     before = set(sys.modules)
     importlib.import_module("own_code")
@@ -144,7 +144,7 @@ def test_a_new_file_is_found_even_if_its_folder_keeps_its_time(home):
 
 def test_the_hash_of_a_configuration_with_a_users_code_is_the_recorded_one(home):
     """Recorded before its code was moved: folders of trials and results in stores stay valid."""
-    (home / "pack" / "inner").mkdir(parents=True)
+    (home / "pack/inner").mkdir(parents=True)
     for name in ("own_code.py", "pack/mine.py", "pack/inner/kernel.cu"):
         (home / name).write_text(f"{name} (")  # Python's versions write syntax trees differently
     classes = {

@@ -34,7 +34,7 @@ def test_the_address_is_the_configured_one_else_the_environments_else_the_runs_f
 @pytest.mark.parametrize("kind", ["sqlite", "http"])
 @pytest.mark.slow
 def test_sync_sends_nothing_to_a_tracker_that_was_not_typed(kind, tmp_path, monkeypatch, capfd):
-    runs, target = tmp_path / "runs", tmp_path / "elsewhere" / "theirs.db"
+    runs, target = tmp_path / "runs", tmp_path / "elsewhere/theirs.db"
     target.parent.mkdir()
     address = f"sqlite:///{target}" if kind == "sqlite" else f"http://127.0.0.1:{free_port()}"
     ended_trial(runs, name="theirs", uri=address)
@@ -98,7 +98,7 @@ def test_a_link_among_the_artifacts_is_not_followed(tmp_path):
     client = connect(None, runs)
     mirror_trial(options(), folder, values)
     (made,) = found_runs(client, "theirs")
-    shown = runs / "mlartifacts" / "theirs" / made.info.run_id / "artifacts" / "config.yaml"
+    shown = runs / f"mlartifacts/theirs/{made.info.run_id}/artifacts/config.yaml"
     shown.unlink()
     shown.symlink_to(private)
     change_json(folder / STATE, complete=None)

@@ -127,7 +127,7 @@ def test_a_long_description_is_cut_at_a_line(tmp_path):
     assert text.splitlines()[-1] == "`gsbench report swept` shows more."
 
 
-@pytest.mark.parametrize("version", ["2.22.0", "3.1.0", "3.170.0", "4.0.0"])
+@pytest.mark.parametrize("version", split("2.22.0 3.1.0 3.170.0 4.0.0"))
 def test_other_versions_of_mlflow_get_the_plain_page(version):
     assert addresses("http://a/", "7", version) == {"experiment": "http://a/#/experiments/7"}
 
@@ -139,7 +139,7 @@ def test_portrait_and_landscape_pictures_keep_their_sizes(runs):
     for kind in ("renders", "ground_truth"):
         (folder / kind).mkdir()
         for name, size in sizes.items():
-            Image.new("RGB", size).save(folder / kind / f"{name}.png")
+            Image.new("RGB", size).save(folder / f"{kind}/{name}.png")
     assert mirror_trial(options(), folder, values)
     client = connect(None, runs)
     run = run_of(client, 2000)

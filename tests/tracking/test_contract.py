@@ -212,7 +212,7 @@ def finished(runs, psnr=20.0):
     write_trial(folder, values, psnr=psnr, metrics_at=AT)
     for kind, value in (("renders", 200), ("ground_truth", 50)):
         (folder / kind).mkdir(exist_ok=True)
-        Image.fromarray(np.full((4, 6, 3), value, np.uint8)).save(folder / kind / "view 1#.png")
+        Image.fromarray(np.full((4, 6, 3), value, np.uint8)).save(folder / f"{kind}/view 1#.png")
     return folder, values
 
 
@@ -321,7 +321,7 @@ def test_curves_are_shown_while_the_trial_runs(shown, tmp_path):
     write(folder / "building.json", training)
     seen = []
     for text in ('{"step": 10, "loss": 0.5}\n{"step": 20, "lo', 'ss": 0.25}\n', ""):
-        with (tmp_path / "building" / "metrics.jsonl").open("a") as stream:
+        with (tmp_path / "building/metrics.jsonl").open("a") as stream:
             stream.write(text)
         run.add_curves()
         curve = {s: v for (key, s), v in shown.one()["metrics"].items() if key == "train/loss"}

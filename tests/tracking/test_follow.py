@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from queue import Queue
+from shlex import split
 from types import SimpleNamespace
 from typing import Any
 
@@ -193,7 +194,7 @@ def words(told):
     return [word for word, *_ in told]
 
 
-ENDED = ["log", "note", "files", "FINISHED"]
+ENDED = split("log note files FINISHED")
 
 
 def test_a_tracker_that_fails_frees_the_trial(told, tmp_path, monkeypatch):
@@ -399,7 +400,7 @@ def test_the_process_ends_at_once_with_the_reason_in_its_last_line(monkeypatch, 
         if error:
             raise error
 
-    monkeypatch.setattr(sys, "argv", ["-c", "follow", "0.5", "30"])
+    monkeypatch.setattr(sys, "argv", split("-c follow 0.5 30"))
     monkeypatch.setattr(mirror, "_follow", follow)
     monkeypatch.setattr(mirror, "_read_input", lambda lines, patience: given.append(patience))
     monkeypatch.setattr(os, "_exit", ended.append)

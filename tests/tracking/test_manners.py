@@ -75,4 +75,4 @@ def test_a_moved_runs_folder_is_mirrored_again_from_its_files(runs, tmp_path):
         command, env=environment, capture_output=True, text=True, timeout=240, check=False
     )
     assert f"mirrored {TrialFolder(folder).label}" in done.stdout.splitlines(), done.stderr
-    assert list((moved / "mlartifacts" / "tracked").rglob("results.json"))
+    assert list((moved / "mlartifacts/tracked").rglob("results.json"))

@@ -115,24 +115,6 @@ def test_one_process_mirrors_all_trials_of_a_sweep(runs):
 
 
 @pytest.mark.slow
-def test_a_crash_of_the_mirror_is_reported_and_the_next_trial_gets_another_mirror(runs, caplog):
-    for seed in (6, 7):
-        folder, values = begun_trial(runs, seed)
-        with following(options(), folder):
-            write_trial(folder, values)
-            if seed == 6:
-                for child in psutil.Process().children():
-                    child.kill()
-    (said,) = [
-        record.getMessage() for record in caplog.records if record.levelno == logging.WARNING
-    ]
-    assert "the mirror crashed (SIGKILL" in said
-    assert "gsbench sync" in said
-    run = run_of(connect(None, runs), 7)
-    assert run.info.status == "FINISHED"
-
-
-@pytest.mark.slow
 def test_the_trials_process_loads_no_mlflow(runs):
     """So MLflow cannot crash the process, and takes no memory beside a training."""
     folder, _ = begun_trial(runs, seed=8)

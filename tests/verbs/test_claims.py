@@ -96,18 +96,18 @@ def test_json_has_the_facts_of_the_text(pilots, capsys, experiment):
 @pytest.mark.parametrize(
     "words, message",
     [
-        (split("exp --metric psn"), "unknown metric"),
-        (split("exp --metric gaussians"), "not counts"),
-        (split("exp --difference 0"), "above 0"),
-        (["alone"], "one arm"),
-        (["apart"], r"no trials of sfm-adc and sfm-volumetric can be paired in PSNR"),
-        (split("exp --metric cc_gain"), "unknown metric|--difference is needed"),
-        (["nothing"], "no experiment"),
+        ("exp --metric psn", "unknown metric"),
+        ("exp --metric gaussians", "not counts"),
+        ("exp --difference 0", "above 0"),
+        ("alone", "one arm"),
+        ("apart", r"no trials of sfm-adc and sfm-volumetric can be paired in PSNR"),
+        ("exp --metric cc_gain", "unknown metric|--difference is needed"),
+        ("nothing", "no experiment"),
     ],
 )
 def test_bad_input_of_plan_is_refused(pilots, words, message):
     with refusal(message):
-        plan(words, pilots)
+        plan(split(words), pilots)
 
 
 # ---- ablate

@@ -144,7 +144,7 @@ def test_doctor_says_what_is_missing(monkeypatch):
 def test_a_full_disk_is_noted(tmp_path, monkeypatch):
     for free, verdict in ((machine.LITTLE_SPACE - 1, "note"), (machine.LITTLE_SPACE, "ok")):
         monkeypatch.setattr("shutil.disk_usage", lambda _, free=free: SimpleNamespace(free=free))
-        assert next(machine.check_runs(tmp_path / "a" / "b")).verdict == verdict
+        assert next(machine.check_runs(tmp_path / "a/b")).verdict == verdict
 
 
 def test_proofs_are_listed_and_rasterizers_of_a_gpu_without_one_noted(gpus, monkeypatch):
@@ -176,31 +176,31 @@ def test_proofs_are_listed_and_rasterizers_of_a_gpu_without_one_noted(gpus, monk
 @pytest.mark.parametrize(
     "words, message",
     [
-        (["--json"], "belong to --prove"),
-        (["--raster", "cpu"], "belong to --prove"),
-        (["--device", "cpu"], "belong to --prove"),
+        ("--json", "belong to --prove"),
+        ("--raster cpu", "belong to --prove"),
+        ("--device cpu", "belong to --prove"),
     ],
 )
 def test_options_of_a_proof_need_prove(tmp_path, words, message):
     with refusal(message):
-        machine.doctor(words, tmp_path)
+        machine.doctor(split(words), tmp_path)
 
 
 @pytest.mark.parametrize(
     "words, message",
     [
-        (["--size", "15x20"], "a size is WIDTHxHEIGHT"),
-        (["--size", "500"], "a size is WIDTHxHEIGHT"),
-        (["--count", "0"], "--count: must be a whole number in "),
-        (["--count", "5,x"], "--count: must be a whole number in "),
-        (["--ply", "nowhere.ply"], "nowhere.ply does not exist"),
-        (["--kernels"], "has no place in the table: add --json"),
-        (["--raster", "cpu,auto"], "name those to time"),
+        ("--size 15x20", "a size is WIDTHxHEIGHT"),
+        ("--size 500", "a size is WIDTHxHEIGHT"),
+        ("--count 0", "--count: must be a whole number in "),
+        ("--count 5,x", "--count: must be a whole number in "),
+        ("--ply nowhere.ply", "nowhere.ply does not exist"),
+        ("--kernels", "has no place in the table: add --json"),
+        ("--raster cpu,auto", "name those to time"),
     ],
 )
 def test_bad_words_of_bench_are_refused(words, message):
     with refusal(message):
-        machine.bench(words)
+        machine.bench(split(words))
 
 
 def test_bench_times_what_the_words_name(monkeypatch, capsys):
@@ -218,9 +218,13 @@ def test_bench_times_what_the_words_name(monkeypatch, capsys):
     *lists, named = asked[0]
     assert lists == [["cpu", "reference"], [(16, 32), (32, 16)], [7, 8]]
     assert named == {
-        **{"ply": None, "repeats": 3, "threads": None, "memory": False},
-        **{"scene": "trained", "kernels": False},
+        "ply": None,
+        "repeats": 3,
+        "threads": None,
+        "memory": False,
+        "scene": "trained",
+        "kernels": False,
     }
     header, line = capsys.readouterr().out.splitlines()
-    assert header.split() == ["raster", "size", "count", "step_ms", "step_ratio"]
-    assert line.split() == ["cpu", "16x32", "7", "1.2", "0.50"]
+    assert header.split() == split("raster size count step_ms step_ratio")
+    assert line.split() == split("cpu 16x32 7 1.2 0.50")

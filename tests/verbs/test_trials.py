@@ -220,7 +220,7 @@ def test_a_trial_whose_configuration_has_changed_takes_the_place_of_the_old_one(
 
 
 def test_retry_of_a_trial_without_a_plan_uses_its_configuration(folders, runs):
-    (runs / "x" / "plan.json").unlink()
+    (runs / "x/plan.json").unlink()
     again = trials.recompose(folders[1], None, runs, [], str(runs.parent))
     assert TrialFolder.of(again.values).path == folders[1]
     assert again.values == compose_one(split("name=x densify=adc seed=1")).values
@@ -240,7 +240,7 @@ def test_a_trial_from_renders_is_entered_by_its_own_command(folders, runs):
 
 
 def test_a_second_retry_without_a_plan_runs_the_same_trial(folders, runs, monkeypatch):
-    (runs / "x" / "plan.json").unlink()
+    (runs / "x/plan.json").unlink()
     ran = []
 
     def killed(given):

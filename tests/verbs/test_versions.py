@@ -51,11 +51,11 @@ def begun(tmp_path, monkeypatch, trainings):
     arms = {"courtyard": ("sfm-adc", "sfm-adc")}
     declaration = declare_gate("psnr", "0.1", arms, range(3), {"eval": {"extra": {}}})
     for commit, _, _ in COMMITS:
-        (tmp_path / commit / "sub").mkdir(parents=True)
-    write(tmp_path / COMMITS[1][0] / "src" / "gsbench" / "__init__.py", b"")
+        (tmp_path / f"{commit}/sub").mkdir(parents=True)
+    write(tmp_path / COMMITS[1][0] / "src/gsbench/__init__.py", b"")
     trees = SimpleNamespace(tree=lambda commit: tmp_path / commit, prefix="sub")
     return CommitSearch(
-        tmp_path / "runs" / "search",
+        tmp_path / "runs/search",
         ["scene=courtyard"],
         frozenset({"courtyard"}),
         declaration,

@@ -182,7 +182,7 @@ def test_a_program_runs_with_the_given_time_limit(views, tmp_path, monkeypatch, 
         step.build(tmp_path)
     ((command, log_file, output, environment, seconds),) = given
     assert command[:2] == [sys.executable, str(tmp_path / "program.py")]
-    assert (log_file, output) == (tmp_path / "trainer.log", tmp_path / "work" / "output")
+    assert (log_file, output) == (tmp_path / "trainer.log", tmp_path / "work/output")
     assert environment["SET"] == "5"
     assert seconds == limit
 
@@ -257,7 +257,7 @@ def test_renders_of_a_program_are_collected_for_the_test_views(views, tmp_path, 
         tmp_path
     )
     for view in views.scene.test:
-        assert (np.asarray(Image.open(tmp_path / "renders" / view.name)) == 255 - view.image).all()
+        assert (np.asarray(Image.open(tmp_path / f"renders/{view.name}")) == 255 - view.image).all()
     summary = read_json(tmp_path / "training.json")
     assert (summary["evaluated_from"], summary["num_gaussians"]) == ("renders", None)
 
@@ -274,7 +274,7 @@ def test_a_program_without_a_result_is_named_with_its_log(views, tmp_path):
     (tmp_path / "built").mkdir()
     with pytest.raises(TrainingError, match=r"ended well, but .*; log: .*trainer\.log"):
         step.build(tmp_path / "built")
-    assert not any((tmp_path / "built" / "work").glob("data/*"))
+    assert not any((tmp_path / "built/work").glob("data/*"))
 
 
 def test_the_version_that_a_program_prints_must_contain_the_set_one(views, tmp_path):

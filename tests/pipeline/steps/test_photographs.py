@@ -36,13 +36,13 @@ def photographs(tmp_path):
         pixels = np.full((20, 30, 4), [10, 20, 30, 255], np.uint8)
         pixels[19, 29, 2] += 0 if name == "b" else index  # makes all photographs different
         pixels[:, :15, 3] = 0 if name == "b" else 255
-        (tmp_path / "photos" / "images").mkdir(parents=True, exist_ok=True)
+        (tmp_path / "photos/images").mkdir(parents=True, exist_ok=True)
         Image.fromarray(pixels if name == "b" else pixels[..., :3]).save(
-            tmp_path / "photos" / "images" / f"{name}.png"
+            tmp_path / f"photos/images/{name}.png"
         )
-        (tmp_path / "photos" / "masks").mkdir(exist_ok=True)
+        (tmp_path / "photos/masks").mkdir(exist_ok=True)
         counts = np.repeat([[0], [255]], 10, axis=0).astype(np.uint8).repeat(30, axis=1)
-        Image.fromarray(counts).save(tmp_path / "photos" / "masks" / f"{name}.png.png")
+        Image.fromarray(counts).save(tmp_path / f"photos/masks/{name}.png.png")
     return tmp_path / "photos"
 
 
@@ -97,14 +97,14 @@ def test_masked_and_transparent_pixels_are_replaced(photographs, tmp_path, monke
     # the progress ends at all four photographs
     assert told == [(done, 4) for done in (1, 2, 3, 4)] * 3
     read = {
-        name: np.asarray(Image.open(tmp_path / name / "images" / "b.png").convert("RGB"))
+        name: np.asarray(Image.open(tmp_path / f"{name}/images/b.png").convert("RGB"))
         for name in ("white", "both")
     }
     assert (read["white"][:, :15] == 255).all()
     assert (read["white"][:, 15:] == [10, 20, 30]).all()
     assert (read["both"][10:, :15] == 255).all()
     found = masked_capture(masks, tmp_path / "both")
-    assert found.images == tmp_path / "both" / "images"
+    assert found.images == tmp_path / "both/images"
     for name in masks.image_names:
         assert_array_equal(read_mask(found.masks[name]), read_mask(masks.masks[name]))
     assert masked_capture(bare, tmp_path / "white").masks == {}
@@ -123,7 +123,7 @@ def test_ground_truth_has_the_test_views_and_their_masks(tmp_path, tiny_scene):
     ]
     for view in scene.test:
         assert_array_equal(np.asarray(Image.open(tmp_path / view.name)), view.image)
-    assert_array_equal(read_mask(tmp_path / "masks" / "08.png"), counts)
+    assert_array_equal(read_mask(tmp_path / "masks/08.png"), counts)
 
 
 def test_each_setting_that_changes_views_changes_the_key(tmp_path):
