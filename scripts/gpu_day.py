@@ -21,7 +21,7 @@ PYTHON = os.environ["PYTHON"]
 BROUGHT, STATE, OUT = (Path(os.environ[k]) for k in ("GPU_DAY_BROUGHT", "GPU_DAY_STATE", "OUT"))
 RESULTS, ARCHIVE = STATE / "results", BROUGHT / "brought.tar.xz"
 PACKAGES = "hydra-core omegaconf pydantic pydantic_core annotated-types typing-inspection"
-PACKAGES += " flip-evaluator plyfile pycolmap gsplat antlr4-python3-runtime"
+PACKAGES += " plyfile pycolmap gsplat antlr4-python3-runtime"
 # CUDA 13 no longer has this functor of the source of Faster-GS.
 OLD_MAXIMUM, MAXIMUM = "cub::Max()", "[](auto a, auto b) { return a < b ? b : a; }"
 WEIGHTS = ("squeezenet1_1*.pth", "lpips_v0.1_squeeze.pth")

@@ -117,6 +117,30 @@ def test_an_error_stays_a_line_whatever_it_quotes(monkeypatch, capfd):
     assert " is full: free some space" in capfd.readouterr().err
 
 
+COMMANDS = (
+    "status",
+    "tables x",
+    "seed=1",
+    "-m seed=0,1 --dry-run",
+    "--cfg job",
+    "doctor",
+    "nosuch",
+)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_without_its_current_folder_a_command_says_so_in_one_line(
+    command, tmp_path, monkeypatch, refused
+):
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    monkeypatch.setenv("PYTHONPATH", "here")
+    assert "the current folder cannot be used" in refused(command)
+    for words in (["--version"], ["--help"]):
+        assert cli.run(words) == 0
+
+
 def test_help_lists_verbs_and_choices_also_of_the_users_folders(tmp_path, said):
     (tmp_path / "own/densify").mkdir(parents=True)
     (tmp_path / "own/densify/calm.yaml").touch()

@@ -1,5 +1,6 @@
 """scripts/gpu_day.sh without a GPU: every line is tried before the short time on a GPU."""
 
+import importlib.util
 import json
 import os
 import re
@@ -15,6 +16,7 @@ from shlex import split
 import pytest
 import torch
 
+from tests.composed import composed
 from tests.raster.conftest import interpreter_fault
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -70,6 +72,15 @@ elif "gsbench.cli" in words:
                    "seconds": {{"train": 99.5}}}}, file)
 """
 
+# What gsbench depends on, or its tests, and a borrowed machine does not have.
+ABSENT = """
+import sys
+class Absent:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in ("kornia", "mlflow", "remotezip", "submitit", "flip_evaluator"):
+            raise ModuleNotFoundError(f"{name} is not on a borrowed machine", name=name)
+sys.meta_path.insert(0, Absent())
+"""
 LISTS = "trained", "skewed", "crowded"  # the scenes in which long lists are split, and are not
 READINGS = "volume_x8", "of_scales", "of_nothing", "condition_8", "quantile", "quantile_once"
 
@@ -102,6 +113,7 @@ class Day:
         """Make an archive like that of the verb ``wheels``."""
         brought = Path(self.environment["GPU_DAY_BROUGHT"])
         (brought / "site").mkdir(parents=True)
+        (brought / "site" / "sitecustomize.py").write_text(ABSENT)
         with tarfile.open(brought / "brought.tar.xz", "w:xz") as archive:
             archive.add(brought / "site", "site")
 
@@ -212,6 +224,51 @@ def test_named_parts_run_and_an_unknown_name_is_refused(day):
     assert code == 0, said
     assert day.results("rest").keys() == {"install", "bits", "train-adc-3", "files"}
     assert day.run("rest", "60", "bites")[1].endswith("there is no part bites\n")
+
+
+def test_the_commands_of_the_full_day_name_what_exists(tmp_path, monkeypatch):
+    """The rehearsals here are small ones; a full day has other files, words and sizes."""
+    pytest.importorskip("triton")
+    from gsbench.bench import host, measure
+    from gsbench.raster import EXECUTORS
+    from gsbench.raster.triton import executor
+    from gsbench.verbs import machine
+
+    for name in ("GPU_DAY_STATE", "GPU_DAY_BROUGHT", "OUT", "PYTHON", "GSBENCH_RUNS"):
+        monkeypatch.setenv(name, str(tmp_path / name))
+    script = ROOT / "scripts" / "gpu_day.py"
+    spec = importlib.util.spec_from_file_location("gpu_day", script)
+    gpu_day = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, "gpu_day", gpu_day)
+    spec.loader.exec_module(gpu_day)
+    monkeypatch.chdir(ROOT)
+    said, rasters = [], {one.name for one in EXECUTORS}
+    monkeypatch.setattr(machine, "_prove", lambda raster, *_: said.append(raster) or 0)
+    monkeypatch.setattr(measure, "run_bench", lambda names, *_, **__: said.extend(names) or [])
+    monkeypatch.setattr(host, "time_host", list)
+    monkeypatch.setattr(executor, "SPLIT_BLOCKS", executor.SPLIT_BLOCKS)  # an error if it is gone
+
+    untried = []
+    for part in (part for row in gpu_day.plan() for part in row.parts):
+        files = [Path(word) for word in part.command if word.endswith(".py")]
+        assert [file for file in files if not file.is_file()] == [], part.name
+        verb, *words = part.command[3:]
+        if "pytest" in part.command:
+            names = " ".join([*rasters, *(str(file) + file.read_text() for file in files)])
+            chosen = part.command[part.command.index("-k") + 1] if "-k" in part.command else ""
+            unknown = {word for word in re.findall(r"\w+", chosen) if word not in names}
+            assert unknown <= {"and", "or"}, part.name
+        elif verb in ("bench", "doctor"):
+            assert getattr(machine, verb)(words, tmp_path) == 0, part.name
+        elif verb.startswith("name="):
+            (trial,) = composed((verb, *words), multirun=False)
+            assert trial.values["raster"]["name"] == "triton"
+        else:
+            untried.append(part.name)
+    assert set(said) == {"triton", "gsplat"}
+    assert untried == ["install", "compilation", "compilation-faster_gs", "bench-faster_gs"]
+    exec(gpu_day.UNSPLIT.partition("; from gsbench.cli")[0])
+    assert executor.SPLIT_BLOCKS == 0
 
 
 def test_without_a_compiled_gsplat_its_parts_are_not_tried(day):

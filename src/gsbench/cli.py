@@ -38,7 +38,7 @@ def main() -> None:
 
 def run(argv: list[str]) -> int:
     """Run the command line ``argv``; returns the exit code and prints errors as one line."""
-    with suppress(FileNotFoundError):  # the current folder was deleted, with all that is in it
+    with suppress(OSError):  # the current folder was deleted: `_require_current_folder` says it
         protect_environment()
     begin_command()
     try:
@@ -47,11 +47,11 @@ def run(argv: list[str]) -> int:
         if argv == ["--version"]:
             print(f"gsbench {__version__}")
             return DONE
-        if argv and not set(argv[0][:1]) & set("-+~") and "=" not in argv[0]:
-            return _verb(argv[0], argv[1:])
-        if set(HELP) & set(argv):
+        is_verb = argv and not set(argv[0][:1]) & set("-+~") and "=" not in argv[0]
+        if set(HELP) & set(argv) and not is_verb:
             return _help([word for word in argv if word not in HELP])
-        return _trials(argv)
+        _require_current_folder()
+        return _verb(argv[0], argv[1:]) if is_verb else _trials(argv)
     except InputError as error:
         return _refuse(error, BAD_INPUT)
     except GsbenchError as error:
@@ -88,6 +88,17 @@ def _refuse(error: GsbenchError, code: int) -> int:
         file=sys.stderr,
     )
     return code
+
+
+def _require_current_folder() -> None:
+    """Raise InputError if the current folder, in which paths start, was deleted."""
+    try:
+        os.getcwd()
+    except OSError as error:
+        raise InputError(
+            f"the current folder cannot be used ({error.strerror}), perhaps it was deleted: change "
+            "to one that exists, or into it again if it was made anew"
+        ) from None
 
 
 def _verb(name: str, argv: list[str]) -> int:

@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 
 from gsbench.analysis.attempts import share_of_version
 from gsbench.analysis.comparison import compare
+from gsbench.analysis.looks import look_levels, plan_looks
 from gsbench.analysis.notes import texts
 from gsbench.analysis.quantities import quantity
 from gsbench.analysis.results import load_all_trials
@@ -31,6 +32,8 @@ from gsbench.claims.site import write_site
 from gsbench.claims.stopping import log_verdicts
 from gsbench.launch.record import remove
 from gsbench.runs.experiments import Arm, Declaration, Question, open_question, record_text
+from gsbench.runs.seen import remember
+from gsbench.runs.trial_folder import TrialFolder
 from gsbench.tracking.comparison import description
 from gsbench.verbs.plan import plan
 from gsbench.verbs.results import explain_cell, tables
@@ -186,6 +189,34 @@ def test_the_baseline_that_a_sweep_in_looks_declared_stays_it_if_another_arm_end
     found = answer(tmp_path)
     assert against(found) == [("sfm-mine", "sfm-absgs")]
     assert "of at most 3 seeds. The metric was declared beforehand." in found.sentences[0]
+
+
+@pytest.mark.parametrize(
+    "days, seeds, doubt",
+    [
+        ((4,), 3, "only after 3 trials of the arm had been measured"),
+        ((1, 6), 5, "4 trials were added after the arm's first result"),
+    ],
+)
+def test_an_exploratory_question_of_a_sweep_in_looks_counts_the_looks(tmp_path, days, seeds, doubt):
+    both = [
+        [replace(one, day=2 + 5 * (one.seed > 2)) for one in grid(name, seeds)]
+        for name in ("adc", "mine")
+    ]
+    write(tmp_path, [*both[0], *both[1]])
+    plans = []
+    for day, most in zip(days, (3, 5), strict=False):
+        plan = replace(in_looks(both), time=midnight(day), looks=plan_looks(most))
+        (asked,) = plan.questions
+        plans.append(replace(plan, questions=(replace(asked, seeds=tuple(range(most))),)))
+    write_declared(tmp_path, *plans)
+    (found,) = answer(tmp_path).answers
+    assert found.standing.doubt == doubt
+    for one in found.verdicts:  # two metrics share 5 %
+        levels = dict(zip(plan_looks(seeds), look_levels(1, plan_looks(seeds), 0.025), strict=True))
+        assert one.answer.rate == levels[one.pairs.seeds]
+    assert "adjusted for their number (2) and for the planned looks." in sentence(found)
+    assert "with equal shares of 5 % at each look" in page_of(tmp_path)
 
 
 def test_a_sweep_in_looks_gets_no_verdict_that_it_did_not_declare(tmp_path):
@@ -665,15 +696,121 @@ def test_each_version_of_the_code_on_the_same_seeds_has_a_smaller_error_rate(tmp
     assert {one.second.densify: one.versions for one in answer(tmp_path).answers}["mine"] == 1
 
 
-def test_code_that_changed_for_the_baseline_too_is_no_choice_between_the_arms(tmp_path):
-    for code, day in ((OLD, 2), (NEW, 5)):
-        write(tmp_path, [*grid("adc", code=code, day=day), *grid("mine", code=code, day=day)])
+EDITED = {"mine": ({"sources": {"mine": OLD}}, {"sources": {"mine": NEW}})}
+EDITED |= {"gsbench": ({"packages": {"densify": "released"}}, {"packages": {"densify": "e" * 16}})}
+UPDATED = ({"stages": {"train": 2}}, {"stages": {"train": 3}})
+
+
+@pytest.mark.parametrize(
+    "codes, same_bits, versions",
+    [
+        (EDITED["mine"], False, 2),  # chosen by its results, although the baseline has it too
+        (EDITED["gsbench"], False, 2),
+        (EDITED["gsbench"], True, 1),  # showed nothing new
+        (UPDATED, False, 1),
+    ],
+)
+def test_an_edit_of_any_code_is_a_version_and_an_update_is_none(
+    tmp_path, codes, same_bits, versions
+):
+    for number, code in enumerate(codes):
+        for one in (*grid("adc"), *grid("mine")):
+            equal = {"metrics": {"psnr": 20.0 + one.seed + (one.densify == "adc") ** one.seed}}
+            made = replace(one, code=f"{number}", day=2 + 3 * number)
+            keep(tmp_path, [made], **{"code": code} | (equal if same_bits else {}))
     (found,) = answer(tmp_path).answers
-    assert found.versions == 1
-    assert "version" not in sentence(found)
+    assert found.versions == versions
+    assert ("versions of the arm's code" in sentence(found)) == (versions > 1)
     (told,) = answer(tmp_path).to_json()["pairs"]
-    assert told["versions"] == 1
-    assert {one["error_rate"] for one in told["verdicts"]} == {0.05}
+    assert told["versions"] == versions
+    rates = {one["error_rate"] for one in told["verdicts"]}
+    assert rates == {0.05 * share_of_version(versions)}
+
+
+def keep(runs, trials, arm="", **changes):
+    """Write trials as a run does, which also records that they were seen.
+
+    ``arm`` is the hash of what the arm is made of, ``changes`` are of ``results.json``.
+    """
+    write(runs, trials)
+    for one in trials:
+        file = one.results(runs)
+        moment, hashes = file.stat().st_mtime, read_json(file)["hashes"] | {"arm": arm}
+        change_json(file, **{"hashes": hashes} | changes)
+        os.utime(file, (moment, moment))
+        remember(runs / "exp", TrialFolder(file.parent).record())
+
+
+def removed(runs, trials):
+    for one in trials:
+        shutil.rmtree(one.results(runs).parent)
+
+
+HIDDEN = {
+    "renamed": lambda runs, old: grid("better", code=NEW, day=5),
+    "removed": lambda runs, old: removed(runs, old) or grid("mine", code=NEW, day=5),
+    "both": lambda runs, old: removed(runs, old) or grid("better", code=NEW, day=5),
+    "all removed": lambda runs, old: shutil.rmtree(runs / "exp") or grid("mine", code=NEW, day=5),
+    # as after an edit of gsbench's source, which is not in the folder's name
+    "overwritten": lambda runs, old: removed(runs, old) or [replace(one, day=5) for one in old],
+    "another scene's name": lambda runs, old: [
+        replace(one, scene="z") for one in grid("better", code=NEW, day=5)
+    ],
+}
+
+
+@pytest.mark.parametrize("hide", HIDDEN)
+def test_an_earlier_version_counts_however_it_was_hidden(tmp_path, hide):
+    adc, old = grid("adc"), grid("mine", code=OLD)
+    keep(tmp_path, adc)
+    keep(tmp_path, old, arm="a", code={"sources": {"mine": OLD}})
+    declare(tmp_path, (1, [*adc, *old]))
+    before = answer(tmp_path).sentences
+    new = HIDDEN[hide](tmp_path, old)
+    of_scene = [replace(one, scene=new[0].scene) for one in adc]
+    for one in of_scene:
+        if not one.results(tmp_path).exists():
+            keep(tmp_path, [one], hashes={"data": "data-a"})
+    for one in new:
+        hashes = {"data": "data-a", "arm": "a"}
+        keep(tmp_path, [one], hashes=hashes, code={"packages": {"densify": "e" * 16}})
+    declare(tmp_path, (1, [*adc, *old]), (4, [*of_scene, *new]))
+    found = answer(tmp_path)
+    by_name = {one.second.densify: one for one in found.answers}
+    assert by_name[new[0].densify].versions == 2
+    assert by_name[new[0].densify].primary[0].answer.rate == pytest.approx(0.05 / 3)
+    if "mine" in by_name and new[0].densify != "mine":
+        assert before == [sentence(by_name["mine"])]  # a later name changes no earlier verdict
+    write_archive(load_all_trials(tmp_path, "exp"), tmp_path / "exp.zip")
+    there = compare(unpack_archive(tmp_path / "exp.zip", tmp_path / "back"))
+    assert there.sentences == found.sentences
+
+
+@pytest.mark.parametrize(
+    "seen",
+    [
+        [replace(one, seed=one.seed + 5) for one in grid("mine", code=OLD)],
+        grid("mine", code=OLD, lr=1),  # other settings
+        grid("later", code=OLD, day=9),
+    ],
+)
+def test_what_says_nothing_about_the_pairs_of_an_arm_is_no_version(tmp_path, seen):
+    keep(tmp_path, seen, arm="b" if seen[0].options else "a")
+    removed(tmp_path, seen)
+    keep(tmp_path, [*grid("adc")])
+    keep(tmp_path, grid("mine", code=NEW), arm="a")
+    assert answer(tmp_path).answers[0].versions == 1
+
+
+def test_what_was_seen_and_removed_before_the_declaration_makes_it_late(tmp_path):
+    adc, old, new = grid("adc"), grid("mine", code=OLD), grid("better", code=NEW, day=6)
+    keep(tmp_path, adc)
+    keep(tmp_path, old, arm="a")
+    removed(tmp_path, old)
+    keep(tmp_path, new, arm="a")
+    declare(tmp_path, (5, [*adc, *new]))
+    (found,) = answer(tmp_path).answers
+    assert found.standing.doubt == "only after 3 trials of the arm had been measured"
 
 
 # ---- random experiments

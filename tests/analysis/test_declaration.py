@@ -219,7 +219,7 @@ def test_the_time_of_measuring_counts_not_that_of_writing_results(tmp_path):
             change_json(path / "results.json", measured="2030-05-31T00:00:00Z")
         os.utime(path / "results.json", (after, after))
     found = standing(loaded(tmp_path))
-    assert {trial.path for trial in found.seen} == {paths[3]}
+    assert [(one.name, one.seed) for one in found.seen] == [("sfm-volumetric", 0)]
     assert not found.beforehand
 
 

@@ -7,7 +7,7 @@ from shlex import split
 
 import pytest
 
-from gsbench.analysis.fairness import counts_note, limit_notes
+from gsbench.analysis.fairness import counts_notes, limit_notes
 from gsbench.analysis.notes import Note, texts
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.table_notes import doubt_notes, held_out_notes, origin_notes, points_notes
@@ -24,9 +24,7 @@ from tests.analysis.helpers import ADC, VOLUMETRIC, loaded, page_of, table_of
 from tests.helpers import read_json, write
 from tests.trials import write_runs, write_trial
 
-COMPARED = (
-    "so this does not compare at equal counts. To do so: give both arms densify.cap=governor "
-)
+EQUAL = "To compare at equal ones: "
 
 
 def trials_of(tmp_path, **plan):
@@ -57,22 +55,42 @@ def test_unequal_counts_are_stated_over_the_scenes_that_both_arms_have(tmp_path,
     for trial in made:
         count = counts[trial.scene][trial.densify == "volumetric"]
         trials.append(with_record(trial, num_gaussians=count, num_init_points=50))
-    note = counts_note(trials, ADC, VOLUMETRIC)
+    notes = texts(counts_notes(trials, [(ADC, VOLUMETRIC)]))
     if said:  # no limit can be below the initial cloud
         larger = [with_record(trial, num_init_points=10_000) for trial in trials]
-        words = "To do so: start both arms with fewer than 10,000 points"
-        assert words in str(counts_note(larger, ADC, VOLUMETRIC))
+        words = f"{EQUAL}start all arms with fewer than 10,000 points"
+        assert words in str(*counts_notes(larger, [(ADC, VOLUMETRIC)]))
     least = min(filter(None, itertools.chain(*counts.values())))
-    words = f"densify.max_gaussians={least} and another name."
-    expected = f"sfm-volumetric has {said} Gaussians than sfm-adc, {COMPARED}{words}"
-    assert str(note or "") == (expected if said else "")
-    assert counts_note(trials, ADC, Arm("sfm", "mcmc")) is None
+    words = f"give all arms densify.cap=governor densify.max_gaussians={least} and another name."
+    line = f"Unequal numbers of Gaussians: sfm-volumetric {said} than sfm-adc. {EQUAL}{words}"
+    assert notes == ([line] if said else [])
+    assert counts_notes(trials, [(ADC, Arm("sfm", "mcmc"))]) == []
+
+
+def test_one_sentence_names_all_arms_with_unequal_counts(tmp_path):
+    arms = {"a": 150, "adc": 100, "b": 60, "equal": 101}
+    made = trials_of(tmp_path, scenes=["garden"], densifiers=[*arms])
+    trials = [with_record(one, num_gaussians=arms[one.densify], num_init_points=50) for one in made]
+    pairs = [(ADC, Arm("sfm", name)) for name in arms if name != "adc"]
+    (note,) = texts(counts_notes(trials, pairs))
+    assert note.startswith(
+        "Unequal numbers of Gaussians: sfm-a 50 % more and sfm-b 40 % fewer than sfm-adc. "
+    )
+    assert note.endswith(
+        "give all arms densify.cap=governor densify.max_gaussians=60 and another name."
+    )
 
 
 OF_FILE = ["hydra.searchpath=['file:///home/me/conf']"]
 DEMO, MINE = (
     ["+experiment=demo"],
     split("densify=adc densify._target_=mine.A allow_targets=[mine]"),
+)
+
+
+GRIDDED = (
+    '\'allow_targets=[mine]\' \'hydra.sweeper.grids=[{densify: "adc"}, {densify: "adc", '
+    'densify._target_: "mine.A"}]\''
 )
 
 
@@ -92,13 +110,16 @@ DEMO, MINE = (
         (
             ["densify=adc"],
             MINE,
-            "`gsbench -m densify=adc seed=0,1 scene=garden densify.cap=governor "
-            "densify.max_gaussians=12300 name=exp_equal && gsbench -m densify=adc "
-            "densify._target_=mine.A 'allow_targets=[mine]' seed=0,1 scene=garden",
+            f"`gsbench -m seed=0,1 scene=garden {GRIDDED} densify.cap=governor ",
         ),
         (
             ["densify=adc", "launch.stop_when_decided=True"],
-            MINE,  # looks need two arms in one command
+            ["launch.stop_when_decided=True", *MINE],
+            f"`gsbench -m launch.stop_when_decided=True seed=0,1 scene=garden {GRIDDED} ",
+        ),
+        (
+            ["densify=adc", "launch.stop_when_decided=True"],
+            ["densify=adc", "~densify.cap", "x=1", "launch.stop_when_decided=True"],
             "`gsbench -m densify=adc seed=0,1 scene=garden densify.cap=governor",
         ),
         (
@@ -124,9 +145,11 @@ def test_the_advice_on_unequal_counts_is_a_whole_command(tmp_path, baseline, arm
         place = trial.path.relative_to(tmp_path / "exp").as_posix()
         planned[place] = {"overrides": [*own, "densify.cap=governor"]}
     write(tmp_path / "exp/plan.json", {"trials": planned})
-    sentence = str(counts_note(trials, ADC, VOLUMETRIC))
-    assert f"To do so: {command}" in sentence
-    assert sentence.endswith("densify.cap=governor densify.max_gaussians=12300 name=exp_equal`.")
+    sentence = str(*counts_notes(trials, [(ADC, VOLUMETRIC)]))
+    assert f"{EQUAL}{command}" in sentence
+    assert "densify.cap=governor densify.max_gaussians=12300 name=exp_equal`" in sentence
+    lost = "~densify.cap" in arm  # no grid removes a setting
+    assert sentence.endswith("without looks, which need all arms in one command." if lost else "`.")
 
 
 @pytest.mark.parametrize(

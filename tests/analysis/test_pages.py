@@ -2,6 +2,7 @@
 
 import random
 import re
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -27,7 +28,13 @@ HOSTILE = (
     "<img src=x onerror=\"document.title='owned'\"><svg onload=\"document.title='owned'\">"
     "{{ 7 * 7 }}"
 )
-LOOK = "[document.title === 'owned', document.scripts.length]"
+# null until the whole page is read
+LOOK = "document.readyState === 'complete' ? [document.title === 'owned', document.scripts.length] : null"
+
+
+def look(browser):
+    answer = browser.call("Runtime.evaluate", expression=LOOK, returnByValue=True)
+    return answer["result"]["value"]
 
 
 def shape(page):
@@ -123,8 +130,8 @@ def test_no_hostile_text_runs_in_a_browser(both, tmp_path):
         file = tmp_path / f"{name}.html"
         file.write_text(text, encoding="utf-8")
         with Browser(file.as_uri(), tmp_path / f"profile-{name}") as browser:
-            found = browser.call("Runtime.evaluate", expression=LOOK, returnByValue=True)
-            assert found["result"]["value"] == [False, len(Page(text).scripts)], name
+            found = browser.wait_for(partial(look, browser), "a whole page")
+            assert found == [False, len(Page(text).scripts)], name
 
 
 def test_the_name_of_a_photograph_stays_a_text_in_the_page_of_a_model():

@@ -33,7 +33,7 @@ def read_aloud(kind, number):
     for name, spec in FIELD.findall(SENTENCES[kind]):
         if spec in ("few", "all", "list", "parts"):
             facts[name] = tuple(f"{name} {k}" for k in range(number))
-        elif spec.startswith("n ") or (name in NUMBERS and kind != "unequal counts"):
+        elif spec.startswith("n ") or name in NUMBERS:
             facts[name] = number
         else:
             facts.setdefault(name, f"<{name}>")

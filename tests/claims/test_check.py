@@ -19,6 +19,7 @@ from gsbench.claims.check import (
 )
 from gsbench.claims.check_page import _number, make_page, to_html
 from gsbench.claims.file import parse_claims
+from gsbench.claims.stopping import sequential_test
 from gsbench.config.compose import with_seed
 from gsbench.runs.experiments import read_declarations
 from gsbench.runs.trial_folder import TrialFolder
@@ -80,7 +81,7 @@ def looked(check, runner):
             runner(left)
 
     check = replace(check, declaration=replace(check.declaration, time="2020-01-01T00:00:00Z"))
-    return list(check.checked(check.test.answer(run)).verdicts)
+    return list(check.checked(sequential_test(check).answer(run)).verdicts)
 
 
 def test_a_clear_effect_ends_at_the_first_look_and_a_repeated_check_runs_nothing(tmp_path):

@@ -21,7 +21,7 @@ from gsbench.datasets.archive import (
     wanted_members,
 )
 from gsbench.datasets.catalog import SceneFiles
-from gsbench.downloads import FetchError, RetryPolicy, download, with_retries
+from gsbench.downloads import FetchError, RetryPolicy, with_retries
 from gsbench.errors import InputError
 from tests.datasets.server import Manners, serve
 from tests.helpers import refusal, write
@@ -229,19 +229,6 @@ def test_a_file_that_changes_between_requests_is_detected(served, tmp_path):
         os.truncate(served.folder / "file.zip", 1000)
         with refusal("416"):
             with_retries(lambda: extract_only(archive, tmp_path / "out", 1), url, PATIENT)
-
-
-def test_a_download_is_complete_or_fails(served, tmp_path):
-    served.manners = Manners(ranges=False, cut_every=300_000, cuts=2)
-    seen = []
-    url, target = f"{served.url}/file.zip", tmp_path / "copy"
-    download(url, target, PATIENT, lambda *state: seen.append(state))
-    content = (served.folder / "file.zip").read_bytes()
-    assert target.read_bytes() == content
-    assert seen[-1] == (len(content), len(content))
-    served.manners = Manners(ranges=False, cut_every=300_000)
-    with pytest.raises(FetchError, match="cut"):
-        download(url, target, PATIENT, lambda *_: None)
 
 
 def test_offsets_beyond_four_gigabytes_are_read(tmp_path):

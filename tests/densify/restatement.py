@@ -102,15 +102,19 @@ def adc_growth(rows, mean_gradient, extent, noise, events):
     return split_all(rows + clones, chosen, noise)
 
 
-def volume_growth(rows, threshold, noise, events):
+def volume_growth(rows, threshold, noise, events, isotropic=True):
+    """Unless ``isotropic``, a Gaussian whose children would be split again is not split."""
     chosen, scales, again = [], {}, 0
     for i, row in enumerate(rows):
         s = np.exp(row["log_scales"])
         if 4 / 3 * math.pi * s[0] * s[1] * s[2] > threshold:
             eigenvalues = s**2 / ((s.max() / s.min()) ** 2)  # eq. 7
+            split_again = 4 / 3 * math.pi * np.sqrt(eigenvalues).prod() > threshold
+            if split_again and not isotropic:
+                continue
             chosen.append(i)
             scales[i] = np.log(np.sqrt(eigenvalues))
-            again += 4 / 3 * math.pi * np.sqrt(eigenvalues).prod() > threshold
+            again += split_again
     events["split_volume"], events["isotropic_resplit"] = len(chosen), int(again)
     return split_all(rows, chosen, noise, scales)
 

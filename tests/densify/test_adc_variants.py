@@ -220,7 +220,7 @@ def least(matrix):
     return float(values[0]), vector * np.sign(vector[np.abs(vector).argmax()])
 
 
-def steep_gs_growth(rows, gradient, matrices, noise, rate, threshold=-1e-6, share=0.5):
+def steep_gs_growth(rows, gradient, matrices, noise, rate, threshold, share):
     """Split Gaussians with a gradient of at least 0.0002 and an eigenvalue below ``threshold``.
 
     Their halves lie on either side of the parent along the least eigenvector. The halves of a large
@@ -262,29 +262,24 @@ def given(densifier, seed, count=60):
 
 @pytest.mark.parametrize("step", [600, 3100])
 @pytest.mark.parametrize("seed", range(3))
-def test_a_round_of_steep_gs_matches_the_restatement(seed, step):
-    densifier = SteepGS()
+@pytest.mark.parametrize("threshold, share", [(-1e-6, 0.5), (None, 1.0)])
+def test_a_round_of_steep_gs_matches_the_restatement(seed, step, threshold, share):
+    densifier = SteepGS(eigenvalue_threshold=threshold, opacity_factor=share)
     trainable, _ = prepared(densifier, seed)
     trainable.values.log_scales.data[::4] -= 3.0  # small ones, too
     trainable.set_step(step)
     gradient, matrices = given(densifier, seed)
     rate = trainable.position_rate
     real = Round(densifier, trainable, step, seed)
-    rows, chosen = steep_gs_growth(real.rows, gradient, matrices, real.noise, rate)
-    assert 0 < chosen == real.event.split_gradient < (gradient >= 0.0002).sum()
+    growing = (gradient >= 0.0002).sum()
+    limit = np.inf if threshold is None else threshold
+    inputs = real.rows, gradient, matrices, real.noise, rate
+    rows, chosen = steep_gs_growth(*inputs, limit, share)
+    assert 0 < chosen == real.event.split_gradient
+    assert (chosen == growing) == (threshold is None)
     real.check(rows)
     assert not densifier.statistics["splitting_sum"].any()
     assert densifier.statistics["splitting_sum"].shape == (len(trainable), 3, 3)
-
-
-def test_the_parts_of_steep_gs_can_be_switched_off():
-    densifier = SteepGS(eigenvalue_threshold=None, opacity_factor=1.0)
-    trainable, _ = prepared(densifier, 1)
-    gradient, matrices = given(densifier, 1)
-    rate = trainable.position_rate
-    real = Round(densifier, trainable, 600, 1)
-    assert real.event.split_gradient == (gradient >= 0.0002).sum()
-    real.check(steep_gs_growth(real.rows, gradient, matrices, real.noise, rate, np.inf, 1.0)[0])
 
 
 def test_under_a_hard_cap_steep_gs_splits_the_least_eigenvalues_first():

@@ -12,7 +12,6 @@ from gsbench.densify import (
     Cause,
     Densifier,
     DensifyContext,
-    Lineage,
     RefineEvent,
     Refinement,
     Volumetric,
@@ -82,15 +81,6 @@ def test_statistics_are_saved_and_reset():
     assert saved["statistics"]["sum"].tolist() == [3.0] * 5  # a copy
 
 
-def test_the_initial_count_does_not_change_by_growth_or_saving():
-    densifier = Gathering()
-    refinement = started(densifier, 4)
-    densifier.clone(refinement, torch.tensor([True, False, True, True]))
-    densifier.edit(refinement, keep=torch.arange(7) > 2)
-    again = Lineage.from_state(densifier.lineage.state_dict())
-    assert again.initial_count == densifier.lineage.initial_count == 4
-
-
 def test_a_subclass_adds_to_the_statistics_of_its_base():
     @dataclass
     class Own(Volumetric):
@@ -127,12 +117,6 @@ def test_an_event_balances_only_if_its_counts_add_up():
     assert event.balances()
     event.cloned += 1
     assert not event.balances()
-
-
-def test_normal_draws_on_the_cpu_are_those_of_the_generator():
-    like = torch.zeros(1, dtype=torch.float64)
-    drawn = standard_normal((4, 3), generator(3), like)
-    assert torch.equal(drawn, torch.randn(4, 3, generator=generator(3), dtype=torch.float64))
 
 
 def test_normal_draws_on_another_device_are_seeded_by_the_generator(monkeypatch):

@@ -13,6 +13,7 @@ import torch
 
 from gsbench.cli import run
 from gsbench.errors import InputError
+from gsbench.runs.seen import seen_path
 from gsbench.runs.store import read_manifest
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.jit import cache_base
@@ -297,13 +298,15 @@ def store(trial, shown):
 
 
 def plans(trial, shown):
-    before = shown()
     home = trial.parents[2]
+    before = shown()
     plan = json.loads((home / "plan.json").read_text())
     for planned in plan["trials"].values():
         planned["time"] = 1
     (home / "plan.json").write_text(json.dumps(plan))
     assert shown() == before
+    seen_path(home).write_text("")
+    assert shown()["tables"] == before["tables"]
 
 
 # rows whose tests are where their files are made
@@ -319,7 +322,7 @@ HERE = {
     "`metrics.jsonl`, `events.jsonl`, `volume_histograms.jsonl`": curves,
     "pictures of a trial": pictures,
     "`store/`: results of stages and prepared views": store,
-    "`declared.jsonl`, `plan.json`, `tuning.json`": plans,
+    "`declared.jsonl`, `plan.json`, `tuning.json`, `.seen/`": plans,
 }
 
 

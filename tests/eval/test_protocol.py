@@ -1,7 +1,6 @@
 """The conventions of the protocols, each in a case that can be calculated by hand."""
 
 import math
-import sys
 from dataclasses import replace
 from functools import partial
 
@@ -108,14 +107,6 @@ def test_lpips_of_too_small_a_view_is_unavailable(shared):
     image = np.zeros((16, 40, 3), dtype=np.uint8)
     assert "lpips_squeeze" not in evaluator.evaluate_view(image, image)
     assert evaluator.unavailable["lpips_squeeze"] == "a view is 40x16 px, below 17 px a side"
-
-
-def test_without_the_flip_package_the_metric_is_unavailable(monkeypatch):
-    monkeypatch.setitem(sys.modules, "flip_evaluator", None)
-    evaluator = Evaluator(PAPER, lpips=[])
-    image = np.zeros((16, 16, 3), dtype=np.uint8)
-    assert "flip" not in evaluator.evaluate_view(image, image)
-    assert "pip install" in evaluator.unavailable["flip"]
 
 
 def test_a_render_with_nan_is_refused():

@@ -8,7 +8,6 @@ import pycolmap
 import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
-from PIL import Image
 
 from gsbench.init import Sfm
 from gsbench.init.colmap.database import (
@@ -102,15 +101,6 @@ def test_keypoints_of_kornia_coincide_with_those_of_colmap(own_path, bare_photos
     offsets = (ours - colmap[distances.argmin(axis=1)])[near]
     assert near.sum() > 100
     assert np.abs(np.median(offsets, axis=0)).max() < 0.04  # px
-
-
-@pytest.mark.parametrize("center", [(50.0, 40.0), (50.3, 39.8)])
-def test_a_blob_is_found_at_its_centre(tmp_path, center):
-    """The first pixel covers 0 to 1, both in the drawing and in the found keypoint."""
-    x, y = np.meshgrid(np.arange(100) + 0.5, np.arange(80) + 0.5)
-    blob = 40 + 200 * np.exp(-((x - center[0]) ** 2 + (y - center[1]) ** 2) / (2 * 4.0**2))
-    Image.fromarray(blob.round().astype(np.uint8)).save(tmp_path / "blob.png")
-    assert_allclose(extract(tmp_path / "blob.png", 1600).colmap_keypoints[0], center, atol=0.05)
 
 
 def test_keypoints_are_scaled_separately_in_x_and_y():

@@ -10,8 +10,8 @@ from numpy.testing import assert_allclose
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from gsbench.init import Sfm, picture
-from gsbench.init.base import PoseErrors, Preparation, Timer
+from gsbench.init import MODEL_FOLDER, Sfm, picture
+from gsbench.init.base import OWN_GAUGE_FOLDER, PoseErrors, Preparation, Timer
 from gsbench.init.colmap.alignment import (
     compare_poses,
     measure_gauge,
@@ -19,6 +19,7 @@ from gsbench.init.colmap.alignment import (
     training_extent,
 )
 from gsbench.init.colmap.mapping import MappingResult
+from gsbench.init.colmap.reconstruct import poses_by_name
 from gsbench.init.colmap_initializer import ReconstructionJob, finish
 from gsbench.init.picture import draw_cloud, view_from_above
 from gsbench.init.report import find_warnings, make_report
@@ -160,19 +161,37 @@ def test_a_similarity_leaves_no_pose_errors_and_a_tilt_does():
     assert errors.center_max < 1e-9
 
 
+def finished(capture, folder, model, reference):
+    """The report on an estimated ``model``, which is written below ``folder``."""
+    work = ReconstructionJob(Sfm(), capture, folder / "out", folder / "work", None, Preparation())
+    mapped = MappingResult(model, 1, "incremental", ())
+    return finish(work, model, reference, mapped, Timer({}), {})
+
+
 def test_two_common_cameras_are_not_compared_and_give_a_warning(capture, tmp_path):
     """A similarity needs at least three."""
     model, reference = model_of(CENTERS), model_of(CENTERS)
     for image_id in (3, 4):
         reference.deregister_frame(reference.images[image_id].frame_id)
-    folders = tmp_path / "out", tmp_path / "work"
-    work = ReconstructionJob(Sfm(), capture, *folders, None, Preparation())
-    mapped = MappingResult(model, 1, "incremental", ())
-    report = finish(work, model, reference, mapped, Timer({}), {})
+    report = finished(capture, tmp_path, model, reference)
     assert report.pose_errors is None
     (warning,) = [line for line in report.warnings if "common cameras" in line]
-    others = finish(work, model, None, mapped, Timer({}), {}).warnings
+    others = finished(capture, tmp_path, model, None).warnings
     assert others == tuple(line for line in report.warnings if line != warning)
+
+
+def test_an_estimated_model_is_written_in_both_gauges(capture, tmp_path):
+    model, shift = model_of(CENTERS), np.array([1.0, 2.0, 3.0])
+    model.transform(pycolmap.Sim3d(3.0, pycolmap.Rotation3d(), shift))
+    report = finished(capture, tmp_path, model, model_of(CENTERS))
+    own = report.own_gauge
+    assert report.gauge.scale_to_reference == 1.0
+    assert own.scale_to_reference == pytest.approx(1 / 3)
+    assert own.scene_extent == pytest.approx(3 * report.gauge.scene_extent)
+    assert own.threshold_in_reference == pytest.approx(0.03 / 27)
+    for gauge, centers in ((MODEL_FOLDER, CENTERS), (OWN_GAUGE_FOLDER, 3 * CENTERS + shift)):
+        found = poses_by_name(pycolmap.Reconstruction(tmp_path / "out" / gauge))
+        assert_allclose([found[name][0] for name in NAMES], centers, atol=1e-9)
 
 
 def test_centre_errors_are_in_reference_units_and_relative_to_the_extent():

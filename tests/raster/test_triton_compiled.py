@@ -22,7 +22,6 @@ from gsbench.train.adam_triton import TritonAdam
 from gsbench.train.compile_ahead import compile_ahead
 from gsbench.train.loss_triton import (
     MULTIPROCESSORS,
-    PROGRAMS_BUSY,
     PROGRAMS_HELD,
     STRIP,
     TritonLoss,
@@ -119,7 +118,7 @@ def test_kernels_compile_without_spills(launches, target, monkeypatch):
             f"{[*made.loops.values()]}"
         )
         assert made.spilled == 0, variant
-        if launch.name in ("measure_similarity", "differentiate") and target == 90:
+        if launch.name in ("measure_similarity", "differentiate"):
             assert made.registers <= 65_536 // (STRIP * PROGRAMS_HELD) // 8 * 8
         if launch.name == "composite":
             *_, split, whole = sorted(made.loops.values())
@@ -173,21 +172,12 @@ def test_no_kernel_is_compiled_again_for_other_sizes(launches):
     "size", [(1600, 1060), (500, 375), (800, 530), (256, 192), (140, 105), (4000, 3000)], ids=str
 )
 def test_the_loss_has_work_for_all_multiprocessors(size):
-    """The busiest one filters fewer rows than with programs of 32 rows, and has enough programs."""
-    strips = -(-3 * size[0] // STRIP)
-
-    def counted(rows):
-        programs = strips * -(-size[1] // rows)
-        return programs, -(-programs // MULTIPROCESSORS) * (rows + 10)
-
+    """All programs run at once, and leave less than a tenth of the room for programs empty."""
     rows = rows_of_program(size[1], 3 * size[0])
-    (programs, filtered), (_, before) = counted(rows), counted(32)
-    print(
-        f"{size}: {rows} rows, {programs} programs; the fullest multiprocessor filters "
-        f"{filtered}, was {before}"
-    )
-    assert filtered < before
-    assert programs >= (PROGRAMS_BUSY - 1) * MULTIPROCESSORS or rows == 8
+    programs = -(-3 * size[0] // STRIP) * -(-size[1] // rows)
+    held = PROGRAMS_HELD * MULTIPROCESSORS
+    assert programs <= held
+    assert programs > 0.9 * held or rows == 8
 
 
 class Watch(TorchDispatchMode):

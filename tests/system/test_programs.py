@@ -3,6 +3,7 @@
 import ast
 import os
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -20,7 +21,7 @@ STARTS = {
     ("external/program.py", "watch", "subprocess.Popen"): "own",
     ("launch/slurm.py", "make_executor", "submitit.SlurmExecutor"): "current",
     ("launch/jobs.py", "run_local", "submitit.LocalExecutor"): "current",
-    ("pipeline/steps/train.py", "check_version", "subprocess.run"): "own",
+    ("pipeline/steps/external.py", "check_version", "subprocess.run"): "own",
     ("system/install.py", "run_git", "subprocess.run"): "neutral",
     ("system/isolate.py", "_run_child", "subprocess.Popen"): "current",
     ("system/isolate.py", "continue_in_child", "os.fork"): "current",
@@ -46,12 +47,17 @@ STARTERS = {
 }
 
 
+parse = cache(ast.parse)
+
+
 def starts_of(text):
     """Where a module mentions what starts processes: {(function, name): [call or None]}."""
     found = {}
-    tree = ast.parse(text)
+    if not any(f"{module}." in text for module in STARTERS):
+        return found
+    tree = parse(text)
     parents = {child: node for node in ast.walk(tree) for child in ast.iter_child_nodes(node)}
-    for node in ast.walk(tree):
+    for node in parents:
         if not isinstance(node, ast.Attribute):
             continue
         module, _, name = ast.unparse(node).partition(".")
@@ -76,7 +82,7 @@ def _starts(name):
 
 def hidden_names(text):
     """The imports by which a module could start processes unseen by `starts_of`."""
-    tree = ast.parse(text)
+    tree = parse(text)
     blocks = (node for node in ast.walk(tree) if isinstance(node, ast.If))
     for_types = (node for node in blocks if ast.unparse(node.test) == "TYPE_CHECKING")
     unseen = {part for block in for_types for part in ast.walk(block)}

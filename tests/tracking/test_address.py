@@ -138,6 +138,21 @@ def test_a_journal_of_a_database_deletes_no_file(command, tmp_path, monkeypatch,
     assert not private.exists()
 
 
+@pytest.mark.parametrize("name", ["mlflow.db", "mlflow.db-journal"])
+def test_no_link_to_a_database_is_opened_by_ui(name, tmp_path, monkeypatch, refused):
+    private = write(tmp_path / "private", "secret")
+    for place in (tmp_path / "runs" / "one", tmp_path / "runs" / "two"):
+        place.mkdir(parents=True)
+    write(tmp_path / "runs" / "mlflow.db", b"")
+    (tmp_path / "runs" / name).unlink(missing_ok=True)
+    (tmp_path / "runs" / name).symlink_to(private)
+    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
+    monkeypatch.delenv(VARIABLE, raising=False)
+    monkeypatch.setattr("gsbench.verbs.servers.subprocess.Popen", None)
+    assert "not a regular file" in refused("ui", "--no-browser")
+    assert private.read_text() == "secret"
+
+
 @pytest.mark.parametrize("address", ["./mlruns", "mlruns", "file:./mlruns", "http:/host"])
 def test_an_address_that_is_a_folder_is_refused_in_one_line(address, refused):
     said = refused("scene=courtyard", f"tracking.uri={address}", "--dry-run")

@@ -15,7 +15,7 @@ from gsbench.system.locks import BusyError
 from gsbench.tracking import connect
 from gsbench.tracking.tracker_run import TrackerRun, make_sink
 from tests.conftest import ROOT
-from tests.helpers import read_json, write
+from tests.helpers import read_json, refusal, write
 from tests.tracking.helpers import (
     begun_trial,
     found_runs,
@@ -339,3 +339,14 @@ def test_a_run_that_was_deleted_there_is_made_again(shown, mirrored):
     else:
         shutil.rmtree(shown.runs / {"TensorBoard": "tensorboard", "own": "kept"}[shown.kind])
     check_one(shown, mirrored)
+
+
+@pytest.mark.parametrize("shown", ["WandB"], indirect=True)
+@pytest.mark.parametrize("name", ["wandb", "wandb/wandb", "wandb/.wandb"])
+def test_a_client_does_not_write_through_a_link(name, shown, tmp_path):
+    (tmp_path / "private").mkdir()
+    folder, values = finished(shown.runs)
+    (shown.runs / name).parent.mkdir(exist_ok=True)
+    (shown.runs / name).symlink_to(tmp_path / "private")
+    with refusal("follows no links"):
+        shown.mirror(folder, values)

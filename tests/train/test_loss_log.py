@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gsbench.raster.staged import Readback
-from gsbench.train.trainer import LossLog, append, volume_histogram
+from gsbench.train.records import LossLog, append, volume_histogram
 
 
 def scalars(step, total=None):

@@ -10,7 +10,7 @@ import pytest
 
 from gsbench.densify import EdgeAware, PixelGS, ResGS, Taming, Volumetric
 from gsbench.system.stopping import Stopped, stop_on_signals
-from gsbench.train.trainer import drop_after
+from gsbench.train.records import drop_after
 from tests.train.lab import EVENTS, METRICS, STATEFUL, StopError, same, small
 
 ITERATIONS = 120
@@ -101,7 +101,7 @@ def test_a_kill_while_records_are_removed_loses_no_record(share, tmp_path):
     file.write_text("".join(lines))
     kept = len("".join(lines[:4000]))
     code = (
-        "import resource, signal, sys\nfrom pathlib import Path\nfrom gsbench.train.trainer "
+        "import resource, signal, sys\nfrom pathlib import Path\nfrom gsbench.train.records "
         "import drop_after\n"
         "signal.signal(signal.SIGXFSZ, signal.SIG_DFL)\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]),) * 2)\n"

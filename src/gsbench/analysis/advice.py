@@ -1,4 +1,4 @@
-"""The command that compares two arms again, at equal numbers of Gaussians."""
+"""The command that compares arms again, at equal numbers of Gaussians."""
 
 import itertools
 import math
@@ -15,14 +15,15 @@ from gsbench.runs.experiments import Planned, merge_planned, read_declarations
 from gsbench.runs.layout import PLAN
 
 DIGITS = 3  # significant digits of a number of Gaussians
-LOOKS = "launch.stop_when_decided"  # needs both arms in one command
+LOOKS = "launch.stop_when_decided"  # needs all arms in one command
+GRIDS, PERMISSIONS = "hydra.sweeper.grids", "allow_targets"
 REPLACED = ("name", "densify.cap", "densify.max_gaussians")  # words that the advice gives itself
 # the word that records ``--config-dir``
 OF_CONFIG_DIR = re.compile(r"hydra\.searchpath=\['file://([\w./-]+)'\]")
 
 Words = dict[str, list[str]]  # the values of each key of a command, in order
 
-
+# of the trials of a baseline, and of those of one arm or more
 Advice = Callable[[Sequence[TrialResult], Sequence[TrialResult]], str]
 
 
@@ -32,12 +33,12 @@ def start_smaller(trials: Iterable[TrialResult]) -> str:
     points = max((record.num_init_points or 0 for record in records), default=0)
     if all((record.num_gaussians or points) >= points for record in records):
         return ""
-    return f"start both arms with fewer than {points:,} points, as no limit can be below these"
+    return f"start all arms with fewer than {points:,} points, as no limit can be below these"
 
 
-def equal_counts_words(baseline: Sequence[TrialResult], arm: Sequence[TrialResult]) -> str:
+def equal_counts_words(baseline: Sequence[TrialResult], arms: Sequence[TrialResult]) -> str:
     """The words for arms that all end with the count of the smallest trial; "" without counts."""
-    counts = [trial.record.num_gaussians for trial in (*baseline, *arm)]
+    counts = [trial.record.num_gaussians for trial in (*baseline, *arms)]
     known = [count for count in counts if count]
     if not known:
         return ""
@@ -45,27 +46,27 @@ def equal_counts_words(baseline: Sequence[TrialResult], arm: Sequence[TrialResul
     return f"densify.cap=governor densify.max_gaussians={min(known) // unit * unit}"
 
 
-def equal_counts_settings(baseline: Sequence[TrialResult], arm: Sequence[TrialResult]) -> str:
+def equal_counts_settings(baseline: Sequence[TrialResult], arms: Sequence[TrialResult]) -> str:
     """The advice to add `equal_counts_words` where the arms are written; "" without counts."""
-    words = equal_counts_words(baseline, arm)
-    return words and f"give both arms {words} and another name"
+    words = equal_counts_words(baseline, arms)
+    return words and f"give all arms {words} and another name"
 
 
-def equal_counts_command(baseline: Sequence[TrialResult], arm: Sequence[TrialResult]) -> str:
+def equal_counts_command(baseline: Sequence[TrialResult], arms: Sequence[TrialResult]) -> str:
     """The command for arms that all end with the count of the smallest trial; "" without counts.
 
     It repeats the words of the trials' own commands, as the experiment's plan records them. If
     the plan does not have them, only the words to add are named.
     """
-    added = equal_counts_words(baseline, arm)
+    added = equal_counts_words(baseline, arms)
     if not added:
         return ""
-    both = places_of(baseline) & places_of(arm)
-    trials = [trial for trial in (*baseline, *arm) if (trial.scene, trial.seed) in both]
+    both = places_of(baseline) & places_of(arms)
+    trials = [one for one in (*baseline, *arms) if (one.scene, one.seed) in both]
     home = baseline[0].path.parents[2]
     planned = _planned_words(home)
     if not all(planned.get(trial.path) for trial in trials):
-        return equal_counts_settings(baseline, arm)
+        return equal_counts_settings(baseline, arms)
     # a sweep in looks may have stopped before its last seed
     looks = [declaration.planned for declaration in read_declarations(home) if declaration.looks]
     most: Planned = reduce(merge_planned, looks, {})
@@ -75,11 +76,12 @@ def equal_counts_command(baseline: Sequence[TrialResult], arm: Sequence[TrialRes
         seeds = most.get(trial.key, (trial.seed,))
         words |= {"seed": [*map(str, seeds)]}
         commands.append({key: words[key] for key in words if key not in REPLACED})
-    commands = _merged(commands)
-    if len(commands) > 1:
-        commands = [{key: own[key] for key in own if key != LOOKS} for own in commands]
+    commands = _in_one(_merged(commands))
+    lost = len(commands) > 1 and any(LOOKS in own for own in commands)
+    commands = [{key: own[key] for key in own if key != LOOKS or not lost} for own in commands]
     end = f"{added} name={shlex.quote(f'{home.name}_equal')}"
-    return f"`{' && '.join(f'gsbench -m {_joined(own)} {end}' for own in commands)}`"
+    whole = f"`{' && '.join(f'gsbench -m {_joined(own)} {end}' for own in commands)}`"
+    return f"{whole}, without looks, which need all arms in one command" if lost else whole
 
 
 def _planned_words(home: Path) -> Mapping[Path, Sequence[str]]:
@@ -107,6 +109,42 @@ def _merged(commands: list[Words]) -> list[Words]:
             for same in group_by(commands, others).values()
         ]
     return commands
+
+
+def _in_one(commands: list[Words]) -> list[Words]:
+    """One command that gives its arms as grids, if they can be written so."""
+    allowed = {
+        name for own in commands for text in own.get(PERMISSIONS, ()) for name in _names(text)
+    }
+    shared = {
+        key: values
+        for key, values in commands[0].items()
+        if key != "densify" and all(own.get(key) == values for own in commands)
+    }
+    grids = [
+        {key: ",".join(own[key]) for key in own if key not in (*shared, PERMISSIONS)}
+        for own in commands
+    ]
+    fits = all(own and all(map(_fits_grid, own.items())) for own in grids)
+    if len(commands) == 1 or not fits:
+        return commands
+    texts = [", ".join(f'{key}: "{value}"' for key, value in own.items()) for own in grids]
+    arms = ", ".join(f"{{{text}}}" for text in texts)
+    permissions = {PERMISSIONS: [f"[{','.join(sorted(allowed))}]"]} if allowed else {}
+    return [shared | permissions | {GRIDS: [f"[{arms}]"]}]
+
+
+def _names(text: str) -> list[str]:
+    """The names in a list such as ``[mine,helper]``."""
+    return [name.strip() for name in text.strip("[]").split(",")]
+
+
+def _fits_grid(word: tuple[str, str]) -> bool:
+    """Return whether a grid can have a word: it sets a value, and has no quotes."""
+    key, value = word
+    return (
+        bool(value) and not key.startswith(("~", "hydra.")) and not set("'\"\\") & set(key + value)
+    )
 
 
 def _joined(words: Words) -> str:

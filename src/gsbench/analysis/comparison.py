@@ -176,13 +176,10 @@ class Comparison:
     @property
     def _elsewhere(self) -> list[Note]:
         """A note for each arm that other experiments measured by other code on its seeds."""
-        by_arm, home = group_by(self.trials, lambda trial: trial.arm), self.experiment.folder
-        notes = {}
-        for first, second in self.pairs:
-            both = by_arm[first], by_arm[second]
-            if others := measured_elsewhere(home.parent, home.name, *both):
-                notes[second] = Note.of("elsewhere", arm=second, experiments=others)
-        return [*notes.values()]
+        by_arm = group_by(self.trials, lambda trial: trial.arm)
+        compared = {second: by_arm[second] for _, second in self.pairs}
+        found = measured_elsewhere(self.experiment.folder, compared)
+        return [Note.of("elsewhere", arm=arm, experiments=own) for arm, own in found.items()]
 
     @cached_property
     def _progress(self) -> list[Note]:
@@ -333,10 +330,10 @@ def compare(experiment: Experiment, baseline: str = BASELINE) -> Comparison:
     turned = {(second, first) for first, second in usual.pairs}.difference(usual.pairs)
     # A baseline that is chosen later frees no question of the others' share of the error rate.
     pairs = [*arms.pairs, *(pair for pair in usual.pairs if frozenset(pair) not in shown)]
-    lacking, older = unfinished(experiment), experiment.older
+    lacking, past = unfinished(experiment), (experiment.older, experiment.seen)
     if declared is not None:
         lacking += declared.missing(arms.trials)
-    answers = judge_pairs(arms.trials, pairs, declared, lacking, others, older, turned)
+    answers = judge_pairs(arms.trials, pairs, declared, lacking, others, *past, turned)
     answers = answers[: len(arms.pairs)]
     if (experiment.folder / LEDGER).exists():
         answers = [

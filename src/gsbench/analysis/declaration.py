@@ -12,13 +12,14 @@ from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 from pathlib import Path
 
-from gsbench.analysis.attempts import of_same_arm, places_of
+from gsbench.analysis.attempts import earlier_results, of_same_arm, places_of
 from gsbench.analysis.notes import Note
 from gsbench.analysis.results import Experiment, TrialResult
 from gsbench.analysis.trial_settings import config_if_readable, settings_text
 from gsbench.analysis.unfinished import Unfinished
 from gsbench.runs.experiments import Declaration, Planned, Question, merge_planned, of_latest_metric
 from gsbench.runs.layout import FORGOTTEN, SEED
+from gsbench.runs.seen import SeenResult
 from gsbench.words import counted
 
 
@@ -28,7 +29,7 @@ class Standing:
 
     ``declaration`` is the one that first named the arm, with its trials up to the arm's first
     result; questions of one such declaration share an error rate. ``question`` is that about these
-    arms if a sweep in looks names its questions. ``seen`` are the arm's trials that were measured
+    arms if a sweep in looks names its questions. ``seen`` are the arm's results that were measured
     before the metric was declared, ``added`` the trials of its pairs that were not declared before
     its first result. ``other_pair``: these arms are no pair of the declaration.
     """
@@ -36,7 +37,7 @@ class Standing:
     active: "ActiveDeclaration"
     declaration: Declaration
     question: Question | None
-    seen: tuple[TrialResult, ...]
+    seen: tuple[SeenResult, ...]
     added: tuple[TrialResult, ...]
     other_pair: bool
 
@@ -63,12 +64,13 @@ class ActiveDeclaration:
     """The declarations in force in an experiment: all of the latest metric, the oldest first.
 
     ``declared`` are those of all metrics, ``folder`` is the experiment's. ``older`` are trials of
-    earlier code, which do not count but were seen.
+    earlier code, which do not count but were seen; ``seen`` is what was ever measured.
     """
 
     declared: tuple[Declaration, ...]
     folder: Path
     older: tuple[TrialResult, ...] = ()
+    seen: tuple[SeenResult, ...] = ()
 
     @cached_property
     def records(self) -> tuple[Declaration, ...]:
@@ -92,8 +94,12 @@ class ActiveDeclaration:
         ``other_pair`` says that the arms would not be compared without a choice made later.
         """
         old = of_same_arm(arm, self.older)
-        first = min((trial.measured for trial in (*arm, *old)), default=math.inf)
-        if known := [record for record in self.declared if record.moment <= first]:
+        # also what was removed or overwritten since, or had another name
+        gone = earlier_results(arm, self.seen)
+        times = [(one.measured, one.as_seen) for one in (*arm, *old)]
+        times += [(one.moment, one) for one in gone]
+        first = min((moment for moment, _ in times), default=math.inf)
+        if known := [one for one in self.declared if one.moment <= first]:
             metric = known[-1].primary
             kept = tuple(o for o in self.declared if o.moment <= first or o.primary == metric)
             if kept != self.declared:
@@ -107,15 +113,23 @@ class ActiveDeclaration:
         naming = [record for record in before if keys & record.planned.keys()] or before[:1]
         in_looks = [record for record in naming if record.looks]
         of_baseline = {trial.key for trial in baseline}
-        asked = [
-            (declaration, question)
-            for declaration in in_looks
-            for question in declaration.questions
-            # some scenes may have no result yet
-            if any(a in of_baseline for a, _ in question.scenes.values())
-            and any(b in keys for _, b in question.scenes.values())
-        ]
-        seen = [trial for trial in (*arm, *old) if trial.measured < self.records[0].moment]
+
+        def asked_by(declarations: Iterable[Declaration]) -> list[tuple[Declaration, Question]]:
+            return [
+                (one, question)
+                for one in declarations
+                for question in one.questions
+                # some scenes may have no result yet
+                if any(a in of_baseline for a, _ in question.scenes.values())
+                and any(b in keys for _, b in question.scenes.values())
+            ]
+
+        asked = asked_by(in_looks)
+        seen = {
+            (one.place, one.version): one
+            for moment, one in times
+            if moment < self.records[0].moment
+        }
         # Only pairs of trials reach a verdict. Of the baseline, what was there before the arm's
         # first result could not be chosen by it.
         places, others = places_of(baseline), places_of(arm)
@@ -129,11 +143,15 @@ class ActiveDeclaration:
             # trial that was measured after the next record with trials may have been added.
             named = (record.moment for record in self.records if record.names_trials)
             next_record = min(named, default=math.inf)
-            added = [trial for trial in paired if trial.measured >= next_record]
-        declaration, question = asked[-1] if asked else ((*in_looks, naming[0])[0], None)
+            added = [one for one in paired if one.measured >= next_record]
+        # An exploratory question has all looks that were ever planned for it: trials end at the
+        # one that pleases.
+        late = asked_by(one for one in self.records if one.looks) if seen or added else []
+        latest = (late or asked)[-1:]
+        declaration, question = latest[0] if latest else ((*in_looks, naming[0])[0], None)
         # a sweep in looks stopped by its own questions
         other_pair = not asked if in_looks else other_pair
-        return Standing(self, declaration, question, tuple(seen), tuple(added), other_pair)
+        return Standing(self, declaration, question, tuple(seen.values()), tuple(added), other_pair)
 
     def missing(self, trials: Sequence[TrialResult]) -> list[Unfinished]:
         """The declared trials without a result, except those of looks, which may not be needed.
@@ -206,7 +224,7 @@ def active_declaration(experiment: Experiment) -> ActiveDeclaration | None:
 
     The latest metric is in force. Further commands may add trials to an arm until its first result.
     """
-    declared = tuple(
-        declaration for declaration in experiment.declarations if declaration.kind == "sweep"
-    )
-    return ActiveDeclaration(declared, experiment.folder, experiment.older) if declared else None
+    declared = tuple(one for one in experiment.declarations if one.kind == "sweep")
+    if not declared:
+        return None
+    return ActiveDeclaration(declared, experiment.folder, experiment.older, experiment.seen)

@@ -17,7 +17,12 @@ from gsbench.analysis.notes import Note
 from gsbench.analysis.results import Arm, TrialPair, TrialResult, group_by, seeds_text
 from gsbench.analysis.trial_settings import Configured, canonical
 from gsbench.gaussians.paper_values import RATES
-from gsbench.runs.config_hash import DECLARED, NOT_HASHED
+from gsbench.runs.config_hash import (
+    IGNORED_SETTINGS,
+    NO_INGREDIENTS,
+    is_among,
+    is_ingredient,
+)
 from gsbench.runs.freshness import Change, Part, code_changes, present_version
 from gsbench.runs.nested import SHOWN
 from gsbench.words import counted, some_of
@@ -25,15 +30,6 @@ from gsbench.words import counted, some_of
 Versions = dict[str, list[TrialResult]]  # version -> the trials that it made
 ScenesByValue = dict[str, list[str]]  # value of a setting or condition -> the scenes that have it
 
-# Settings in which trials of one cell may differ: they do not change what is computed.
-# "x" stands for x and all below it (x.y).
-IGNORED_SETTINGS = (
-    *NOT_HASHED,
-    *(f"{group}.{name}" for group, names in DECLARED.items() for name in names),
-    "hydra",
-    "experiment",
-    "scene.path",
-)
 MAX_NAMED = 6  # the most ingredients that a sentence names; it counts the rest
 NO_RECORD = "settings that are not recorded (a trial has no readable config.yaml)"
 ELSEWHERE = "a training elsewhere, which left no record"
@@ -64,30 +60,10 @@ INGREDIENT_NAMES = {
     **{f"init.{key}": "cameras" for key in ("poses", "align")},
     **{f"train.{key}": "learning rates" for key in RATES},
 }
-# Settings that do not change the trained model.
-WITHOUT_EFFECT = (
-    *IGNORED_SETTINGS,
-    "eval",
-    "scene.name",
-    "raster.name",
-    "init.name",
-    "init.device",
-    "init.weights",
-    "init.download",
-    "init.threads",
-    "densify.name",
-    "densify.time_limit_minutes",
-    "train.name",
-    "train.log_every",
-    "train.checkpoint_every",
-    "train.checkpoint_minutes",
-    "train.volume_histogram",
-)
-
 # Conditions and settings that each scene may have for itself. The settings of a budget are not
 # among them, so that a note says where it differs. Iterations are a condition already.
 OF_A_SCENE = ("resolution", "data", "budget")
-OWN_SETTINGS = (*WITHOUT_EFFECT, "scene", "init.path", "train.iterations")
+OWN_SETTINGS = (*NO_INGREDIENTS, "scene", "init.path", "train.iterations")
 
 # The ingredients in which each densifier class departs from ADC, beside its settings. They are not
 # attributes of the classes, since importing those loads torch. Another class is one ingredient.
@@ -141,7 +117,7 @@ def differing_settings(trials: Sequence[Configured]) -> dict[str, list[str]]:
     if len({trial.config_hash for trial in trials}) == 1:
         return {}
     configs = {trial.key: trial.config for trial in trials}.values()
-    keys = {key for config in configs for key in config if not _is_among(key, IGNORED_SETTINGS)}
+    keys = {key for config in configs for key in config if not is_among(key, IGNORED_SETTINGS)}
     values_by_key = {key: {canonical(config.get(key)) for config in configs} for key in keys}
     return {key: sorted(values) for key, values in sorted(values_by_key.items()) if len(values) > 1}
 
@@ -165,7 +141,7 @@ def settings_between_scenes(trials: Sequence[TrialResult]) -> dict[str, ScenesBy
     keys = {
         key for other in others for key in first.keys() | other if first.get(key) != other.get(key)
     }
-    keys = {key for key in keys if not _is_among(key, OWN_SETTINGS)}
+    keys = {key for key in keys if not is_among(key, OWN_SETTINGS)}
     return _between_scenes(
         by_scene, sorted(keys), lambda trial, key: canonical(trial.config.get(key))
     )
@@ -314,24 +290,9 @@ def ingredients(one: Mapping[str, Any], other: Mapping[str, Any]) -> tuple[str, 
 
 
 def differing_keys(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
-    """The settings in which two configurations differ, without those in `WITHOUT_EFFECT`."""
+    """The settings in which two configurations differ, without those in `NO_INGREDIENTS`."""
     keys = [key for key in {**one, **other} if one.get(key) != other.get(key)]
     return [key for key in keys if is_ingredient(key)]
-
-
-def is_ingredient(key: str) -> bool:
-    """Return whether a setting may change the trained model."""
-    return not _is_among(key, WITHOUT_EFFECT)
-
-
-def _is_among(key: str, settings: Sequence[str]) -> bool:
-    """Return whether a dotted key is one of ``settings`` or below one of them.
-
-    A key that only begins with the same letters is another setting: a user's class may have the
-    option ``densify.name_noise``.
-    """
-    parts = key.split(".")
-    return any(".".join(parts[:count]) in settings for count in range(1, len(parts) + 1))
 
 
 def ingredients_between(trials: Sequence[TrialResult], first: Arm, second: Arm) -> tuple[str, ...]:

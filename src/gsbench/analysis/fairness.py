@@ -17,7 +17,6 @@ from gsbench.analysis.differences import (
     differing_keys,
     ingredients_between,
     ingredients_note,
-    is_ingredient,
     is_mixed,
 )
 from gsbench.analysis.notes import Note
@@ -28,6 +27,7 @@ from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.analysis.trial_settings import canonical
 from gsbench.gaussians.paper_values import PAPER_CAP
 from gsbench.parsing import read_if_sound
+from gsbench.runs.config_hash import is_ingredient
 from gsbench.runs.experiments import SearchPoint, TuningRecord
 from gsbench.runs.layout import EVENTS, TUNING
 from gsbench.words import counted, listed
@@ -46,32 +46,39 @@ def caveats(
     trials: Sequence[TrialResult],
     first: Arm,
     second: Arm,
-    advise: Advice = equal_counts_command,
 ) -> list[Note]:
-    """Notes on unequal counts, several differing ingredients and unequal tuning.
-
-    ``advise`` says how to compare at equal counts.
-    """
+    """Notes on several differing ingredients and on unequal tuning."""
     names = ingredients_between(trials, first, second)
     mixed = ingredients_note(names, first, second) if is_mixed(names) else None
-    counts = counts_note(trials, first, second, advise)
-    return [note for note in (counts, mixed, tuning_note(trials, (first, second))) if note]
+    return [note for note in (mixed, tuning_note(trials, (first, second))) if note]
 
 
-def counts_note(
+def counts_notes(
     trials: Sequence[TrialResult],
-    first: Arm,
-    second: Arm,
+    pairs: Iterable[tuple[Arm, Arm]],
     advise: Advice = equal_counts_command,
-) -> Note | None:
-    """A note on how many more Gaussians the second arm has over common scenes, if it has."""
-    baseline, other = (trials_of(trials, arm) for arm in (first, second))
-    change = relative_change(baseline, other, COSTS["gaussians"][1])
-    if change is None or abs(change.of_totals) <= EQUAL_COUNTS:
-        return None
-    more = f"{100 * abs(change.of_totals):.0f} % {'more' if change.of_totals > 0 else 'fewer'}"
-    how = start_smaller([*baseline, *other]) or advise(baseline, other)
-    return Note.of("unequal counts", arm=second, baseline=first, more=more, advice=how)
+) -> list[Note]:
+    """A note for each baseline on the arms that have more Gaussians over common scenes, or fewer.
+
+    ``advise`` says how to compare all of these at equal counts.
+    """
+    by_arm, notes = group_by(trials, lambda trial: trial.arm), []
+    for first, own in group_by(pairs, lambda pair: pair[0]).items():
+        baseline, unequal = by_arm.get(first, []), dict[Arm, float]()
+        for _, second in own:
+            change = relative_change(baseline, by_arm.get(second, []), COSTS["gaussians"][1])
+            if change is not None and abs(change.of_totals) > EQUAL_COUNTS:
+                unequal[second] = change.of_totals
+        if not unequal:
+            continue
+        others = [trial for arm in unequal for trial in by_arm[arm]]
+        how = start_smaller([*baseline, *others]) or advise(baseline, others)
+        texts = [
+            f"{arm} {100 * abs(more):.0f} % {'more' if more > 0 else 'fewer'}"
+            for arm, more in unequal.items()
+        ]
+        notes.append(Note.of("unequal counts", arms=texts, baseline=first, advice=how))
+    return notes
 
 
 def limit_notes(trials: Sequence[TrialResult], pairs: Iterable[tuple[Arm, Arm]]) -> list[Note]:

@@ -29,7 +29,7 @@ from gsbench.analysis.statistics import (
     t_test,
 )
 from gsbench.analysis.unfinished import Unfinished, one_sided
-from gsbench.runs.experiments import Declaration, Question
+from gsbench.runs.experiments import NO_TIME, Declaration, Question
 from gsbench.words import signed
 
 # deviations from the other trials of its scene and arm, beyond which a trial is outlying
@@ -222,11 +222,13 @@ def judge(
     testable = [k for k, one in enumerate(unjudged) if one.pairs.rows and not one.untestable]
     for secondary in (False, True):
         family = [k for k in testable if unjudged[k].question.secondary == secondary]
-        # With looks, the shares of the error rate were fixed beforehand: questions without pairs
-        # keep theirs.
-        beside = [other for other in others if other.secondary == secondary]
+        beside = [one for one in others if one.secondary == secondary]
+        # With looks, the shares of the error rate were fixed when it was declared: questions
+        # without pairs keep theirs.
+        is_declared = declaration.time != NO_TIME
         sharing = len(beside) + sum(
-            question.secondary == secondary for question in declaration.questions
+            question.secondary == secondary and (is_declared or k in family)
+            for k, question in enumerate(declaration.questions)
         )
         if declaration.looks:
             for k in family:

@@ -85,8 +85,8 @@ SENTENCES: dict[str, str] = {
     # ---- arms that are unlike in more than was asked
     "scenes differ": "Scenes of {arms:all} differ in more than the scene: {differences}.",
     "unequal counts": (
-        "{arm} has {more} Gaussians than {baseline}, so this does not compare at equal counts. To "
-        "do so: {advice}."
+        "Unequal numbers of Gaussians: {arms:all} than {baseline}. To compare at equal ones: "
+        "{advice}."
     ),
     "limit not reached": (
         "The limit of {limit:,} Gaussians (densify.max_gaussians) did not bind{scenes:if: on %}: "

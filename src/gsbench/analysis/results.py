@@ -23,6 +23,7 @@ from gsbench.runs.experiments import Declaration, experiment_home, read_declarat
 from gsbench.runs.freshness import Change, code_changes
 from gsbench.runs.layout import CONFIG, FAILED, FORGOTTEN, PER_VIEW, RESULTS, SEED
 from gsbench.runs.nested import SHOWN
+from gsbench.runs.seen import SeenResult, read_seen
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import UnfinishedError
 from gsbench.words import command, counted, some_of
@@ -45,7 +46,7 @@ class Experiment:
     ``older`` are trials of earlier code that `newest_code` left out, of which ``versions`` has a
     line for each part of the code, and those that were forgotten (``status --forget-superseded``).
     ``lacking`` are the folders of trials without a usable result: they failed, were stopped, or
-    are damaged.
+    are damaged. ``seen`` is what was ever measured.
     """
 
     name: str
@@ -55,6 +56,7 @@ class Experiment:
     older: tuple[TrialResult, ...] = ()
     versions: tuple[str, ...] = ()
     lacking: tuple[Path, ...] = ()
+    seen: tuple[SeenResult, ...] = ()
 
     @cached_property
     def declarations(self) -> list[Declaration]:
@@ -154,9 +156,8 @@ def read_experiment(folder: Path) -> Experiment:
         for path, fault in sorted(faults.items())
         if TRIAL_FOLDER.fullmatch(path.name) and not fault.startswith(FOREIGN)
     )
-    return Experiment(
-        folder.name, folder, tuple(usable), (*warnings, *unread), forgotten, lacking=lacking
-    )
+    found = Experiment(folder.name, folder, tuple(usable), (*warnings, *unread), forgotten)
+    return replace(found, lacking=lacking, seen=read_seen(folder))
 
 
 def _forgotten(home: Path, there: Collection[Path]) -> tuple[tuple[TrialResult, ...], list[str]]:

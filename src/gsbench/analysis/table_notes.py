@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Sequence
 
-from gsbench.analysis.fairness import caveats, limit_notes
+from gsbench.analysis.fairness import caveats, counts_notes, limit_notes
 from gsbench.analysis.notes import Note
 from gsbench.analysis.results import Experiment, TrialResult, group_by, seeds_text
 from gsbench.events import FEWEST_ROUNDS
@@ -52,8 +52,8 @@ def comparison_notes(experiment: Experiment) -> list[Note]:
         for first, second in comparison.pairs
         for note in caveats([*by_arm[first], *by_arm[second]], first, second)
     ]
-    limits = limit_notes(comparison.trials, comparison.pairs)
-    return [*comparison.notes(), *limits, *between]
+    both = comparison.trials, comparison.pairs
+    return [*comparison.notes(), *limit_notes(*both), *counts_notes(*both), *between]
 
 
 def doubt_notes(trials: Sequence[TrialResult]) -> list[Note]:

@@ -14,6 +14,7 @@ from gsbench.runs.experiments import QUESTIONS, Arm, trial_key, unix_time
 from gsbench.runs.freshness import Change, Part, code_changes, code_of, present_version
 from gsbench.runs.layout import RESULTS
 from gsbench.runs.nested import SHOWN
+from gsbench.runs.seen import SeenResult
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS, TrialRecord, split_text
 from gsbench.system.machine import kind_of_machine
@@ -108,6 +109,11 @@ class TrialResult:
         """The versions of the code that made the trial; empty if another program made it."""
         return code_of(self.record.code)
 
+    @cached_property
+    def as_seen(self) -> SeenResult:
+        """The result as the record of what was ever measured has it."""
+        return SeenResult.of(self.record)
+
     @property
     def code_texts(self) -> list[str]:
         """``code of mine 3fa9c1d2`` for each of the user's modules and of gsbench's stages."""
@@ -146,7 +152,7 @@ class TrialResult:
     def measured(self) -> float:
         """The Unix time of measuring the metrics; if unrecorded, that of finishing the trial."""
         moment = unix_time(self.record.measured)
-        return min(int(self.finished) if moment is None else moment, self.known - 1)
+        return min(self.finished if moment is None else moment, self.known - 1)
 
     @cached_property
     def conditions(self) -> Mapping[str, str]:

@@ -225,11 +225,14 @@ def sentence(judged: PairVerdicts) -> str:
     in_doubt = [verdict for verdict in verdicts if verdict.favours_lacking][:1]
     if all(verdict.interval is None for verdict in verdicts):
         return f"{against}: no verdict, {TOO_FEW.format(where)}."
+    # in looks all metrics share the error rate equally, so none of them counts a family
+    number = max(len(verdicts), *(one.family for one in verdicts))
+    looks = " and for the planned looks" if first.question.seeds else ""
     return (
         f"{against}, on {where}: {_by_word(verdicts, with_numbers=True)}. Exploratory: "
         f"{_why_exploratory(judged)}, so all metrics count, adjusted for their number "
-        f"({max(verdict.family for verdict in verdicts)}).{_versions_words(judged)}"
-        + "".join(f" Undecided: {lacking_words(verdict.lacking)}." for verdict in in_doubt)
+        f"({number}){looks}.{_versions_words(judged)}"
+        + "".join(f" Undecided: {lacking_words(one.lacking)}." for one in in_doubt)
     )
 
 
@@ -364,10 +367,8 @@ def families(judged: Sequence[PairVerdicts]) -> list[str]:
         lines.append(f"All other metrics are secondary and do not decide the verdict; {how}.")
     if "" in sizes:
         number = f"{_or(sizes[''])} {'test' if sizes[''] == [1] else 'tests'}"
-        lines.append(
-            "Exploratory verdicts: all metrics of a pair of arms are one family, "
-            f"{number} adjusted by Holm."
-        )
+        how = "with equal shares of 5 % at each look" if looks else f"{number} adjusted by Holm"
+        lines.append(f"Exploratory verdicts: all metrics of a pair of arms are one family, {how}.")
     return lines
 
 

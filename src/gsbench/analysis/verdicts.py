@@ -33,6 +33,7 @@ from gsbench.analysis.results import Arm, TrialResult, group_by
 from gsbench.analysis.statistics import UNDECIDED
 from gsbench.analysis.unfinished import Unfinished
 from gsbench.runs.experiments import NO_TIME, Declaration, Question
+from gsbench.runs.seen import SeenResult
 
 ArmPair = tuple[Arm, Arm]  # baseline, other arm
 DECLARED, SECONDARY = "declared", "secondary"
@@ -93,13 +94,14 @@ def judge_pairs(
     lacking: Sequence[Unfinished] = (),
     others: Sequence[ArmPair] = (),
     older: Sequence[TrialResult] = (),
+    seen: Sequence[SeenResult] = (),
     turned: Collection[ArmPair] = (),
 ) -> list[PairVerdicts]:
     """Judge each pair of arms in every metric that has a direction.
 
     ``declared`` defines the families of tests; ``lacking`` are trials without a result, ``older``
-    those of earlier code. The pairs ``others`` are no questions of the declaration, and those that
-    are ``turned`` are questions of it with the sides exchanged.
+    those of earlier code, ``seen`` what was ever measured. The pairs ``others`` are no questions of
+    the declaration, and those that are ``turned`` are questions of it with the sides exchanged.
     """
     by_arm = group_by(trials, lambda trial: trial.arm)
     primaries: dict[ArmPair, Quantity] = {}
@@ -127,7 +129,7 @@ def judge_pairs(
             if not metric.direction
         ]
         directed = [metric for metric in metrics if metric.direction]
-        versions[pair] = measured_versions(*sides, older)
+        versions[pair] = measured_versions(*sides, older, seen)
         known = standings.get(pair)
         asked += [
             PairQuestion(pair, metric, _question(first, pair, metric, known), known, versions[pair])
@@ -232,8 +234,12 @@ def _judge_families(
             # Without a time no trial is late, so Holm's method alone adjusts for the number of
             # metrics.
             declaration = Declaration(time=NO_TIME, questions=questions)
+            standing = own[0][1].standing
+            if standing is not None and questions[0].seeds:
+                # also if it is exploratory: its trials end at the look that pleased
+                declaration = replace(declaration, looks=standing.declaration.looks)
             if (named := own[0][1].declaration) is not None:
-                looks = named.looks if questions[0].seeds else ()
+                looks = declaration.looks
                 # an arm without any trial yet keeps its share of the error rate
                 asked_scenes = [question.scenes for question in questions]
                 waiting = [
@@ -247,7 +253,6 @@ def _judge_families(
                     declaration,
                     questions=(*questions, *waiting),
                     error_rate=named.error_rate,
-                    looks=looks,
                 )
             rate = declaration.error_rate * share_of_version(number)
             found = judge(trials, replace(declaration, error_rate=rate), lacking, others)
@@ -296,7 +301,9 @@ def _of_earlier_code(
         # the state when this version was trained
         first = min(trial.measured for trial in version)
         known = replace(
-            declared, older=tuple(trial for trial in declared.older if trial.measured < first)
+            declared,
+            older=tuple(one for one in declared.older if one.measured < first),
+            seen=tuple(one for one in declared.seen if one.moment < first),
         )
         standing = known.standing(baseline, version)
         questions = [
@@ -335,14 +342,17 @@ def _question(
         baseline=baseline,
         arm=arm,
     )
-    if standing is None or not standing.beforehand:
+    if standing is None:
         return question
     active, planned = standing.active, standing.question
-    split_question = next((trial.question for trial in of_baseline), "")
-    is_primary = active.question in ("", split_question) and metric.key == active.metric
     if planned is not None:
         question = replace(question, scenes=planned.scenes, seeds=planned.seeds)
-        question = replace(question, least=planned.least) if is_primary else question
+    if not standing.beforehand:
+        return question
+    split_question = next((trial.question for trial in of_baseline), "")
+    is_primary = active.question in ("", split_question) and metric.key == active.metric
+    if planned is not None and is_primary:
+        question = replace(question, least=planned.least)
     return replace(question, secondary=not is_primary)
 
 

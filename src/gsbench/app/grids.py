@@ -14,9 +14,10 @@ from typing import Any
 from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, OmegaConf
 
+from gsbench.analysis.advice import GRIDS
 from gsbench.app.sweep import Run, Sweep
 from gsbench.app.tuning import tuned_jobs
-from gsbench.claims.stopping import KeyAndSeed, log_verdicts, plan_sweep
+from gsbench.claims.stopping import KeyAndSeed, log_verdicts, plan_sweep, sequential_test
 from gsbench.config.command_words import grid_points, is_interval
 from gsbench.config.compose import Trial
 from gsbench.config.groups import GROUPS
@@ -26,8 +27,6 @@ from gsbench.files import checked_runs_folder, make_runs_folder
 from gsbench.launch.record import declare_questions
 from gsbench.runs.layout import RESULTS
 from gsbench.words import listed
-
-GRIDS = "hydra.sweeper.grids"
 
 log = logging.getLogger(__name__)
 
@@ -94,7 +93,7 @@ def _run_until_decided(trials: Sequence[Trial], run: Run) -> None:
         if batch:
             run(batch)
 
-    stopping.test.answer(run_planned)
+    sequential_test(stopping).answer(run_planned)
     if not launched:  # else it is said when the trials' outcomes are
         log_verdicts(trials)
     spared = [

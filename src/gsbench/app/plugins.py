@@ -24,8 +24,9 @@ from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig, OmegaConf
 
+from gsbench.analysis.advice import GRIDS
 from gsbench.analysis.results import group_by
-from gsbench.app.grids import GRIDS, run_sweep
+from gsbench.app.grids import run_sweep
 from gsbench.app.hydra_files import check_links, words_for_hydras_files, words_for_new_folder
 from gsbench.app.hydra_main import run_main
 from gsbench.app.sweep import DEFAULT_METRIC, HYDRA_ERRORS, OWN, Ended, Sweep, better_direction

@@ -12,6 +12,7 @@ An archive is a zip file that is also an RO-Crate 1.2 (`gsbench.claims.export` w
 - ``declared.jsonl``: the declarations of the experiment, if there are any;
 - ``ledger.jsonl``: the ideas of a ledger (`gsbench ledger`), if it is one;
 - ``searches.jsonl``: the records of searches that tuned its arms, or of the search that it is;
+- ``seen.jsonl``: all results that were ever measured (`gsbench.runs.seen`);
 - ``from_pixels.jsonl``: measures of the trials' pictures, if declared claims use them;
 - ``pictures/``: renders and photographs of test views by trial, only if they were asked for;
 - ``archive.json``: the version of this format and the sha256 of the files above;
@@ -55,12 +56,12 @@ from gsbench.runs.layout import (
     RESULTS,
     TUNING,
 )
+from gsbench.runs.seen import seen_path
 from gsbench.settings import ARM_BYTES, is_folder_name
 from gsbench.words import readable_bytes
 
-RECORDS = (DECLARED, LEDGER)  # files of the experiment itself
 FORMAT, VERSION = "gsbench results", 1
-PIXELS = "from_pixels.jsonl"
+PIXELS, SEEN_RESULTS = "from_pixels.jsonl", "seen.jsonl"
 MANIFEST, CRATE = "archive.json", "ro-crate-metadata.json"
 TRIALS, CONFIGURATIONS = "results.jsonl", "configurations.jsonl"
 SEARCHES = "searches.jsonl"
@@ -242,9 +243,15 @@ def _unpack(
     for name in contents:
         if name.startswith(f"{PICTURES_FOLDER}/"):
             _unpack_picture(home, name, contents[name])
-    for name in RECORDS:
+    for name, place in records_of(home).items():
         if name in contents:
-            (home / name).write_bytes(contents[name])
+            place.parent.mkdir(exist_ok=True)
+            place.write_bytes(contents[name])
+
+
+def records_of(home: Path) -> dict[str, Path]:
+    """The files of the experiment itself, by their names in an archive."""
+    return {DECLARED: home / DECLARED, LEDGER: home / LEDGER, SEEN_RESULTS: seen_path(home)}
 
 
 def _unpack_unfinished(home: Path, line: Mapping[str, Any]) -> Path:

@@ -20,7 +20,7 @@ from gsbench.analysis.statistics import SUPPORTED
 from gsbench.analysis.verdict_words import in_words, reason
 from gsbench.claims.archive import unpack_archive
 from gsbench.claims.file import Claim, ClaimsFile
-from gsbench.claims.stopping import KeyAndSeed, SequentialTest, trials_of_look
+from gsbench.claims.stopping import KeyAndSeed, trials_of_look
 from gsbench.config.compose import Trial, compose_one, with_seed
 from gsbench.errors import InputError
 from gsbench.parsing import read_if_sound
@@ -116,17 +116,13 @@ class Check:
         questions = range(len(self.declaration.questions))
         return self.to_run(trials_of_look(self.declaration, questions, seeds))
 
-    @property
-    def test(self) -> SequentialTest:
-        return SequentialTest(self.declaration, lambda: read_experiment(self.home).trials)
-
     def checked(self, judged: Sequence[Verdict]) -> Checked:
         """All claims in the order of the file, with the reasons why trials failed."""
         verdicts = claim_verdicts(self.file, self.declaration, judged)
         verdicts = [
             replace(verdict, failed=tuple(self._failures(verdict.verdict))) for verdict in verdicts
         ]
-        unused = unused_trials(list(self.test.read()), judged)
+        unused = unused_trials(read_experiment(self.home).trials, judged)
         declarations = read_declarations(self.home)
         return Checked(self.file, verdicts, self.declaration, declarations, unused)
 

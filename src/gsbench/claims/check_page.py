@@ -7,7 +7,7 @@ from pathlib import Path
 
 from gsbench.analysis.advice import equal_counts_settings
 from gsbench.analysis.cells import with_variants
-from gsbench.analysis.fairness import caveats, fairness_table, limit_notes
+from gsbench.analysis.fairness import caveats, counts_notes, fairness_table, limit_notes
 from gsbench.analysis.looks import plan_looks
 from gsbench.analysis.notes import Note, texts
 from gsbench.analysis.report.charts import ForestRow, forest_plot
@@ -140,7 +140,8 @@ def _fairness(judged: ClaimVerdict) -> tuple[tuple[Table, ...], str]:
     )
     pairs = [(baseline, arm) for baseline, arm in arms if baseline != arm]
     # The arms are written in the claims file, so no command alone would change them.
-    notes = [note for pair in pairs for note in caveats(trials, *pair, equal_counts_settings)]
+    notes = counts_notes(trials, pairs, equal_counts_settings)
+    notes += [note for pair in pairs for note in caveats(trials, *pair)]
     return tuple(fairness_table(trials, *pair) for pair in pairs), " ".join(
         texts([*notes, *limit_notes(trials, pairs)])
     )

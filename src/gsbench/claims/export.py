@@ -40,10 +40,12 @@ from gsbench.claims.archive import (
     PIXELS,
     SEARCHES,
     SEED_KEY,
+    SEEN_RESULTS,
     TRIALS,
     UNFINISHED,
     VERSION,
     check_size,
+    records_of,
 )
 from gsbench.errors import InputError
 from gsbench.files import atomic
@@ -79,6 +81,7 @@ FILES = {  # media types and descriptions
     SEARCHES: ("application/jsonl", "The searches that tuned arms, with all points"),
     DECLARED: ("application/jsonl", "What was declared before the trials were run"),
     LEDGER: ("application/jsonl", "The ideas of a ledger and their tests (gsbench ledger)"),
+    SEEN_RESULTS: ("application/jsonl", "All results that were measured, also removed ones"),
     MANIFEST: ("application/json", "Version of the archive, and the sha256 of its files"),
 }
 
@@ -151,16 +154,16 @@ def _write_zip(
 
 
 def _declared(home: Path, trials: Sequence[TrialResult]) -> dict[str, bytes]:
-    """The declarations, the ledger, and what declared questions ask of pictures.
+    """The experiment's own records, and what declared questions ask of pictures.
 
     The pictures themselves are mostly not in the archive.
     """
-    contents = {}
-    if (home / DECLARED).is_file():
-        contents[DECLARED] = read_bytes(home / DECLARED)
-    if (home / LEDGER).is_file():
-        contents[LEDGER] = _shared_ledger(home)
-    asked = itertools.chain(*(declaration.questions for declaration in read_declarations(home)))
+    records = {name: place for name, place in records_of(home).items() if place.is_file()}
+    contents = {
+        name: _shared_ledger(home) if name == LEDGER else read_bytes(place)
+        for name, place in records.items()
+    }
+    asked = itertools.chain(*(one.questions for one in read_declarations(home)))
     if TEXTURED.key in {question.metric for question in asked}:
         measured = []
         for trial in trials:

@@ -8,14 +8,14 @@ import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import yaml
 
 from gsbench.analysis.advice import equal_counts_settings
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.comparison import compare
-from gsbench.analysis.fairness import counts_note, limit_notes
+from gsbench.analysis.fairness import counts_notes, limit_notes
 from gsbench.analysis.judgement import Verdict, judge
 from gsbench.analysis.looks import FIRST_LOOK, plan_looks
 from gsbench.analysis.notes import texts
@@ -26,7 +26,7 @@ from gsbench.config.compose import Trial
 from gsbench.errors import InputError
 from gsbench.eval.facts import MetricFacts, facts_of, find_metric
 from gsbench.runs.experiments import Declaration, Question, declared_now, trial_key
-from gsbench.runs.layout import SEED
+from gsbench.runs.layout import LEDGER, SEED
 from gsbench.runs.nested import flatten
 from gsbench.words import counted
 
@@ -91,6 +91,20 @@ class SequentialTest:
         return verdicts
 
 
+class InExperiment(Protocol):
+    """A declaration about the experiment in the folder ``home``."""
+
+    @property
+    def declaration(self) -> Declaration: ...
+    @property
+    def home(self) -> Path: ...
+
+
+def sequential_test(asked: InExperiment) -> SequentialTest:
+    """The test of a declaration's questions by all trials of its experiment."""
+    return SequentialTest(asked.declaration, lambda: read_experiment(asked.home).trials)
+
+
 @dataclass(frozen=True)
 class SweepInLooks:
     """The trials of a sweep that stops when decided, with its declaration."""
@@ -98,10 +112,6 @@ class SweepInLooks:
     declaration: Declaration
     home: Path
     trials: Mapping[KeyAndSeed, Trial]
-
-    @property
-    def test(self) -> SequentialTest:
-        return SequentialTest(self.declaration, lambda: read_experiment(self.home).trials)
 
     def describe(self) -> str:
         """A line about the looks for a dry run."""
@@ -189,15 +199,14 @@ def log_verdicts(trials: Iterable[Trial]) -> None:
     """Log the verdicts of the experiments of ``trials``, and what one must know beside them.
 
     These are unequal counts and limits without effect, said first, trials in no verdict, and
-    earlier code.
+    earlier code. A ledger says its own verdicts: what is said of a sweep does not fit its ideas.
     """
     for home in dict.fromkeys(trial.files.home for trial in trials):
+        if (home / LEDGER).exists():
+            continue
         comparison = compare(newest_code(read_experiment(home)))
-        counts = [
-            counts_note(comparison.trials, *pair, equal_counts_settings)
-            for pair in comparison.pairs
-        ]
-        before = [*filter(None, counts), *limit_notes(comparison.trials, comparison.pairs)]
+        both = comparison.trials, comparison.pairs
+        before = [*counts_notes(*both, equal_counts_settings), *limit_notes(*both)]
         said = [*texts(before), *comparison.sentences, *texts(comparison.remarks)]
         said += comparison.experiment.versions
         for line in said:

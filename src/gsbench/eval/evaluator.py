@@ -1,6 +1,5 @@
 """The evaluator: it applies a protocol's metrics and the user's own to pairs of images."""
 
-import importlib.util
 import math
 import traceback
 from collections.abc import Callable, Mapping, Sequence
@@ -28,10 +27,11 @@ from gsbench.eval.facts import (
     further_keys,
     lpips_variants,
 )
+from gsbench.eval.flip import flip, flip_map
 from gsbench.eval.images import as_batch, as_unit_range, in_double_precision, replace_ignored
 from gsbench.eval.lpips import Lpips, load_lpips
 from gsbench.eval.metric import MaskedMetric, Metric, UnavailableError
-from gsbench.eval.metrics import flip, flip_map, psnr
+from gsbench.eval.metrics import psnr
 from gsbench.eval.protocol import Protocol
 from gsbench.eval.ssim import ssim
 from gsbench.weights import MissingWeightsError
@@ -111,16 +111,13 @@ class Flip:
     """FLIP for the protocol's viewer."""
 
     def __init__(self, context: MetricContext) -> None:
-        if importlib.util.find_spec("flip_evaluator") is None:
-            reason = "the package flip-evaluator is not installed: pip install flip-evaluator"
-            raise UnavailableError(reason, awaited=True)
         self._ppd = context.protocol.flip_ppd
 
     def measure(self, image: Tensor, truth: Tensor) -> float:
         return float(flip(image, truth, self._ppd))
 
     def measure_masked(self, image: Tensor, truth: Tensor, mask: Tensor) -> float:
-        return float(flip_map(image, truth, self._ppd)[mask].mean())
+        return float(in_double_precision(flip_map(image, truth, self._ppd))[mask].mean())
 
 
 class StructuralMetric:
@@ -150,7 +147,7 @@ def _corrected(key: str) -> Callable[[MetricContext], Metric]:
 
 
 # Makes each metric of `gsbench.eval.facts.METRICS` for a context, or raises UnavailableError if
-# weights or packages are missing.
+# weights are missing.
 MEASURES: dict[str, Callable[[MetricContext], Metric]] = {
     "psnr": Psnr,
     "ssim": Ssim,
@@ -182,7 +179,7 @@ class Evaluator:
     name. ``weights`` is the folder that is searched first.
 
     ``unavailable`` maps each metric that cannot be computed to the reason, in one line. ``awaited``
-    holds those that can be computed once their weights or packages are installed. Both can grow
+    holds those that can be computed once their weights are installed. Both can grow
     while views are evaluated; ``summarize`` then leaves the metric out for all views. ``own`` are
     the facts of the user's metrics.
     """

@@ -1,5 +1,7 @@
 """Operations on images that metrics and the loss share."""
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -62,6 +64,16 @@ def mix_channels(images: Tensor, weights: tuple[float, float, float]) -> Tensor:
     """The weighted sum [B, 1, H, W] of the channels of [B, 3, H, W]."""
     red, green, blue = weights
     return images[:, :1] * red + images[:, 1:2] * green + images[:, 2:] * blue
+
+
+def correlate(images: Tensor, weights: Sequence[float], axis: int) -> Tensor:
+    """Weighted sums of neighbours along ``axis``, which gets ``len(weights) - 1`` px smaller."""
+    size = images.shape[axis] - len(weights) + 1
+    # Sums of shifted images are several times faster on a CPU than a depthwise convolution.
+    total = images.narrow(axis, 0, size) * weights[0]
+    for offset, weight in enumerate(weights[1:], start=1):
+        total.add_(images.narrow(axis, offset, size), alpha=weight)
+    return total
 
 
 def halved(images: Tensor, padding: str) -> Tensor:

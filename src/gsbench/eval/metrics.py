@@ -1,12 +1,9 @@
-"""PSNR, FLIP and GMSD by their exact definitions, each with one value per image.
+"""PSNR and GMSD by their exact definitions, each with one value per image.
 
 Images are torch tensors in [0, 1], either one image [H, W, 3] (the value is a 0-dimensional tensor)
 or a batch [B, 3, H, W] (the values are [B]).
 """
 
-from typing import Any
-
-import torch
 from torch import Tensor
 
 from gsbench.eval.images import (
@@ -19,7 +16,6 @@ from gsbench.eval.images import (
     mix_channels,
     similarity,
 )
-from gsbench.eval.protocol import FLIP_PPD
 
 
 def psnr(image: Tensor, target: Tensor) -> Tensor:
@@ -31,37 +27,6 @@ def psnr(image: Tensor, target: Tensor) -> Tensor:
     squared = (image - target).square()
     mse = squared.mean() if image.ndim == 3 else squared.flatten(1).mean(dim=1)  # [] or [B]
     return -10.0 * mse.log10()
-
-
-def flip(image: Tensor, target: Tensor, ppd: float = FLIP_PPD) -> Tensor:
-    """Mean FLIP error of sRGB images: 0 identical, 1 worst.
-
-    The viewer sees ``ppd`` pixels per degree. NVIDIA's library ``flip-evaluator`` computes it after
-    Andersson et al. 2020, "FLIP: a difference evaluator for alternating images". Raises
-    ModuleNotFoundError if the library is not installed.
-    """
-    check_pair(image, target)
-    pairs = zip(*(as_batch(x).permute(0, 2, 3, 1) for x in (image, target)), strict=True)
-    means = [_mean_and_errors(x, y, ppd)[0] for x, y in pairs]
-    values = torch.tensor(means, device=image.device)  # [B]
-    return values[0] if image.ndim == 3 else values
-
-
-def flip_map(image: Tensor, target: Tensor, ppd: float = FLIP_PPD) -> Tensor:
-    """The FLIP error of every pixel, [H, W], of images [H, W, 3]; see `flip`."""
-    check_pair(image, target)
-    _, errors = _mean_and_errors(image, target, ppd)
-    return torch.as_tensor(errors, device=image.device).reshape(image.shape[:2])
-
-
-def _mean_and_errors(image: Tensor, target: Tensor, ppd: float) -> tuple[float, Any]:
-    import flip_evaluator
-
-    test, reference = (x.float().cpu().contiguous().numpy() for x in (image, target))
-    errors, mean, _ = flip_evaluator.evaluate(
-        reference, test, "LDR", applyMagma=False, parameters={"ppd": ppd}
-    )
-    return mean, errors
 
 
 PREWITT = (1 / 3, 1 / 3, 1 / 3)

@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from gsbench.eval.images import as_batch, check_pair, check_size
+from gsbench.eval.images import as_batch, check_pair, check_size, correlate
 from gsbench.eval.protocol import SsimPadding
 
 WINDOW_RADIUS = 5  # px
@@ -92,10 +92,5 @@ def _blur(images: Tensor, padding: SsimPadding) -> Tensor:
     if padding == "zero":
         images = F.pad(images, [WINDOW_RADIUS] * 4)
     for axis in (2, 3):
-        size = images.shape[axis] - WINDOW_SIZE + 1
-        # Sums of shifted images are several times faster on a CPU than a depthwise convolution.
-        blurred = images.narrow(axis, 0, size) * _WEIGHTS[0]
-        for offset, weight in enumerate(_WEIGHTS[1:], start=1):
-            blurred.add_(images.narrow(axis, offset, size), alpha=weight)
-        images = blurred
+        images = correlate(images, _WEIGHTS, axis)
     return images

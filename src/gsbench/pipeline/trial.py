@@ -33,6 +33,7 @@ from gsbench.normalization import Normalization
 from gsbench.parsing import read_json, read_typed
 from gsbench.pipeline.parts import Parts
 from gsbench.pipeline.steps.evaluate import evaluate_step
+from gsbench.pipeline.steps.external import external_step
 from gsbench.pipeline.steps.scene import (
     CaptureSource,
     Views,
@@ -43,9 +44,9 @@ from gsbench.pipeline.steps.scene import (
     normalized_capture,
     normalizing_step,
 )
-from gsbench.pipeline.steps.train import external_step, train_step
+from gsbench.pipeline.steps.train import train_step
 from gsbench.runs import keys, layout
-from gsbench.runs.config_hash import config_hash
+from gsbench.runs.config_hash import arm_hash, config_hash
 from gsbench.runs.experiments import read_declarations
 from gsbench.runs.nested import flatten, sha256_of
 from gsbench.runs.rows import read_rows
@@ -366,6 +367,7 @@ def results_of(
         init_report=read_json(init.path / REPORT_FILE),
         hashes={
             "config": config_hash(values),
+            "arm": arm_hash(values),
             "data": capture.fingerprint,
             "cloud": cloud_hash(init.path),
             **{stage.name: entries[stage.name].key for stage in stages},

@@ -1,9 +1,9 @@
 """The settings that determine a result, and their hash, which names a trial's folder."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from gsbench.runs.nested import GSBENCH, TARGET, sha256_of
+from gsbench.runs.nested import GSBENCH, TARGET, flatten, sha256_of
 from gsbench.runs.user_code import user_modules
 
 # Options that cannot change a result. This holds for gsbench's own classes; a user's class may use
@@ -13,6 +13,34 @@ WITHOUT_EFFECT = ("threads", "weights", "download", "time_limit_minutes")
 # train.steps_scaler has been applied to the steps.
 DECLARED = {"eval": ("primary", "controls"), "densify": ("switches",), "train": ("steps_scaler",)}
 NOT_HASHED = ("name", "seed", "device", "threads", "runs", "allow_targets", "tracking", "launch")
+# Settings in which trials of one cell may differ: they do not change what is computed.
+# "x" stands for x and all below it (x.y).
+IGNORED_SETTINGS = (
+    *NOT_HASHED,
+    *(f"{group}.{name}" for group, names in DECLARED.items() for name in names),
+    "hydra",
+    "experiment",
+    "scene.path",
+)
+# Settings that do not change the trained model.
+NO_INGREDIENTS = (
+    *IGNORED_SETTINGS,
+    "eval",
+    "scene.name",
+    "raster.name",
+    "init.name",
+    "init.device",
+    "init.weights",
+    "init.download",
+    "init.threads",
+    "densify.name",
+    "densify.time_limit_minutes",
+    "train.name",
+    "train.log_every",
+    "train.checkpoint_every",
+    "train.checkpoint_minutes",
+    "train.volume_histogram",
+)
 
 
 def is_hashed(key: str) -> bool:
@@ -42,3 +70,32 @@ def determining_settings(values: Mapping[str, Any]) -> dict[str, Any]:
                 dropped |= set(WITHOUT_EFFECT)
             kept[key] = {name: value for name, value in group.items() if name not in dropped}
     return kept
+
+
+def arm_hash(values: Mapping[str, Any]) -> str:
+    """sha256 of what an arm is made of: classes and settings, without names, code and evaluation.
+
+    Arms of one hash are the same arm, whatever its name, and versions of it if their code differs.
+    """
+    return sha256_of(
+        {
+            key: value
+            for key, value in flatten(values).items()
+            if value is not None and is_ingredient(key)
+        }
+    )
+
+
+def is_ingredient(key: str) -> bool:
+    """Return whether a setting may change the trained model."""
+    return not is_among(key, NO_INGREDIENTS)
+
+
+def is_among(key: str, settings: Sequence[str]) -> bool:
+    """Return whether a dotted key is one of ``settings`` or below one of them.
+
+    A key that only begins with the same letters is another setting: a user's class may have the
+    option ``densify.name_noise``.
+    """
+    parts = key.split(".")
+    return any(".".join(parts[:count]) in settings for count in range(1, len(parts) + 1))

@@ -65,7 +65,7 @@ CAPTURE = Stage("scene", 2)
 INIT = Stage("init", 4, resumable=True)
 TRAIN = Stage("train", 3, resumable=True, scratch=("checkpoint-*.pt",))
 GROUND_TRUTH = Stage("ground_truth", 1)
-EVALUATE = Stage("evaluate", 2)
+EVALUATE = Stage("evaluate", 3)
 
 STAGES = (CAPTURE, INIT, TRAIN, GROUND_TRUTH, EVALUATE)
 
@@ -85,7 +85,7 @@ CODE_OF_STAGE = {
         "weights.py",
         "pipeline/steps/scene.py",
     ),
-    "train": (*MODEL, *LOSS, "external", "pipeline/steps/train.py"),
+    "train": (*MODEL, *LOSS, "external", "pipeline/steps/train.py", "pipeline/steps/external.py"),
     "ground_truth": ("scene", "normalization.py", "pipeline/steps/scene.py"),
     "evaluate": (*MODEL, "eval", "weights.py", "pipeline/steps"),
 }

@@ -8,6 +8,7 @@ STORE = "store"  # results of stages by key
 ARTIFACTS, DATABASE = "mlartifacts", "mlflow.db"  # MLflow's files
 TENSORBOARD, WANDB = "tensorboard", "wandb"  # other trackers' files
 IN_RUNS = (STORE, ARTIFACTS, DATABASE, TENSORBOARD, WANDB)
+SEEN = ".seen"  # a file for each experiment: what was ever measured in it
 JOBS = ".jobs"  # output of the jobs of launch=local and launch=slurm, with a folder per experiment
 
 # in the store

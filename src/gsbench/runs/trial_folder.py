@@ -38,6 +38,7 @@ from gsbench.runs.config_hash import config_hash
 from gsbench.runs.freshness import Change, change_of_files, changes, origin_of
 from gsbench.runs.nested import sha256_of
 from gsbench.runs.rows import Row, read_rows
+from gsbench.runs.seen import remember
 from gsbench.runs.trial_files import Building, Configuration, Failure, MadeOf, ResultsFile
 from gsbench.runs.trial_record import TrialRecord, UnfinishedError, record_from
 from gsbench.system.locks import is_held
@@ -245,6 +246,7 @@ class TrialFolder:
             finished = (self._origin and self._origin.finished) or before.st_mtime
         origin = origin_of(self.path, content, values, sources, entries or {}, published)
         origin = replace(origin, finished=finished)
+        remember(self.home, record)
         with atomic(path) as temporary:
             temporary.write_text(
                 json.dumps(content | {MADE_OF: origin.to_json()}, indent=1, allow_nan=False) + "\n"

@@ -146,8 +146,8 @@ class TrialRecord(Record):
 
     A value that cannot be known is None; the file leaves out None if that is the default.
     ``metrics`` are means over the test views. ``unavailable`` says why other metrics are
-    missing; ``awaited`` names those of them that need only weights or packages. ``seconds`` are
-    by stage; ``resolution`` is (width, height) in px.
+    missing; ``awaited`` names those of them that need only weights. ``seconds`` are by stage;
+    ``resolution`` is (width, height) in px.
     """
 
     status: Literal["complete"]

@@ -163,7 +163,8 @@ class WandB:
         import wandb
 
         folder = trial.folder.runs / layout.WANDB
-        require_no_links(trial.folder.runs, folder)
+        for name in ("wandb", ".wandb"):  # where its client writes
+            require_no_links(trial.folder.runs, folder / name)
         folder.mkdir(exist_ok=True)
         self._root = trial.folder.path
         self._run: Any = wandb.init(

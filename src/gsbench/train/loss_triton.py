@@ -25,14 +25,11 @@ from gsbench.raster.triton.launch import Workspace, WorkspacePool, launch_grid
 
 STRIP = 128  # numbers of a row per program
 MIN_ROWS = 8  # rows per program
-# The numbers of programs are chosen for an H100 or H200. A multiprocessor holds five programs at
-# once: it has 65,536 registers, and each of the 128 lanes of a program uses at most 96 there.
-MULTIPROCESSORS, PROGRAMS_HELD = 132, 5
-# Programs that a multiprocessor needs to be busy: one issued an instruction in every 4.6th cycle
-# (`measure_similarity`) or 7.9th (`differentiate`), by Nsight Compute on an H100.
-PROGRAMS_BUSY = 4
-# Without this limit, `differentiate` takes 108 registers for the same loads. ROCm has none.
-REGISTERS = {} if torch.version.hip else {"maxnreg": 96}
+# The numbers of programs are chosen for an H100 or H200. A multiprocessor holds six programs at
+# once: it has 65,536 registers, and each of the 128 lanes of a program uses at most 80.
+MULTIPROCESSORS, PROGRAMS_HELD = 132, 6
+# Without this limit, the kernels take up to 91 registers for the same loads. ROCm has none.
+REGISTERS = {} if torch.version.hip else {"maxnreg": 80}
 RADIUS = tl.constexpr(WINDOW_RADIUS)
 CHANNELS = tl.constexpr(3)
 # from the centre outwards
@@ -44,23 +41,12 @@ F_C1, F_C2 = tl.constexpr(C1), tl.constexpr(C2)
 def rows_of_program(height: int, numbers: int) -> int:
     """The number of rows per program, for an image of ``height`` rows of ``numbers`` each.
 
-    A program filters ``2 * RADIUS`` rows besides its own. So few programs do less work in all, but
-    leave multiprocessors idle. The function chooses the number of programs per multiprocessor, all
-    running at once, for which the busiest multiprocessor filters the fewest rows. Fewer programs
-    than `PROGRAMS_BUSY` count as that many, because nothing runs while they wait for memory. The
-    result depends only on the size of the image, so every GPU adds up in the same order.
+    A program filters ``2 * RADIUS`` rows besides its own, so few programs do less work in all. But
+    each one waits for memory most of the time: a multiprocessor is busiest with as many as it
+    holds. The result depends only on the size of the image, so every GPU adds up in the same order.
     """
-    strips = triton.cdiv(numbers, STRIP)
-
-    def rows(held: int) -> int:
-        return max(MIN_ROWS, triton.cdiv(height, max(1, held * MULTIPROCESSORS // strips)))
-
-    def filtered(held: int) -> int:
-        programs = strips * triton.cdiv(height, rows(held))
-        fullest = triton.cdiv(programs, MULTIPROCESSORS)
-        return max(PROGRAMS_BUSY, fullest) * (rows(held) + 2 * WINDOW_RADIUS)
-
-    return rows(min(range(1, PROGRAMS_HELD + 1), key=filtered))
+    lines = max(1, PROGRAMS_HELD * MULTIPROCESSORS // triton.cdiv(numbers, STRIP))
+    return max(MIN_ROWS, triton.cdiv(height, lines))
 
 
 @triton.jit
@@ -99,10 +85,15 @@ def _push(sums, value):
 
 
 @triton.jit
-def _load(array, row, number, height, numbers, scale):
-    """Load numbers of one row as float32, times ``scale``; 0 outside the image."""
-    inside = (row >= 0) & (row < height) & (number >= 0) & (number < numbers)
-    return tl.load(array + row * numbers + number, mask=inside, other=0).to(tl.float32) * scale
+def _load(row, number, limit, offset: tl.constexpr, scale):
+    """Load numbers of a row, ``offset`` from the lanes' own, as float32, times ``scale``.
+
+    ``row`` are the lanes' pointers. The result is 0 where the number is not in [0, ``limit``).
+    """
+    # Constants are added to the pointers last: they cost neither registers nor instructions there.
+    # As unsigned, negative numbers are above every limit.
+    inside = (number + offset).to(tl.uint32) < limit.to(tl.uint32)
+    return tl.load(row + offset, mask=inside, other=0).to(tl.float32) * scale
 
 
 @triton.jit
@@ -145,15 +136,16 @@ def measure_similarity(
     plane = height.to(tl.int64) * numbers
     for row in range(first - RADIUS, tl.minimum(first + rows, height) + RADIUS):
         # Windows of the first and the last row reach RADIUS rows beyond; L1 does not count these.
-        x = _load(image, row, number, height, numbers, 1.0)
-        y = _load(target, row, number, height, numbers, scale)
+        limit = tl.where((row >= 0) & (row < height), numbers, 0)
+        xs, ys = image + (row * numbers + number), target + (row * numbers + number)
+        x = _load(xs, number, limit, 0, 1.0)
+        y = _load(ys, number, limit, 0, scale)
         total_l1 += tl.where((row >= first) & (row < first + rows), tl.abs(x - y), 0.0)
         blurred = _add((zero, zero, zero, zero), x, y, W0)
         for k in tl.static_range(1, RADIUS + 1):
             for side in tl.static_range(-1, 2, 2):
-                neighbour = number + side * k * CHANNELS
-                x = _load(image, row, neighbour, height, numbers, 1.0)
-                y = _load(target, row, neighbour, height, numbers, scale)
+                x = _load(xs, number, limit, side * k * CHANNELS, 1.0)
+                y = _load(ys, number, limit, side * k * CHANNELS, scale)
                 blurred = _add(blurred, x, y, _weight(k))
         # A row is blurred horizontally once, and added to the eleven rows whose windows it is in.
         # The sums of the row RADIUS above are now complete.
@@ -228,17 +220,17 @@ def differentiate(
     factor = tl.load(g_loss) / (height * numbers).to(tl.float32)
     l1_factor, ssim_factor = factor * (1.0 - ssim_weight), factor * ssim_weight
     for row in range(first - RADIUS, tl.minimum(first + rows, height) + RADIUS):
-        mean = W0 * _load(derivatives, row, number, height, numbers, 1.0)
-        square = W0 * _load(derivatives + plane, row, number, height, numbers, 1.0)
-        product = W0 * _load(derivatives + 2 * plane, row, number, height, numbers, 1.0)
+        limit = tl.where((row >= 0) & (row < height), numbers, 0)
+        means = derivatives + (row * numbers + number)
+        squares, products = means + plane, means + 2 * plane
+        mean = W0 * _load(means, number, limit, 0, 1.0)
+        square = W0 * _load(squares, number, limit, 0, 1.0)
+        product = W0 * _load(products, number, limit, 0, 1.0)
         for k in tl.static_range(1, RADIUS + 1):
             for side in tl.static_range(-1, 2, 2):
-                neighbour = number + side * k * CHANNELS
-                mean += _load(derivatives, row, neighbour, height, numbers, _weight(k))
-                square += _load(derivatives + plane, row, neighbour, height, numbers, _weight(k))
-                product += _load(
-                    derivatives + 2 * plane, row, neighbour, height, numbers, _weight(k)
-                )
+                mean += _load(means, number, limit, side * k * CHANNELS, _weight(k))
+                square += _load(squares, number, limit, side * k * CHANNELS, _weight(k))
+                product += _load(products, number, limit, side * k * CHANNELS, _weight(k))
         d_mean = _push(d_mean, mean)
         d_square = _push(d_square, square)
         d_product = _push(d_product, product)
@@ -321,7 +313,7 @@ class TritonLoss:
         columns, lines = measured.grid
         sums = memory.take("sums", 2 * columns * lines, torch.float32)
         launch_grid(measure_similarity, columns, lines)(
-            **measured.arguments(), sums=sums, DIFFERENTIATE=differentiated
+            **measured.arguments(), sums=sums, DIFFERENTIATE=differentiated, **REGISTERS
         )
         launch_grid(add_up, 1)(
             sums=sums,

@@ -1,36 +1,28 @@
-"""The training loop: the schedule of 3DGS, with any rasterizer and any densifier, and its logs."""
+"""The training loop: the schedule of 3DGS, with any rasterizer and any densifier."""
 
-import json
 import logging
-import math
 import time
-from collections import deque
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from gsbench.densify import Densifier, DensifyContext, NoDensifier
-from gsbench.densify.volumetric import log_volume
 from gsbench.errors import InputError, TrainingError
 from gsbench.eval.images import replace_ignored
 from gsbench.events import FEWEST_ROUNDS, RefineEvent, few_rounds
-from gsbench.files import write_text
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
 from gsbench.gaussians.ply import write_ply
 from gsbench.gaussians.trainable import StepAll, TrainableGaussians
 from gsbench.raster import Rasterizer
 from gsbench.raster.base import RenderOutput
 from gsbench.raster.executors import find_executor, lacks
-from gsbench.raster.staged import Readback
 from gsbench.runs.layout import CURVES, EVENTS, HISTOGRAMS
-from gsbench.runs.rows import whole_lines
 from gsbench.scene.types import Scene
 from gsbench.system.device import free_bytes
 from gsbench.system.stopping import deferred, requested
@@ -38,6 +30,7 @@ from gsbench.train.checkpoint import CheckpointWriter, load_checkpoint
 from gsbench.train.growth import GrowthWatch
 from gsbench.train.loss import PhotometricLoss
 from gsbench.train.options import TrainConfig
+from gsbench.train.records import LossLog, append, drop_after, volume_histogram
 from gsbench.train.resolution import Resolution, ScaledViews
 from gsbench.train.views import CameraOrder, SceneViews, Targets, generators
 
@@ -47,49 +40,6 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 SHARE_FOR_IMAGES = 0.5  # of a GPU's free memory; the rest is for the model and its renders
-SMOOTHING = 0.9  # weight of the previous mean in the smoothed loss
-
-
-class LossLog:
-    """The losses of a training, in order of iterations. Losses from a GPU arrive with a delay.
-
-    ``smoothed`` is the exponential mean of the losses that have arrived; NaN before the first.
-    """
-
-    def __init__(self) -> None:
-        self.smoothed = math.nan
-        self._pending: deque[tuple[int, Readback]] = deque()
-        self._latest: dict[str, float] = {}
-
-    def add(self, step: int, scalars: Tensor) -> None:
-        """Add the ``scalars`` of iteration ``step``.
-
-        They are loss, L1, SSIM and, if there is a regulariser, the loss plus it. Raises
-        FloatingPointError if such a total that has arrived by now is not finite.
-        """
-        self._pending.append((step, Readback(scalars)))
-        while self._pending and self._pending[0][1].arrived:
-            self._take()
-
-    def wait(self) -> dict[str, float]:
-        """Wait for all losses; return ``step``, ``loss``, ``l1``, ``ssim`` of the last iteration.
-
-        Raises FloatingPointError, which names the first iteration whose total was not finite.
-        """
-        while self._pending:
-            self._take()
-        return self._latest
-
-    def _take(self) -> None:
-        step, readback = self._pending.popleft()
-        loss, l1, ssim, *more = readback.values().tolist()
-        for total in more or [loss]:
-            if not math.isfinite(total):
-                raise FloatingPointError(f"the loss became {total} at iteration {step}")
-        is_first = math.isnan(self.smoothed)
-        mean = SMOOTHING * self.smoothed + (1 - SMOOTHING) * loss
-        self.smoothed = loss if is_first else mean
-        self._latest = {"step": step, "loss": loss, "l1": l1, "ssim": ssim}
 
 
 @dataclass(frozen=True)
@@ -431,30 +381,3 @@ def fast_steps(
 def sh_degree_at(options: TrainConfig, step: int) -> int:
     """The degree of spherical harmonics at iteration ``step``."""
     return min(MAX_SH_DEGREE, step // options.sh_interval)
-
-
-LOG_VOLUME_BINS = np.linspace(-18, 3, 85)  # log10 of world units^3, in steps of 0.25
-
-
-def volume_histogram(step: int, log_scales: Tensor) -> dict[str, Any]:
-    """The record of iteration ``step`` with a histogram of volumes, from ``log_scales`` [N, 3]."""
-    volumes = (log_volume(log_scales) / math.log(10)).cpu().numpy()
-    clipped = np.clip(volumes, LOG_VOLUME_BINS[0], LOG_VOLUME_BINS[-1])
-    counts, edges = np.histogram(clipped, LOG_VOLUME_BINS)
-    return {"step": step, "log10_edges": edges.tolist(), "counts": counts.tolist()}
-
-
-def append(stream: TextIO, record: dict[str, Any]) -> None:
-    """Append a record to an open file, and flush it so that readers see it."""
-    stream.write(json.dumps(record) + "\n")
-    stream.flush()
-
-
-def drop_after(path: Path, step: int) -> None:
-    """Remove records later than ``step`` from a JSON-lines file, if it exists.
-
-    An incomplete last line is removed, too. A resumed training writes the removed records again. A
-    kill leaves the old or the new file, never a part of one.
-    """
-    if path.exists():
-        write_text(path, "".join(f"{line}\n" for line, at in whole_lines(path) if at <= step))

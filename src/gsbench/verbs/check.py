@@ -9,7 +9,7 @@ from gsbench.analysis.notes import texts
 from gsbench.claims.check import Check, prepare, recheck
 from gsbench.claims.check_page import make_page, to_html, to_text
 from gsbench.claims.file import ClaimsFile, read_claims
-from gsbench.claims.stopping import KeyAndSeed
+from gsbench.claims.stopping import KeyAndSeed, sequential_test
 from gsbench.config.permissions import PERMISSIONS
 from gsbench.errors import InputError
 from gsbench.files import make_runs_folder, writable_output, write_text
@@ -141,7 +141,7 @@ def _run(check: Check) -> None:
         if unfinished:
             run_batch(unfinished)
 
-    checked = check.checked(check.test.answer(run))
+    checked = check.checked(sequential_test(check).answer(run))
     write_text(check.home / HTML, to_html(make_page(checked)))
     for verdict in checked.verdicts:
         print(f"{verdict.word:<19}  {verdict.claim.id}: {verdict.sentence}")

@@ -16,6 +16,7 @@ import requests
 
 from gsbench.analysis.addresses import TRIAL
 from gsbench.errors import InputError
+from gsbench.files import require_no_links
 from gsbench.runs.experiments import experiment_home, list_experiments
 from gsbench.runs.layout import DATABASE
 from gsbench.system.install import install_command
@@ -95,6 +96,7 @@ def ui(argv: Sequence[str], runs: Path) -> int:
     home = None if options.experiment is None else experiment_home(runs, options.experiment)
     if home is None and len(names := list_experiments(runs)) == 1:
         home = experiment_home(runs, names[0])
+    require_no_links(runs, runs / DATABASE)
     if uri == default_uri(runs) and not (runs / DATABASE).exists():
         raise InputError(
             f"no MLflow database in {runs}: run a trial first, or `gsbench sync`, or give --uri"

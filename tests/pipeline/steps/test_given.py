@@ -21,14 +21,12 @@ from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.init import Random
 from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER
 from gsbench.normalization import Normalization
+from gsbench.pipeline.steps import external as external_steps
 from gsbench.pipeline.steps import scene as scene_steps
 from gsbench.pipeline.steps import train as train_steps
+from gsbench.pipeline.steps.external import external_step
 from gsbench.pipeline.steps.scene import init_step
-from gsbench.pipeline.steps.train import (
-    _log_normalization,
-    external_step,
-    train_step,
-)
+from gsbench.pipeline.steps.train import _log_normalization, train_step
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.runs.keys import INIT, Step
 from gsbench.runs.store import Store
@@ -178,7 +176,7 @@ def test_a_program_works_in_the_given_coordinates_and_its_model_is_normalized(vi
 def test_a_program_runs_with_the_given_time_limit(views, tmp_path, monkeypatch, minutes, limit):
     given = []
     ended = SimpleNamespace(seconds=1.0, peak_memory_mb=1.0)
-    monkeypatch.setattr(train_steps, "run_program", lambda *rest: given.append(rest) or ended)
+    monkeypatch.setattr(external_steps, "run_program", lambda *rest: given.append(rest) or ended)
     step = external_step(views, trainer(tmp_path, "none", time_limit_minutes=minutes), parts_of())
     with pytest.raises(TrainingError, match="ended well, but"):
         step.build(tmp_path)
@@ -192,7 +190,7 @@ def test_a_program_runs_with_the_given_time_limit(views, tmp_path, monkeypatch, 
 def test_a_program_gets_the_environment_without_variables_of_gsbench(tmp_path, monkeypatch):
     for name, value in (("GSBENCH_X", "1"), ("KEPT", "2"), SAFE_PATH):
         monkeypatch.setenv(name, value)
-    found = train_steps.environment_of(trainer(tmp_path, "none"), {"seed": 5})
+    found = external_steps.environment_of(trainer(tmp_path, "none"), {"seed": 5})
     assert (found.get("GSBENCH_X"), found.get("KEPT"), found.get(SAFE_PATH[0]), found["SET"]) == (
         None,
         "2",
@@ -200,7 +198,9 @@ def test_a_program_gets_the_environment_without_variables_of_gsbench(tmp_path, m
         "5",
     )
     monkeypatch.setenv(SAFE_PATH[0], "1")  # the user's own value, not gsbench's
-    assert train_steps.environment_of(trainer(tmp_path, "none"), {"seed": 5})[SAFE_PATH[0]] == "1"
+    assert (
+        external_steps.environment_of(trainer(tmp_path, "none"), {"seed": 5})[SAFE_PATH[0]] == "1"
+    )
 
 
 def test_a_training_writes_its_model_lineage_and_summary(views, tmp_path, monkeypatch):
@@ -252,7 +252,7 @@ def test_renders_of_a_program_are_collected_for_the_test_views(views, tmp_path, 
             Image.fromarray(255 - view.image).save(output / view.name)
         return SimpleNamespace(seconds=1.0, peak_memory_mb=1.0)
 
-    monkeypatch.setattr(train_steps, "run_program", run)
+    monkeypatch.setattr(external_steps, "run_program", run)
     external_step(views, replace(trainer(tmp_path, "none"), result="*.png"), parts_of()).build(
         tmp_path
     )

@@ -12,7 +12,7 @@ from gsbench.analysis import verdict_words
 from gsbench.analysis.cells import select_trials
 from gsbench.analysis.comparison import VERDICT, compare
 from gsbench.analysis.differences import between_scenes_notes
-from gsbench.analysis.fairness import caveats, fairness_table, limit_notes
+from gsbench.analysis.fairness import caveats, counts_notes, fairness_table, limit_notes
 from gsbench.analysis.images import choose_views, png_uri
 from gsbench.analysis.judgement import Verdict
 from gsbench.analysis.ledger_table import describe_ledger, ledger_tables
@@ -141,7 +141,13 @@ def compare_arms(
         "title": f"{second} against {first}",
         "has_like_these": any(verdict.like_these is not None for verdict in judged.verdicts),
         "caveats": " ".join(
-            texts([*caveats(trials, first, second), *limit_notes(trials, [(first, second)])])
+            texts(
+                [
+                    *counts_notes(trials, [(first, second)]),
+                    *caveats(trials, first, second),
+                    *limit_notes(trials, [(first, second)]),
+                ]
+            )
         ),
         "fairness": fairness_table(trials, first, second, older),
         "facts": [*_costs(baseline, other), *between_scenes_notes(baseline, other)],

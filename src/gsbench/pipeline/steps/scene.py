@@ -43,7 +43,7 @@ from gsbench.scene.readers import (
 from gsbench.scene.transforms import Transforms
 from gsbench.scene.transforms import read_transforms as read_transforms_files
 from gsbench.scene.twins import without_copies
-from gsbench.scene.types import Capture, Scene
+from gsbench.scene.types import Capture, Scene, View
 from gsbench.system.install import version_of
 from gsbench.system.resources import in_threads
 
@@ -269,11 +269,14 @@ def ground_truth_step(views: Views) -> Step:
     """The step that keeps the test views, and the masks of those that have one, as PNG files."""
 
     def build(folder: Path) -> None:
-        for view in views.scene.test:
+        def write(view: View) -> None:
             Image.fromarray(view.image).save(folder / png_name(view.name))
             if view.mask is not None:
                 (folder / MASKS).mkdir(exist_ok=True)
                 write_mask(view.mask, folder / MASKS / png_name(view.name))
+
+        for _ in in_threads(write, views.scene.test):
+            pass
 
     return step_of(GROUND_TRUTH, {"scene": views.inputs, "init": views.init.key}, build)
 
