@@ -144,7 +144,7 @@ def test_the_advice_on_unequal_counts_is_a_whole_command(tmp_path, baseline, arm
         own = [*words[trial.densify], f"seed={trial.seed}", "scene=garden", "name=exp"]
         place = trial.path.relative_to(tmp_path / "exp").as_posix()
         planned[place] = {"overrides": [*own, "densify.cap=governor"]}
-    write(tmp_path / "exp" / "plan.json", {"trials": planned})
+    write(tmp_path / "exp/plan.json", {"trials": planned})
     sentence = str(*counts_notes(trials, [(ADC, VOLUMETRIC)]))
     assert f"{EQUAL}{command}" in sentence
     assert "densify.cap=governor densify.max_gaussians=12300 name=exp_equal`" in sentence
