@@ -28,8 +28,12 @@ HOSTILE = (
     "<img src=x onerror=\"document.title='owned'\"><svg onload=\"document.title='owned'\">"
     "{{ 7 * 7 }}"
 )
-# null until the whole page is read
-LOOK = "document.readyState === 'complete' ? [document.title === 'owned', document.scripts.length] : null"
+# null until the whole page is read; before it, the window has an empty one
+LOOK = """
+location.protocol === 'file:' && document.readyState === 'complete'
+    ? [document.title === 'owned', document.scripts.length]
+    : null
+"""
 
 
 def look(browser):

@@ -108,7 +108,7 @@ def test_brackets_are_counted_while_they_are_open():
         ("hydra.searchpath=[pkg://minefield.a]", r"allow_targets=\[mine,minefield\]"),
         ("hydra.searchpath=[http://a]", "neither a folder .file://…. nor a package"),
         *(
-            (f"{key}={value}", "")  # every spelling is refused
+            (f"{key}={value}", r"allow_targets=\[mine,strange\]")  # every spelling is refused
             for key in ("hydra.searchpath", "hydra[searchpath]")
             for value in ("[pkg://strange]", "extend_list('pkg://strange')")
         ),
