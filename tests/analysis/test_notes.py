@@ -4,9 +4,11 @@ import html
 import itertools
 from dataclasses import replace
 from shlex import split
+from types import SimpleNamespace
 
 import pytest
 
+from gsbench.analysis.advice import train_longer
 from gsbench.analysis.fairness import counts_notes, limit_notes
 from gsbench.analysis.notes import Note, texts
 from gsbench.analysis.report.build import build_report
@@ -110,7 +112,7 @@ GRIDDED = (
         (
             ["densify=adc"],
             MINE,
-            f"`gsbench -m seed=0,1 scene=garden {GRIDDED} densify.cap=governor ",
+            f"`gsbench -m seed=0,1 scene=garden {GRIDDED} ++densify.cap=governor ",
         ),
         (
             ["densify=adc", "launch.stop_when_decided=True"],
@@ -147,9 +149,22 @@ def test_the_advice_on_unequal_counts_is_a_whole_command(tmp_path, baseline, arm
     write(tmp_path / "exp/plan.json", {"trials": planned})
     sentence = str(*counts_notes(trials, [(ADC, VOLUMETRIC)]))
     assert f"{EQUAL}{command}" in sentence
-    assert "densify.cap=governor densify.max_gaussians=12300 name=exp_equal`" in sentence
+    plus = "++" if "_target_" in command else ""  # its choice may lack the settings
+    added = f" {plus}densify.cap=governor {plus}densify.max_gaussians=12300 name=exp_equal`"
+    assert added in sentence
     lost = "~densify.cap" in arm  # no grid removes a setting
     assert sentence.endswith("without looks, which need all arms in one command." if lost else "`.")
+
+
+def test_arms_that_the_governor_did_not_make_equal_need_a_longer_training():
+    def advice(*budgets):
+        keys = ("densify.cap", "densify.max_gaussians")
+        return train_longer(
+            SimpleNamespace(config=dict(zip(keys, b, strict=True))) for b in budgets
+        )
+
+    assert advice(("governor", 9), ("governor", 9)).startswith("train longer, since the governor")
+    assert {advice(("governor", 9), ("governor", 8)), advice(("soft", 9), ("soft", 9))} == {""}
 
 
 @pytest.mark.parametrize(

@@ -78,7 +78,8 @@ def test_the_code_of_the_library_document_trains_and_resumes(folder):
 
 def test_the_densifier_of_its_document_runs(folder):
     schedule = " train.iterations=120 train.densify_start=20 train.densify_stop=100"
-    small = TINY.replace(" train.iterations=5", schedule) + " +densify.interval=20 seed=0"
+    schedule += " train.densify_interval=20 seed=0"
+    small = TINY.replace(" train.iterations=5", schedule)
     run_command("densifier.md", "densify._target_=largest.SplitLargest", small)
     (trial,) = Path("runs").glob("largest/courtyard/random-largest/*/results.json")
     events = [json.loads(line) for line in trial.with_name("events.jsonl").open()]

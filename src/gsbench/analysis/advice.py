@@ -17,7 +17,8 @@ from gsbench.runs.layout import PLAN
 DIGITS = 3  # significant digits of a number of Gaussians
 LOOKS = "launch.stop_when_decided"  # needs all arms in one command
 GRIDS, PERMISSIONS = "hydra.sweeper.grids", "allow_targets"
-REPLACED = ("name", "densify.cap", "densify.max_gaussians")  # words that the advice gives itself
+CAP, LIMIT = "densify.cap", "densify.max_gaussians"
+REPLACED = ("name", CAP, LIMIT)  # words that the advice gives itself
 # the word that records ``--config-dir``
 OF_CONFIG_DIR = re.compile(r"hydra\.searchpath=\['file://([\w./-]+)'\]")
 
@@ -28,12 +29,20 @@ Advice = Callable[[Sequence[TrialResult], Sequence[TrialResult]], str]
 
 
 def start_smaller(trials: Iterable[TrialResult]) -> str:
-    """The advice where an arm ended with fewer Gaussians than initial points; "" elsewhere."""
+    """The advice where an arm ended with no more Gaussians than initial points; "" elsewhere."""
     records = [trial.record for trial in trials]
     points = max((record.num_init_points or 0 for record in records), default=0)
-    if all((record.num_gaussians or points) >= points for record in records):
+    if all((record.num_gaussians or math.inf) > points for record in records):
         return ""
     return f"start all arms with fewer than {points:,} points, as no limit can be below these"
+
+
+def train_longer(trials: Iterable[TrialResult]) -> str:
+    """The advice where arms differ although all are steered to one count; "" elsewhere."""
+    aims = {(trial.config.get(CAP), trial.config.get(LIMIT)) for trial in trials}
+    if len(aims) > 1 or {cap for cap, _ in aims} != {"governor"}:
+        return ""
+    return "train longer, since the governor (densify.cap) had too few rounds to reach its count"
 
 
 def equal_counts_words(baseline: Sequence[TrialResult], arms: Sequence[TrialResult]) -> str:
@@ -43,7 +52,7 @@ def equal_counts_words(baseline: Sequence[TrialResult], arms: Sequence[TrialResu
     if not known:
         return ""
     unit = 10 ** max(0, math.floor(math.log10(min(known))) + 1 - DIGITS)
-    return f"densify.cap=governor densify.max_gaussians={min(known) // unit * unit}"
+    return f"{CAP}=governor {LIMIT}={min(known) // unit * unit}"
 
 
 def equal_counts_settings(baseline: Sequence[TrialResult], arms: Sequence[TrialResult]) -> str:
@@ -75,12 +84,16 @@ def equal_counts_command(baseline: Sequence[TrialResult], arms: Sequence[TrialRe
         words = {key: [value] for key, _, value in (w.partition("=") for w in planned[trial.path])}
         seeds = most.get(trial.key, (trial.seed,))
         words |= {"seed": [*map(str, seeds)]}
-        commands.append({key: words[key] for key in words if key not in REPLACED})
+        commands.append({key: words[key] for key in words if key.lstrip("+") not in REPLACED})
     commands = _in_one(_merged(commands))
     lost = len(commands) > 1 and any(LOOKS in own for own in commands)
     commands = [{key: own[key] for key in own if key != LOOKS or not lost} for own in commands]
-    end = f"{added} name={shlex.quote(f'{home.name}_equal')}"
-    whole = f"`{' && '.join(f'gsbench -m {_joined(own)} {end}' for own in commands)}`"
+    name = f"name={shlex.quote(f'{home.name}_equal')}"
+    texts = [_joined(own) for own in commands]
+    # A class of the user's own may be based on a choice that lacks these settings.
+    ends = [re.sub("(?=densify)", "++", added) if "_target_" in text else added for text in texts]
+    pairs = zip(texts, ends, strict=True)
+    whole = f"`{' && '.join(f'gsbench -m {text} {end} {name}' for text, end in pairs)}`"
     return f"{whole}, without looks, which need all arms in one command" if lost else whole
 
 

@@ -9,7 +9,7 @@ import statistics
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from typing import Any
 
-from gsbench.analysis.advice import Advice, equal_counts_command, start_smaller
+from gsbench.analysis.advice import Advice, equal_counts_command, start_smaller, train_longer
 from gsbench.analysis.differences import (
     between_scenes_notes,
     compared_trials,
@@ -72,7 +72,8 @@ def counts_notes(
         if not unequal:
             continue
         others = [trial for arm in unequal for trial in by_arm[arm]]
-        how = start_smaller([*baseline, *others]) or advise(baseline, others)
+        both = [*baseline, *others]
+        how = start_smaller(both) or train_longer(both) or advise(baseline, others)
         texts = [
             f"{arm} {100 * abs(more):.0f} % {'more' if more > 0 else 'fewer'}"
             for arm, more in unequal.items()
