@@ -11,6 +11,7 @@ from shlex import split
 import pandas as pd
 import pytest
 
+from gsbench.analysis.cells import short_reason
 from gsbench.analysis.quantities import (
     Change,
     asked_quantity,
@@ -436,3 +437,13 @@ def test_the_first_table_says_how_weakly_its_metrics_agree_with_people(
     assert len(notes) == bool(said)
     assert said in "".join(notes)
     assert second == table
+
+
+@pytest.mark.parametrize(
+    "why, said", [("the download failed: no network", " (the download failed)"), ("b.pth", "")]
+)
+def test_the_note_on_missing_weights_says_if_a_download_failed(why, said):
+    reason = f"weights not found: a.pth (looked in /home; {why}): get them from there"
+    assert short_reason(reason) == (
+        f"weights not found: a.pth{said}; gsbench doctor says where they come from"
+    )

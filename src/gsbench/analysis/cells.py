@@ -193,7 +193,8 @@ def short_reason(reason: str) -> str:
     For missing weights, ``results.json`` has the full text.
     """
     if reason.startswith("weights not found: "):
-        return f"{reason.partition(' (')[0]}; gsbench doctor says where they come from"
+        failed = " (the download failed)" if "; the download failed" in reason else ""
+        return f"{reason.partition(' (')[0]}{failed}; gsbench doctor says where they come from"
     return reason
 
 
