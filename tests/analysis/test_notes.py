@@ -156,6 +156,24 @@ def test_the_advice_on_unequal_counts_is_a_whole_command(tmp_path, baseline, arm
     assert sentence.endswith("without looks, which need all arms in one command." if lost else "`.")
 
 
+def test_arms_without_a_common_seed_get_advice_for_all_seeds(tmp_path):
+    made = trials_of(tmp_path, scenes=["garden"], seeds=(0, 1))
+    trials = [
+        with_record(trial, num_gaussians=12_345 + 9000 * trial.seed)
+        for trial in made
+        if trial.seed == (trial.densify == "volumetric")
+    ]
+    words = {
+        trial.path.relative_to(tmp_path / "exp").as_posix(): {
+            "overrides": [f"densify={trial.densify}", f"seed={trial.seed}"]
+        }
+        for trial in trials
+    }
+    write(tmp_path / "exp/plan.json", {"trials": words})
+    (note,) = counts_notes(trials, [(ADC, VOLUMETRIC)])
+    assert note["advice"].startswith("`gsbench -m densify=adc,volumetric seed=0,1 ")
+
+
 def test_arms_that_the_governor_did_not_make_equal_need_a_longer_training():
     def advice(*budgets):
         keys = ("densify.cap", "densify.max_gaussians")

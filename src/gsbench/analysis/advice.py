@@ -70,8 +70,10 @@ def equal_counts_command(baseline: Sequence[TrialResult], arms: Sequence[TrialRe
     added = equal_counts_words(baseline, arms)
     if not added:
         return ""
-    both = places_of(baseline) & places_of(arms)
-    trials = [one for one in (*baseline, *arms) if (one.scene, one.seed) in both]
+    shared = places_of(baseline) & places_of(arms)
+    # Arms without a common seed are run with the seeds of both, since only pairs are compared.
+    places = shared or places_of(baseline) | places_of(arms)
+    trials = [one for one in (*baseline, *arms) if (one.scene, one.seed) in places]
     home = baseline[0].path.parents[2]
     planned = _planned_words(home)
     if not all(planned.get(trial.path) for trial in trials):
@@ -82,7 +84,8 @@ def equal_counts_command(baseline: Sequence[TrialResult], arms: Sequence[TrialRe
     commands: list[Words] = []
     for trial in trials:
         words = {key: [value] for key, _, value in (w.partition("=") for w in planned[trial.path])}
-        seeds = most.get(trial.key, (trial.seed,))
+        of_scene = sorted(seed for scene, seed in places if scene == trial.scene)
+        seeds = most.get(trial.key, [trial.seed] if shared else of_scene)
         words |= {"seed": [*map(str, seeds)]}
         commands.append({key: words[key] for key in words if key.lstrip("+") not in REPLACED})
     commands = _in_one(_merged(commands))
