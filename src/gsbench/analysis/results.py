@@ -156,8 +156,15 @@ def read_experiment(folder: Path) -> Experiment:
         for path, fault in sorted(faults.items())
         if TRIAL_FOLDER.fullmatch(path.name) and not fault.startswith(FOREIGN)
     )
-    found = Experiment(folder.name, folder, tuple(usable), (*warnings, *unread), forgotten)
-    return replace(found, lacking=lacking, seen=read_seen(folder))
+    return Experiment(
+        folder.name,
+        folder,
+        tuple(usable),
+        (*warnings, *unread),
+        forgotten,
+        lacking=lacking,
+        seen=read_seen(folder),
+    )
 
 
 def _forgotten(home: Path, there: Collection[Path]) -> tuple[tuple[TrialResult, ...], list[str]]:
