@@ -13,10 +13,11 @@ from gsbench.analysis.results import TrialResult, group_by
 from gsbench.parsing import DamagedError, read_json
 from gsbench.runs.experiments import Planned, merge_planned, read_declarations
 from gsbench.runs.layout import PLAN
+from gsbench.runs.user_code import PERMISSIONS
 
 DIGITS = 3  # significant digits of a number of Gaussians
 LOOKS = "launch.stop_when_decided"  # needs all arms in one command
-GRIDS, PERMISSIONS = "hydra.sweeper.grids", "allow_targets"
+GRIDS = "hydra.sweeper.grids"
 CAP, LIMIT = "densify.cap", "densify.max_gaussians"
 REPLACED = ("name", CAP, LIMIT)  # words that the advice gives itself
 # the word that records ``--config-dir``

@@ -36,10 +36,10 @@ from gsbench.analysis.looks import FIRST_LOOK, plan_looks
 from gsbench.analysis.quantities import askable_names, asked_quantity
 from gsbench.analysis.statistics import ALPHA
 from gsbench.config.overrides import value_text
-from gsbench.config.permissions import PERMISSIONS
 from gsbench.errors import InputError
 from gsbench.parsing import read_yaml, resolved
 from gsbench.runs.experiments import Arm, Question
+from gsbench.runs.user_code import PERMISSIONS
 from gsbench.settings import check_values
 from gsbench.words import did_you_mean, least_text
 

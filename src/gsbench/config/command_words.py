@@ -10,11 +10,11 @@ from hydra.core.override_parser.types import Override
 
 from gsbench.config.groups import GROUPS, REMOVABLE, options
 from gsbench.config.overrides import bare_key, is_sweep, key_of, parse_word
-from gsbench.config.permissions import PERMISSIONS
 from gsbench.config.programs import reading
 from gsbench.config.search_path import search_path, searched_folders
 from gsbench.errors import InputError
 from gsbench.runs.config_hash import DECLARED, NOT_HASHED, WITHOUT_EFFECT
+from gsbench.runs.user_code import PERMISSIONS
 from gsbench.words import did_you_mean
 
 # not in the configuration's hash, but in the path of the trial's folder

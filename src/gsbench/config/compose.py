@@ -29,13 +29,13 @@ from gsbench.config.hydra_setup import (
     installed_nodes,
 )
 from gsbench.config.overrides import bare_key, is_sweep, key_of, parse_word, task_words
-from gsbench.config.permissions import PERMISSIONS
 from gsbench.config.schema import ROOT_SETTINGS, Config, check, checked_values, plain
 from gsbench.config.search_files import check_places
 from gsbench.config.search_path import check_search_path, searched_folders
 from gsbench.config.trust import MADE_NODES, check_composed, check_permissions
 from gsbench.errors import InputError
 from gsbench.runs.trial_folder import TrialFolder
+from gsbench.runs.user_code import PERMISSIONS
 from gsbench.settings import check_values
 from gsbench.system.own_modules import allow_modules
 

@@ -16,8 +16,6 @@ from gsbench.runs.nested import TARGET
 from gsbench.system.own_modules import allowed_modules
 from gsbench.words import did_you_mean
 
-# the setting that says what may run; it counts on the command line only
-PERMISSIONS = "allow_targets"
 PACKAGE = "gsbench"
 # groups that name one class each; `eval.extra` names any number
 COMPONENTS = ("init", "densify", "raster", "tracking")

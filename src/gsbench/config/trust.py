@@ -16,7 +16,6 @@ from omegaconf.grammar_parser import parse
 
 from gsbench.config.permissions import (
     PACKAGE,
-    PERMISSIONS,
     check_target,
     is_allowed,
     load_class,
@@ -33,6 +32,7 @@ from gsbench.config.programs import (
 )
 from gsbench.errors import InputError
 from gsbench.runs.nested import TARGET, entries_of, targets_in
+from gsbench.runs.user_code import PERMISSIONS
 
 ADDRESS_VARIABLES = ("MLFLOW_TRACKING_URI", "WANDB_BASE_URL")  # by which users name their trackers
 # Where gsbench and Hydra write, by gsbench's own configuration (None: what the installed packages

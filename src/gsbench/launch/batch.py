@@ -7,7 +7,6 @@ from pathlib import Path
 
 from gsbench.config.compose import Trial
 from gsbench.config.groups import options
-from gsbench.config.permissions import PERMISSIONS
 from gsbench.config.schema import COMPONENTS
 from gsbench.errors import InputError
 from gsbench.files import FORBIDDEN, checked_runs_folder, make_runs_folder, storage_errors
@@ -20,6 +19,7 @@ from gsbench.runs.keys import STAGES
 from gsbench.runs.layout import STORE
 from gsbench.runs.nested import GSBENCH
 from gsbench.runs.store import Store
+from gsbench.runs.user_code import PERMISSIONS
 from gsbench.system.stopping import stop_on_signals
 from gsbench.tracking import Mirror
 from gsbench.tracking.tracker_run import make_sink

@@ -12,7 +12,6 @@ import torch
 from gsbench.analysis.results import read_experiment
 from gsbench.config.command_words import typed_permissions
 from gsbench.config.compose import compose_one
-from gsbench.config.permissions import PERMISSIONS
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator, summarize
 from gsbench.eval.facts import METRICS
@@ -29,6 +28,7 @@ from gsbench.renders.truth import (
     pictures_in,
     reference_images_of,
 )
+from gsbench.runs.user_code import PERMISSIONS
 from gsbench.scene.images import list_images
 from gsbench.system.device import select_device
 from gsbench.system.own_modules import allow_modules

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from gsbench.runs.nested import GSBENCH, TARGET, flatten, sha256_of
-from gsbench.runs.user_code import user_modules
+from gsbench.runs.user_code import PERMISSIONS, user_modules
 
 # Options that cannot change a result. This holds for gsbench's own classes; a user's class may use
 # the names otherwise.
@@ -12,7 +12,7 @@ WITHOUT_EFFECT = ("threads", "weights", "download", "time_limit_minutes")
 # Settings that only declare how results are read or what an ablation may turn off.
 # train.steps_scaler has been applied to the steps.
 DECLARED = {"eval": ("primary", "controls"), "densify": ("switches",), "train": ("steps_scaler",)}
-NOT_HASHED = ("name", "seed", "device", "threads", "runs", "allow_targets", "tracking", "launch")
+NOT_HASHED = ("name", "seed", "device", "threads", "runs", PERMISSIONS, "tracking", "launch")
 # Settings in which trials of one cell may differ: they do not change what is computed.
 # "x" stands for x and all below it (x.y).
 IGNORED_SETTINGS = (

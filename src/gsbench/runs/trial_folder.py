@@ -41,6 +41,7 @@ from gsbench.runs.rows import Row, read_rows
 from gsbench.runs.seen import remember
 from gsbench.runs.trial_files import Building, Configuration, Failure, MadeOf, ResultsFile
 from gsbench.runs.trial_record import TrialRecord, UnfinishedError, record_from
+from gsbench.runs.user_code import PERMISSIONS
 from gsbench.system.locks import is_held
 from gsbench.words import command
 
@@ -159,7 +160,7 @@ class TrialFolder:
             raise InputError(f"{path} is not there: give the command of the trial again") from None
         parse_typed(to_json(values), Configuration, path)
         # only the user who gives a command may allow code to run
-        return values | {"allow_targets": []}
+        return values | {PERMISSIONS: []}
 
     # ---- results
 

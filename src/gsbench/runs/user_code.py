@@ -19,6 +19,8 @@ from gsbench.files import file_sha256
 from gsbench.runs.nested import GSBENCH, targets_in
 from gsbench.runs.package_code import PACKAGE, syntax_of
 
+# the setting that says what may run; it counts on the command line only
+PERMISSIONS = "allow_targets"
 # packages in these folders are identified by their versions
 INSTALLED = frozenset({"site-packages", "dist-packages"})
 CODE_SUFFIXES = frozenset({".py", ".so", ".pyd", ".c", ".cpp", ".cu", ".h", ".cuh"})
@@ -57,7 +59,7 @@ def user_modules(values: Mapping[str, Any]) -> dict[str, str]:
     of_classes = {name.split(".")[0] for place, name in named if place[0] != "tracking"}
     if not of_classes:
         return {}
-    helpers = {name.split(".")[0] for name in values.get("allow_targets") or ()}
+    helpers = {name.split(".")[0] for name in values.get(PERMISSIONS) or ()}
     helpers -= {name.split(".")[0] for _, name in named}
     helpers = {
         name

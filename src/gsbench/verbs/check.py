@@ -10,12 +10,12 @@ from gsbench.claims.check import Check, prepare, recheck
 from gsbench.claims.check_page import make_page, to_html, to_text
 from gsbench.claims.file import ClaimsFile, read_claims
 from gsbench.claims.stopping import KeyAndSeed, sequential_test
-from gsbench.config.permissions import PERMISSIONS
 from gsbench.errors import InputError
 from gsbench.files import make_runs_folder, writable_output, write_text
 from gsbench.launch.batch import missing_folders, run_batch
 from gsbench.launch.dry_run import describe_plan
 from gsbench.launch.record import declare_questions
+from gsbench.runs.user_code import PERMISSIONS
 from gsbench.verbs.arguments import ArgumentParser, path
 from gsbench.words import counted
 

@@ -20,7 +20,6 @@ from gsbench.analysis.results import read_experiment
 from gsbench.config.command_words import makes_other_trials, typed_permissions
 from gsbench.config.compose import Trial, compose_one
 from gsbench.config.overrides import key_of
-from gsbench.config.permissions import PERMISSIONS
 from gsbench.errors import GsbenchError, InputError
 from gsbench.launch.dry_run import describe_plan
 from gsbench.launch.progress import Progress, progress_of
@@ -30,6 +29,7 @@ from gsbench.runs.experiments import experiment_home, list_experiments, trial_fo
 from gsbench.runs.plan import PlannedTrial, change_plan
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS
+from gsbench.runs.user_code import PERMISSIONS
 from gsbench.system.own_modules import allow_modules
 from gsbench.tracking.tracker_run import MirrorError
 from gsbench.tracking.tracker_run import sync as send_missing
