@@ -24,10 +24,26 @@ FILE = Path(__file__).with_name("trials.json.gz")
 COUNT = 300
 DIGITS = 10  # significant digits of frozen numbers
 
-DENSIFIERS = (
-    "adc volumetric mcmc absgs absgrad pixelgs quantile resgs revised steepgs taming gns mrnf "
-    "fastgs edgeaware longaxis volumetric_once none"
-).split()
+DENSIFIERS = [
+    "adc",
+    "volumetric",
+    "mcmc",
+    "absgs",
+    "absgrad",
+    "pixelgs",
+    "quantile",
+    "resgs",
+    "revised",
+    "steepgs",
+    "taming",
+    "gns",
+    "mrnf",
+    "fastgs",
+    "edgeaware",
+    "longaxis",
+    "volumetric_once",
+    "none",
+]
 SETTINGS = {
     "train.iterations": (200, 1500, 7000),
     "train.ssim_weight": (0.1, 0.3),
@@ -79,7 +95,7 @@ def composed(words, runs):
     for trial in trials:
         values = {key: value for key, value in trial.values.items() if key != "runs"}
         keys = {}
-        with suppress(GsbenchError), mock.patch("gsbench.runs.keys.edited", lambda states: {}):
+        with suppress(GsbenchError), mock.patch("gsbench.runs.keys.edited", return_value={}):
             for step in TrialSteps(Parts(trial.values), store).steps():
                 keys[step.stage.name] = step.key[:16]
                 if step.stage.name == "scene":
