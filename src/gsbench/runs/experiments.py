@@ -164,6 +164,11 @@ class Arm:
         return f"{self.init}-{self.short}" if self.init else self.short
 
     @property
+    def name(self) -> str:
+        """The name without the swept settings: ``sfm-momentum``"""
+        return f"{self.init}-{self.densify}" if self.init else self.densify
+
+    @property
     def short(self) -> str:
         """The name without the initialiser: ``momentum[decay=0.9]``"""
         values = ", ".join(f"{key.rpartition('.')[2]}={value}" for key, value in self.variant)
