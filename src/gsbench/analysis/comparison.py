@@ -22,7 +22,7 @@ from gsbench.analysis.judge import (
     judge,
 )
 from gsbench.analysis.notes import Note, texts
-from gsbench.analysis.pairs import BASELINE, are_equal
+from gsbench.analysis.pairs import are_equal
 from gsbench.analysis.quantities import choose_quantities
 from gsbench.analysis.questions import Asked, Row, choose_pairs, rows_of
 from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by
@@ -31,6 +31,7 @@ from gsbench.runs.commands import Question, code_in
 from gsbench.runs.layout import TUNING
 
 DEFAULT_METRIC = "psnr"
+VERDICT = Note.of("verdict", sentence="").sentence  # begins the notes that state verdicts
 
 
 @dataclass(frozen=True)

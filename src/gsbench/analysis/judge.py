@@ -29,7 +29,7 @@ from gsbench.analysis.statistics import (
     outcome_of,
     t_test,
 )
-from gsbench.runs.commands import Question
+from gsbench.runs.commands import BY_COMMAND, Question
 from gsbench.runs.experiments import Arm
 from gsbench.words import signed
 
@@ -212,7 +212,8 @@ def _state(
     if question.untested:
         return NOT_TESTED
     ideas = {second for _, second in question.digests.values()}
-    if any(one.digest in ideas and not one.asked for one in own):
+    # gates, ledgers and old declarations know by themselves what was asked before
+    if question.rule == BY_COMMAND and not all(one.asked for one in own if one.digest in ideas):
         return NOT_ASKED
     ended = len(own) + sum(one.failed for one in unfinished)
     if ended >= question.trials:

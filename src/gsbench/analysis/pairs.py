@@ -223,9 +223,7 @@ def _pair_scene(
     """The pairs of one scene that have values, and a note on each thing that was not paired."""
     wanted = question.seeds[scene]
     # a claim may be about arms with different budgets, which its question then names
-    pairs = _match_seeds(
-        scene, baseline, arm, wanted, not question.name, not question.versions
-    )
+    pairs = _match_seeds(scene, baseline, arm, wanted, not question.name, not question.versions)
     values: dict[int, tuple[float, float]] = {}
     reasons: dict[str, list[str]] = {}
     for seed, trials in pairs.items():

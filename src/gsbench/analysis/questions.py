@@ -17,16 +17,18 @@ measured before. Nothing changes a question afterwards.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 from gsbench.analysis.statistics import ALPHA, MIN_SCENES, sign_test_needs
 from gsbench.analysis.trial_settings import canonical
+from gsbench.errors import InputError
 from gsbench.runs.commands import Digest, History, Place, Question, code_in
 from gsbench.runs.config_hash import is_among, is_hashed
 from gsbench.runs.experiments import Arm
-from gsbench.words import counted
+from gsbench.words import counted, least_text
 
 ORDINALS = ("first", "second", "third", "fourth", "fifth")
 LAST_LOOK = 0.6  # of a question's level
@@ -85,6 +87,36 @@ def count_tries(places: Collection[Place], earlier: Iterable[Collection[Place]])
         left = [one for one in left if not one & linked]
         linked = linked.union(*joined)
     return found + 1
+
+
+@dataclass(frozen=True)
+class LeastEffect:
+    """The least effect that matters: a difference, or (``relative``) a fraction of the baseline."""
+
+    size: float
+    relative: bool
+
+    def __str__(self) -> str:
+        return least_text(self.size, self.relative)
+
+
+def read_least(value: float | str, where: str) -> LeastEffect:
+    """Read ``0.005``, or ``10%`` of the baseline's value.
+
+    Raises InputError unless it is a number above 0.
+    """
+    text = str(value).strip()
+    relative = text.endswith("%")
+    try:
+        size = float(text.removesuffix("%")) / (100 if relative else 1)
+    except ValueError:
+        size = math.nan
+    if not math.isfinite(size) or size <= 0:
+        raise InputError(
+            f"{where} must be a number above 0, got {value!r}: give a difference such as 0.005, or "
+            "10% (of the baseline's value)"
+        )
+    return LeastEffect(size, relative)
 
 
 # ---- the trials of a command, and of earlier ones
@@ -352,9 +384,7 @@ def _earlier(name: str, measured: Sequence[Row], history: History) -> list[set[P
     found, asked = list[set[Place]](), set[tuple[Digest, Place]]()
     for command in history.commands:
         own = [one for one in command.questions if one.idea.name == name]
-        trials = {
-            (one.digests[place[0]][1], place) for one in own for place in one.places
-        }
+        trials = {(one.digests[place[0]][1], place) for one in own for place in one.places}
         asked |= trials
         if trials & done:
             found.append({place for _, place in trials})

@@ -18,8 +18,8 @@ from gsbench.analysis.trial_settings import Configurations
 from gsbench.errors import InputError
 from gsbench.files import require_no_links
 from gsbench.parsing import DamagedError, one_line
-from gsbench.runs.experiments import Arm as Arm
 from gsbench.runs.commands import Digest, History, Question, code_in, read_history
+from gsbench.runs.experiments import Arm as Arm
 from gsbench.runs.experiments import experiment_home, trial_folders
 from gsbench.runs.freshness import Change, code_changes
 from gsbench.runs.layout import CONFIG, FAILED, PER_VIEW, RESULTS, SEED
@@ -67,6 +67,11 @@ class Unfinished:
     @property
     def label(self) -> str:
         return "/".join(self.path.parts[-4:])
+
+    @property
+    def by_key(self) -> "Unfinished":
+        """The same, with the trial's key in place of its digest, as a ledger names trials."""
+        return replace(self, digest=f"{self.scene}/{self.digest.partition('+')[0]}")
 
     def is_of(self, question: Question, side: int | None = None) -> bool:
         """Return whether a question is about it, as a trial of this side (1: the idea)."""
@@ -231,7 +236,8 @@ def newest_code(experiment: Experiment) -> Experiment:
     for question in experiment.questions:
         for arm, side in ((question.baseline, 0), (question.idea, 1)):
             digests = [both[side] for both in question.digests.values() if both[side]]
-            code |= {arm.name: code_in(digest) for digest in digests}
+            if digests:
+                code[arm.name] = code_in(digests[-1])
     older: list[TrialResult] = []
     # {(part, version that counts): {earlier version: its trials}}
     replaced: dict[tuple[str, str], dict[str, list[TrialResult]]] = {}

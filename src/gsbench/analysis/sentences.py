@@ -69,6 +69,11 @@ def badge(verdict: Verdict) -> str:
     return outcome_words(verdict).removesuffix(" to matter").upper()
 
 
+def with_notes(words: str, verdict: Verdict) -> str:
+    """Words about a verdict, with its notes behind them."""
+    return "; ".join([words, *map(str, verdict.notes)])
+
+
 def numbers(verdict: Verdict) -> str:
     """``+0.50 (95 % interval +0.30 to +0.70)``; "" without a mean."""
     if verdict.mean is None:
@@ -93,7 +98,8 @@ def reason(verdict: Verdict) -> str:
     if verdict.untestable is not None:
         return str(verdict.untestable)
     if verdict.state == NOT_TESTED:
-        return f"not tested, since {verdict.question.untested}" if _says_why(verdict) else NOT_TESTED
+        why = verdict.question.untested
+        return NOT_TESTED if why in (NOT_TESTED, NOT_ASKED) else f"{NOT_TESTED}, since {why}"
     if verdict.state == NOT_ASKED:
         return NOT_ASKED
     if verdict.state in (RUNNING, STOPPED):
@@ -107,10 +113,6 @@ def reason(verdict: Verdict) -> str:
     return f"undecided{'' if verdict.final else ' so far'}"
 
 
-def _says_why(verdict: Verdict) -> bool:
-    return verdict.question.untested not in (NOT_TESTED, NOT_ASKED)
-
-
 def _waits(verdict: Verdict) -> str:
     """Why a question has no verdict yet, and the command that goes on."""
     count = f"{verdict.done} of {counted(verdict.wanted, 'trial')}"
@@ -119,7 +121,7 @@ def _waits(verdict: Verdict) -> str:
     if verdict.missing:
         again = command("retry", verdict.missing[0].path.parts[-4])
         return f"stopped at {count}: `{again}` goes on"
-    return f"{count}: the others, such as those of {verdict.question.baseline}, were not planned yet"
+    return f"{count}: no command has planned the others yet, such as {verdict.question.baseline}"
 
 
 def in_words(verdict: Verdict) -> str:
@@ -131,9 +133,11 @@ def in_words(verdict: Verdict) -> str:
         return reason(verdict)
     if not (shown := numbers(verdict)):
         return reason(verdict)
-    return f"{reason(verdict)}; {verdict.quantity.name} on {scope(verdict)}: {shown}" if (
-        verdict.state != ANSWERED or verdict.favours_lacking
-    ) else f"{reason(verdict)} in {verdict.quantity.name} on {scope(verdict)}: {shown}"
+    return (
+        f"{reason(verdict)}; {verdict.quantity.name} on {scope(verdict)}: {shown}"
+        if (verdict.state != ANSWERED or verdict.favours_lacking)
+        else f"{reason(verdict)} in {verdict.quantity.name} on {scope(verdict)}: {shown}"
+    )
 
 
 def _known_sign(verdict: Verdict) -> str:
@@ -179,7 +183,8 @@ def _level_words(verdict: Verdict) -> str:
 def asked_words(verdict: Verdict) -> str:
     """What a question was about: metric, scenes, seeds and level."""
     question = verdict.question
-    level = "" if verdict.state in (NOT_TESTED, NOT_ASKED) else f", level {100 * question.level:.2g} %"
+    is_tested = verdict.state not in (NOT_TESTED, NOT_ASKED)
+    level = f", level {100 * question.level:.2g} %" if is_tested else ""
     return f"{verdict.quantity.name} on {places_text(question.places)}{level}"
 
 

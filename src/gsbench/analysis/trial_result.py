@@ -33,6 +33,7 @@ class TrialResult:
     # swept settings that distinguish arms of one initialiser and densifier
     variant: tuple[tuple[str, str], ...] = ()
     settings: Configurations = field(default_factory=Configurations, repr=False, compare=False)
+    alias: Digest = ""  # stands for the digest where a question names its sides otherwise
 
     @property
     def experiment(self) -> str:
@@ -109,6 +110,8 @@ class TrialResult:
     @cached_property
     def digest(self) -> Digest:
         """The digest of its arm on its scene: settings, user's modules, edited packages."""
+        if self.alias:
+            return self.alias
         code = self.record.code
         arm = f"{self.init}-{self.densify}"
         return make_digest(arm, self.config_hash, code.sources, code.packages)

@@ -15,7 +15,7 @@ from typing import Any
 import yaml
 
 from gsbench.analysis.cells import with_variants
-from gsbench.analysis.questions import Asked, Row, announce, ask, plan_looks, rows_of
+from gsbench.analysis.questions import FIRST_LOOK, Asked, Row, announce, ask, plan_looks, rows_of
 from gsbench.analysis.results import group_by, read_experiment
 from gsbench.claims.stopping import facts_for
 from gsbench.config.compose import Trial
@@ -32,13 +32,13 @@ DEFAULT_METRIC = "psnr"
 
 
 def record(trials: Sequence[Trial], asks: bool = True) -> list[Question]:
-    """Write the trials of a command down, each in its experiment; returns the new questions.
+    """Write the trials of a command down, each in its experiment; returns their questions.
 
     With ``asks``, the questions that no earlier command asked are written, too. A trial that is
     read from its own record has no words and asks nothing. A repeated command adds no line.
     Raises InputError if trials of one experiment name different metrics.
     """
-    new: list[Question] = []
+    asked_now: list[Question] = []
     asked_metrics(trials)
     for home, own in group_by(trials, lambda trial: trial.files.home).items():
         typed = [trial for trial in own if trial.overrides]
@@ -58,6 +58,7 @@ def record(trials: Sequence[Trial], asks: bool = True) -> list[Question]:
             measured: Sequence[Row] = measured,
         ) -> Command | None:
             found, shown = ask(rows, asked, measured, history) if asked else ([], [])
+            asked_now.extend([*found, *(one for one in history.questions if one.id in shown)])
             last = {one.idea.name: one.id for one in history.questions}
             shown = [name for name in shown if name not in last.values()]
             planned = {
@@ -86,8 +87,7 @@ def record(trials: Sequence[Trial], asks: bool = True) -> list[Question]:
         line = append(home, make)
         for question in () if line is None else line.questions:
             log.info("%s: %s", home.name, announce(question))
-            new.append(question)
-    return new
+    return asked_now
 
 
 def asked_metrics(trials: Sequence[Trial]) -> dict[Path, str]:
@@ -138,13 +138,32 @@ def asked_of(trials: Sequence[Trial], rows: Sequence[Row]) -> Asked | None:
         least=launch.get("least_difference") or facts.worthwhile,
         baseline=options.get("baseline") or "adc",
         controls=options.get("controls") or {},
-        looks=_looks(trials) if launch.get("stop_when_decided") else (),
+        looks=(
+            plan_looks(len({row.seed for row in rows})) if launch.get("stop_when_decided") else ()
+        ),
         split=split,
     )
 
 
-def _looks(trials: Sequence[Trial]) -> tuple[int, ...]:
-    return plan_looks(len({trial.values["seed"] for trial in trials}))
+def check_looks(trials: Sequence[Trial], rows: Sequence[Row]) -> tuple[int, ...]:
+    """The seeds of a sweep in looks, in order; raises InputError if it cannot be run in looks."""
+    what = "launch.stop_when_decided"
+    if len({trial.files.home for trial in trials}) > 1:
+        raise InputError(f"{what}: all trials of the sweep need one name")
+    first: tuple[int, ...] = ()
+    for (scene, arm), group in group_by(rows, lambda row: (row.scene, row.arm)).items():
+        seeds = tuple(dict.fromkeys(row.seed for row in group))
+        first = first or seeds
+        if seeds != first:
+            raise InputError(
+                f"{what} needs the same seeds everywhere: {arm} on {scene} has "
+                f"{', '.join(map(str, seeds))}, others {', '.join(map(str, first))}"
+            )
+    if len(first) < FIRST_LOOK:
+        raise InputError(
+            f"{what} needs at least {FIRST_LOOK} seeds, as seed=0,1,2,3: the most it adds"
+        )
+    return first
 
 
 def remove(home: Path, folders: Iterable[Path]) -> None:

@@ -10,7 +10,7 @@ import json
 import os
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from hashlib import sha256
@@ -33,6 +33,7 @@ from gsbench.settings import ARM_BYTES, is_folder_name
 from gsbench.system.locks import hold
 
 ERROR_RATE = 0.05
+BY_COMMAND = "command"  # the rule that gives a question its level
 ID_CHARACTERS, LINK_CHARACTERS = 12, 16
 LEVELS = 3  # folders of scene, arm and trial
 Place = tuple[str, int]  # scene and seed
@@ -100,7 +101,7 @@ class Question(Record):
     digests: dict[str, tuple[Digest, Digest]] = field(default_factory=dict)
     seeds: dict[str, tuple[Count, ...]] = field(default_factory=dict)
     looks: tuple[Count, ...] = ()
-    rule: str = "command"
+    rule: str = BY_COMMAND
     n: Count = 1
     level: Amount = ERROR_RATE
     untested: str = ""
@@ -290,11 +291,23 @@ def _of_old_plan(home: Path) -> list[Command]:
     except (FileNotFoundError, DamagedError):
         return []
     return [
-        Command(words=trial.overrides, cwd=trial.cwd, time=trial.time, trials={
-            name: PlannedTrial(words=trial.overrides)
-        })
+        Command(
+            words=trial.overrides,
+            cwd=trial.cwd,
+            time=trial.time,
+            trials={name: PlannedTrial(words=trial.overrides)},
+        )
         for name, trial in planned.items()
     ]
+
+
+def read_lines(home: Path) -> list[Line]:
+    """The sound lines of the file, in order."""
+    lines = list[Line]()
+    for text in _content(home / COMMANDS).splitlines():
+        with suppress(DamagedError):
+            lines.append(_parsed(text, home / COMMANDS))
+    return lines
 
 
 def append(home: Path, make: Callable[[History], Command | None]) -> Command | None:

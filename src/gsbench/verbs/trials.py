@@ -25,8 +25,8 @@ from gsbench.launch.dry_run import describe_plan
 from gsbench.launch.progress import Progress, progress_of
 from gsbench.launch.record import remove
 from gsbench.launch.states import TrialState, label_of, names_of, states_of_experiment
-from gsbench.runs.experiments import experiment_home, list_experiments, trial_folders
 from gsbench.runs.commands import PlannedTrial, drop
+from gsbench.runs.experiments import experiment_home, list_experiments, trial_folders
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS
 from gsbench.runs.user_code import PERMISSIONS
