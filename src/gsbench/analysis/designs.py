@@ -125,8 +125,8 @@ def power_of_mean(
     """The chance that the t test of these scenes sees ``difference`` at ``level``.
 
     Trainings differ by ``deviation``, in the root mean square of the scenes, which have these
-    ``shares`` of its square (equal ones by default). The test estimates each scene's variance and its own
-    degrees of freedom. Given these, the power is that of a normal mean; the result is its
+    ``shares`` of its square (equal ones by default). The test estimates each scene's variance and
+    its own degrees of freedom. Given these, the power is that of a normal mean; the result is its
     average over simulated variances. The far tail of the wrong sign is left out.
     """
     if deviation == 0:

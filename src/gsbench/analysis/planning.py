@@ -1,7 +1,8 @@
 """Numbers of scenes and seeds that a command needs to show a difference.
 
 The commands differ in their error rate and in their looks, so the same trials have other chances.
-Trainings are simulated with the shares of noise that the pilot's scenes have, and decided by the thresholds of the judge.
+Trainings are simulated with the shares of noise that the pilot's scenes have, and decided by the
+thresholds of the judge.
 """
 
 import math
