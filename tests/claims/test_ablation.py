@@ -23,7 +23,7 @@ from gsbench.runs.config_hash import config_hash
 from gsbench.settings import Switch
 from tests.analysis.helpers import trials_of
 from tests.helpers import refusal
-from tests.launch.test_declare import TINY
+from tests.launch.test_record import TINY
 from tests.trials import write_trial
 
 NESTED = {

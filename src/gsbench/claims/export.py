@@ -21,6 +21,7 @@ from typing import Any
 from gsbench import __version__
 from gsbench.analysis.fairness import searches_of
 from gsbench.analysis.images import PixelMeasures, textured_error
+from gsbench.analysis.old_declarations import all_questions
 from gsbench.analysis.quantities import TEXTURED
 from gsbench.analysis.results import (
     Experiment,
@@ -168,7 +169,7 @@ def _declared(experiment: Experiment, trials: Sequence[TrialResult]) -> dict[str
         name: shared[name](home) if name in shared else read_bytes(place)
         for name, place in records.items()
     }
-    if TEXTURED.key in {question.metric for question in experiment.questions}:
+    if TEXTURED.key in {question.metric for question in all_questions(experiment)}:
         measured = []
         for trial in trials:
             with suppress(InputError):  # a trial whose pictures cannot be read
