@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +11,7 @@ from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.events import Cause
-
-# what numpy raises for a file of arrays that is missing or damaged, or announces more than there is
-ARRAY_DAMAGE = (
-    *(OSError, EOFError, MemoryError, zipfile.BadZipFile, zlib.error),
-    *(ValueError, TypeError, LookupError, OverflowError, NotImplementedError, RuntimeError),
-)
+from gsbench.files import DAMAGE
 
 
 class Lineage:
@@ -92,7 +85,7 @@ def read_causes(path: Path, num_gaussians: int) -> NDArray[np.uint8]:
             if values.dtype.kind not in "iu" or ((values < 0) | (values >= end)).any():
                 raise ValueError(f"{name} must be whole numbers from 0 to {end - 1}")
         living: NDArray[np.uint8] = causes[ids].astype(np.uint8)
-    except ARRAY_DAMAGE as error:
+    except DAMAGE as error:
         raise InputError(f"{path} cannot be read ({error}): run this trial again") from error
     # a model and a record of two runs would give Gaussians the causes of others
     if living.shape != (num_gaussians,):
