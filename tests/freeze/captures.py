@@ -46,7 +46,9 @@ def outcome(case, folder):
             return {"model": cameras_of(read_model(folder))}
         except InputError as error:
             return {"refused": str(error)}
-    settings = {key: case[key] for key in ("images", "sparse", "masks", "max_images") if key in case}
+    settings = {
+        key: case[key] for key in ("images", "sparse", "masks", "max_images") if key in case
+    }
     settings |= case.get("split", {})
     kind = "transforms" if case["kind"] == "cameras" else case["kind"]
     if case["kind"] == "cameras":
@@ -86,7 +88,7 @@ def read_corpus(corpus):
         case = json.loads(file.read_text())
         try:
             found[file.parent.name] = outcome(case, file.parent / "in")
-        except Exception as error:
+        except Exception as error:  # noqa: BLE001 - any of them is an outcome
             found[file.parent.name] = {"error": f"{type(error).__name__}: {error}"[:200]}
         found[file.parent.name]["what"] = f"{case['kind']} {case['test']}"
     return found
