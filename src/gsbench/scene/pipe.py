@@ -65,7 +65,7 @@ def hold_out_views(raw: RawCapture, wish: Wish) -> RawCapture:
         else None
     )
     split = hold_out(select_images(names, options.max_images), rule, (train, test), cameras)
-    roles: dict[str, Role] = {name: "train" for name in split.train}
+    roles: dict[str, Role] = dict.fromkeys(split.train, "train")
     roles.update((name, "test") for name in split.test)
     kept = [replace(by_name[name], role=roles[name]) for name in sorted(roles)]
     return replace(raw, photographs=tuple(kept), held_out=split.description)
