@@ -220,8 +220,12 @@ def test_the_number_and_the_level_are_said_before_training():
 
 def test_what_cannot_be_reached_is_said_with_what_it_needs():
     """Six scenes that agree have p 2/64, so 5 % can be reached, and 1.7 % needs seven."""
-    scenes = [row(name, seed, scene=f"s{k}") for name in ("adc", "mine") for seed in (0, 1)
-              for k in range(6)]
+    scenes = [
+        row(name, seed, scene=f"s{k}")
+        for name in ("adc", "mine")
+        for seed in (0, 1)
+        for k in range(6)
+    ]
     _, (one,), _ = asked(scenes)
     assert unreachable(one) == []
     assert "need 7 scenes at 1.7 %, not 6" in unreachable(replace(one, level=level_of(2)))[0]

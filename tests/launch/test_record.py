@@ -122,8 +122,13 @@ def test_metric_baseline_and_least_difference_come_from_the_settings(tmp_path):
 def test_an_earlier_baseline_is_found_by_its_results(tmp_path):
     adc = trial(tmp_path)
     path = write_trial(
-        tmp_path, 0, adc.folder.name.partition("-")[0], experiment="exp", scene="courtyard",
-        init="a_init", psnr=20.0,
+        tmp_path,
+        0,
+        adc.folder.name.partition("-")[0],
+        experiment="exp",
+        scene="courtyard",
+        init="a_init",
+        psnr=20.0,
     )
     assert path == adc.folder
     (question,) = record([trial(tmp_path, densify="mine")])

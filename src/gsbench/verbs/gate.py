@@ -20,7 +20,7 @@ from gsbench.verbs.arguments import ArgumentParser, add_question, add_where, pat
 from gsbench.words import listed, printable
 
 EXIT_CODES = {gates.PASSED: 0, gates.WORSE: 1, gates.NOT_DECIDED: 3}
-# what `git bisect run` takes for "cannot be tested", and for "stop" (any code from 128)
+# exit codes of `git bisect run`: the commit cannot be tested; the search ends (128 and more)
 SKIP, STOP = 125, 128
 
 

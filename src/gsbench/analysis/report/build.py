@@ -19,7 +19,7 @@ from gsbench.analysis.judge import Verdict
 from gsbench.analysis.ledger_table import describe_ledger, ledger_tables
 from gsbench.analysis.notes import texts
 from gsbench.analysis.pairs import pair_trials
-from gsbench.analysis.paper import layout_of, load_paper, paper_tables
+from gsbench.analysis.paper import layout_of, load_published, paper_tables
 from gsbench.analysis.quantities import COSTS, choose_quantities, relative_change
 from gsbench.analysis.ranks import rank_all
 from gsbench.analysis.report.charts import ForestRow, forest_plot, line_chart, rank_plot
@@ -83,7 +83,7 @@ def build_report(
         ranks=[
             rank_plot(ranking) for ranking in rank_all(trials, choose_quantities(trials)) if pairs
         ],
-        contradictions=[] if paper_table is None else load_paper().contradictions,
+        contradictions=[] if paper_table is None else load_published().contradictions,
         search=search_summary(experiment.folder),
         say=sentences,
         seeds_to_resolve=seeds_to_resolve,
