@@ -16,7 +16,7 @@ from gsbench.runs.experiments import read_declarations
 from gsbench.runs.layout import RESULTS
 from gsbench.runs.trial_record import record_from
 from tests.helpers import change_json
-from tests.launch.test_declare import TINY
+from tests.launch.test_record import TINY
 from tests.trials import write_as
 
 BASE = [

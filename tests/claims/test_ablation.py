@@ -21,7 +21,7 @@ from gsbench.densify.volumetric import Volumetric
 from gsbench.runs.config_hash import config_hash
 from gsbench.settings import Switch
 from tests.helpers import refusal
-from tests.launch.test_declare import TINY
+from tests.launch.test_record import TINY
 
 NESTED = {
     "rule": Switch({"stop": 0}),

@@ -15,7 +15,7 @@ import yaml
 from tests.claims.test_check import content
 from tests.end_to_end.conftest import SMALL, SWEEP, results_of
 from tests.helpers import read_json, write
-from tests.launch.test_declare import TINY
+from tests.launch.test_record import TINY
 from tests.processes import bytes_written, completed
 
 pytestmark = [

@@ -22,6 +22,7 @@ from gsbench.analysis.judge import (
     judge,
 )
 from gsbench.analysis.notes import Note, texts
+from gsbench.analysis.old_declarations import all_questions
 from gsbench.analysis.pairs import are_equal
 from gsbench.analysis.quantities import choose_quantities
 from gsbench.analysis.questions import Asked, Row, choose_pairs, rows_of
@@ -178,7 +179,7 @@ def _answers(
     everything = [*trials, *experiment.older]
     arms = {(trial.scene, trial.digest): trial.arm for trial in trials}
     verdicts: dict[tuple[Arm, Arm], list[Verdict]] = {}
-    for question in experiment.questions:
+    for question in all_questions(experiment):
         question = _named(question, arms)
         verdict = judge(everything, question, experiment.unfinished)
         verdicts.setdefault((question.baseline, question.idea), []).append(verdict)

@@ -8,18 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import field, replace
-from typing import TYPE_CHECKING
 
+from gsbench.analysis.cells import with_variants
 from gsbench.analysis.quantities import asked_quantity
 from gsbench.analysis.questions import Asked, choose_pairs, level_of, rows_of
+from gsbench.analysis.results import Experiment, TrialResult
 from gsbench.parsing import Amount, Count, Record
 from gsbench.runs.commands import ERROR_RATE, Question, code_in
 from gsbench.runs.experiments import Arm, unix_time
 from gsbench.runs.layout import DECLARED
 from gsbench.runs.rows import read_rows
-
-if TYPE_CHECKING:
-    from gsbench.analysis.results import Experiment, TrialResult
 
 OLD = "declaration"  # the rule of these questions
 
@@ -45,11 +43,13 @@ class _OldDeclaration(Record):
     trials: dict[str, tuple[Count, ...]] | None = None
 
 
+def all_questions(experiment: Experiment) -> list[Question]:
+    """All questions of an experiment, the newest last."""
+    return [*old_questions(experiment), *experiment.history.questions]
+
+
 def old_questions(experiment: Experiment) -> list[Question]:
     """The questions of the experiment's old declarations; the last about each pair counts."""
-    # here, since tables of trials read this module, and most experiments have no such file
-    from gsbench.analysis.cells import with_variants
-
     declarations = read_rows(experiment.folder / DECLARED, _OldDeclaration)
     if not declarations:
         return []

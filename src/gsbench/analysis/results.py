@@ -9,7 +9,6 @@ import math
 import re
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from pathlib import Path
 from typing import TypeVar
 
@@ -99,13 +98,6 @@ class Experiment:
     versions: tuple[str, ...] = ()
     unfinished: tuple[Unfinished, ...] = ()
     history: History = field(default_factory=lambda: History(Path()))
-
-    @cached_property
-    def questions(self) -> tuple[Question, ...]:
-        """All questions, the newest last; those of earlier versions are worked out."""
-        from gsbench.analysis.old_declarations import old_questions
-
-        return (*old_questions(self), *self.history.questions)
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -233,7 +225,7 @@ def newest_code(experiment: Experiment) -> Experiment:
     finished last. A warning for each part of the code names the earlier versions.
     """
     code: dict[str, str] = {}
-    for question in experiment.questions:
+    for question in experiment.history.questions:
         for arm, side in ((question.baseline, 0), (question.idea, 1)):
             digests = [both[side] for both in question.digests.values() if both[side]]
             if digests:

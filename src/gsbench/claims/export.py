@@ -23,6 +23,7 @@ from gsbench.analysis.comparison import compare
 from gsbench.analysis.fairness import searches_of
 from gsbench.analysis.images import PixelMeasures, textured_error
 from gsbench.analysis.judge import RUNNING, STOPPED
+from gsbench.analysis.old_declarations import all_questions
 from gsbench.analysis.quantities import TEXTURED
 from gsbench.analysis.results import Experiment, TrialResult, group_by, newest_code, read_views
 from gsbench.claims.archive import (
@@ -87,7 +88,7 @@ def write_archive(
         raise InputError(f"{experiment.name} has no whole trial to export (first: {left_out[0]})")
     for path in unfinished:
         files |= _of_unfinished(path)
-    if TEXTURED.key in {question.metric for question in experiment.questions}:
+    if TEXTURED.key in {question.metric for question in all_questions(experiment)}:
         for trial in kept:
             with suppress(InputError):  # a trial whose pictures cannot be read
                 measures = PixelMeasures(error_textured=textured_error(trial)).to_json()

@@ -16,9 +16,10 @@ from gsbench.analysis.questions import FIRST_LOOK, LeastEffect, plan_looks, read
 from gsbench.analysis.results import Arm, TrialResult
 from gsbench.analysis.sentences import in_words, least_words, with_notes
 from gsbench.analysis.statistics import REFUTED, SUPPORTED, TOO_SMALL, UNDECIDED
-from gsbench.claims.stopping import SequentialTest, facts_for
+from gsbench.claims.stopping import SequentialTest
 from gsbench.errors import InputError
 from gsbench.eval.facts import known_keys
+from gsbench.pipeline.metric_facts import facts_for
 from gsbench.runs.commands import Question
 from gsbench.words import did_you_mean
 

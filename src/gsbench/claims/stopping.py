@@ -1,9 +1,8 @@
 """Adding seeds in planned looks until every question is decided: sweeps, gates, ledgers."""
 
 import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 from gsbench.analysis.comparison import compare
 from gsbench.analysis.fairness import counts_notes, limit_notes
@@ -11,7 +10,6 @@ from gsbench.analysis.judge import Verdict, judge
 from gsbench.analysis.notes import texts
 from gsbench.analysis.results import TrialResult, newest_code, read_experiment
 from gsbench.config.compose import Trial
-from gsbench.eval.facts import MetricFacts, facts_of, find_metric
 from gsbench.runs.commands import Digest, Question
 from gsbench.runs.layout import LEDGER
 from gsbench.words import counted
@@ -103,17 +101,3 @@ def log_verdicts(trials: Iterable[Trial]) -> None:
         before = [*counts_notes(*both), *limit_notes(*both)]
         for line in [*texts(before), *comparison.headlines, *comparison.experiment.versions]:
             log.info("%s", line)
-
-
-def facts_for(metric: str, values: Mapping[str, Any]) -> MetricFacts:
-    """The facts of a metric of trials with the configuration ``values``.
-
-    Raises InputError for an unknown metric.
-    """
-    shipped = find_metric(metric)
-    if shipped is not None:
-        return shipped
-    # here, since only a user's own metric needs it
-    from gsbench.pipeline.parts import build_metrics
-
-    return facts_of(metric, build_metrics(values["eval"], values["allow_targets"])[metric])

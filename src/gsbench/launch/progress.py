@@ -138,7 +138,7 @@ def _share_done(state: TrialState) -> float:
 
 def _leader(experiment: Experiment, names: dict[Path, Name]) -> str:
     """The arm with the best mean over those scenes and seeds that all arms have, in words."""
-    trials, questions = experiment.trials, experiment.questions
+    trials, questions = experiment.trials, experiment.history.questions
     metric = asked_quantity(questions[-1].metric if questions else "psnr", trials)
     values: dict[str, dict[tuple[str, int], float]] = {arm: {} for arm, _ in names.values()}
     for trial in trials:

@@ -17,10 +17,10 @@ import yaml
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.questions import FIRST_LOOK, Asked, Row, announce, ask, plan_looks, rows_of
 from gsbench.analysis.results import group_by, read_experiment
-from gsbench.claims.stopping import facts_for
 from gsbench.config.compose import Trial
 from gsbench.errors import InputError
 from gsbench.files import require_no_links
+from gsbench.pipeline.metric_facts import facts_for
 from gsbench.runs.commands import Command, History, PlannedTrial, Question, append, digest_of, drop
 from gsbench.runs.experiments import QUESTIONS, metric_and_question
 from gsbench.runs.layout import LEDGER, RESULTS, SEED, TUNING

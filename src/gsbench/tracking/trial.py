@@ -220,7 +220,6 @@ class TrackedTrial:
             f"Folder: `{self.path}`",
         ]
         planned = read_history(self.folder.home).planned.get(self.folder.path)
-        place = self.folder.path.relative_to(self.folder.home).as_posix()
         if planned is not None:
             lines.append(f"Again: `{shlex.join(['gsbench', *planned.words])}`")
         return "\n\n".join(lines)
