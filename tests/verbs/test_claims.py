@@ -32,14 +32,14 @@ def test_plan_names_designs_that_suffice(pilots, capsys):
 
 def test_plan_answers_for_the_command_given(pilots, capsys):
     trials = {}
-    for words in (("sweep",), ("looks",), ("check", "--questions", "4"), ("ledger",)):
+    for words in (("sweep",), ("looks",), ("gate", "--questions", "4"), ("ledger",)):
         assert plan(["exp", "--difference", "0.5", "--for", *words], pilots) == 0
         out = capsys.readouterr().out
         trials[words[0]] = int(re.search(r"on these scenes.*?\((\d+) trials", out)[1])
         assert "seeds that the pilot does not have (it has 0, 1, 2), under another name" in out
         assert PLANNED[words[0]].partition(" {")[0] in out
         assert re.search(r"only within 0\.\d+ to 1\.\d+ times \(80 % of pilots\)", out)
-    assert trials["sweep"] < trials["looks"] < trials["check"] < trials["ledger"]
+    assert trials["sweep"] < trials["looks"] < trials["gate"] < trials["ledger"]
 
 
 def test_arms_that_cannot_be_planned_for_are_named_beside_the_others(pilots, capsys):
@@ -70,7 +70,7 @@ def test_json_has_the_facts_of_the_text(pilots, capsys, experiment):
     text, start, rest = capsys.readouterr().out.partition("{\n")
     found = json.loads(start + rest)
     assert [found[key] for key in ("metric", "difference", "for")] == ["ssim", 0.02, "sweep"]
-    assert [pair["sentence"] in text for pair in found["pairs"]] == [True]
+    assert [answer["sentence"] in text for answer in found["answers"]] == [True]
     assert all(line in text for line in found["left_out"])
     (one,) = found["plans"]
     assert (one["arm"], one["baseline"]) == ("sfm-volumetric", "sfm-adc")

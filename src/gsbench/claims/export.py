@@ -143,7 +143,8 @@ def _of_unfinished(path: Path) -> dict[str, bytes]:
         configuration = _configuration(path)
     files = {f"{folder}/{CONFIG}": configuration}
     if TrialFolder(path).state() in ("failed", "damaged"):
-        files[f"{folder}/{FAILED}"] = _page({"status": "failed"})
+        reason = without_folders(TrialFolder(path).failure().reason)
+        files[f"{folder}/{FAILED}"] = _page({"status": "failed", "message": reason})
     return files
 
 

@@ -12,6 +12,7 @@ from gsbench.config.compose import Trial
 from gsbench.config.overrides import value_text
 from gsbench.errors import InputError
 from gsbench.files import own_output, write_text
+from gsbench.launch.batch import check_parts
 from gsbench.verbs.arguments import ArgumentParser, names, path
 from gsbench.words import command, counted
 
@@ -41,7 +42,8 @@ def ablate(argv: Sequence[str], runs: Path) -> int:
     grids = []
     for run in ablation.runs_to_train(switches):
         off = _settings(ablation.off_settings(run, switches), values["densify"])
-        compose_trials([*words, *(f"{key}={value}" for key, value in off.items())], multirun=True)
+        settings = [f"{key}={value}" for key, value in off.items()]
+        check_parts(compose_trials([*words, *settings], multirun=True)[:1], on_this_machine=False)
         if off in grids:
             raise InputError(f"switching off {', '.join(off)} twice makes no other run")
         grids.append(off)
