@@ -49,6 +49,7 @@ from gsbench.runs.layout import (
     COMMANDS,
     CONFIG,
     DECLARED,
+    FAILED,
     FROM_PIXELS,
     GROUND_TRUTH,
     LEDGER,
@@ -57,6 +58,7 @@ from gsbench.runs.layout import (
     RESULTS,
     TUNING,
 )
+from gsbench.runs.trial_files import Failure
 from gsbench.settings import ARM_BYTES, is_folder_name
 from gsbench.words import readable_bytes
 
@@ -262,6 +264,9 @@ def _unpack_unfinished(home: Path, line: Mapping[str, Any]) -> Path:
         raise InputError(f"the trial {line['folder']} is in it twice")
     folder.mkdir(parents=True)
     (folder / CONFIG).write_text(yaml.safe_dump(line["configuration"]), encoding="utf-8")
+    if line.get("failed", True):  # archives of earlier versions do not tell: no verdict waits
+        failure = Failure(message="its reason is not in the archive")
+        (folder / FAILED).write_text(json.dumps(failure.to_json()), encoding="utf-8")
     return folder
 
 

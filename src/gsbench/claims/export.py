@@ -58,6 +58,7 @@ from gsbench.runs.layout import (
     COMMANDS,
     CONFIG,
     DECLARED,
+    FAILED,
     LEDGER,
     PER_VIEW,
     TUNING,
@@ -250,7 +251,8 @@ def _unfinished(path: Path) -> dict[str, Any]:
     configuration = "{}"
     with suppress(InputError, OSError):
         configuration = _configuration(path)
-    return {"folder": _folder(path), "configuration": json.loads(configuration)}
+    failed = (path / FAILED).exists()
+    return {"folder": _folder(path), "configuration": json.loads(configuration), "failed": failed}
 
 
 def _configuration(path: Path) -> str:

@@ -59,8 +59,8 @@ def record(trials: Sequence[Trial], asks: bool = True) -> list[Question]:
         ) -> Command | None:
             found, shown = ask(rows, asked, measured, history) if asked else ([], [])
             asked_now.extend([*found, *(one for one in history.questions if one.id in shown)])
-            last = {one.idea.name: one.id for one in history.questions}
-            shown = [name for name in shown if name not in last.values()]
+            if set(shown) <= set().union(*history.newest.values()):
+                shown = []  # they are the newest ones already
             planned = {
                 trial.folder.relative_to(home).as_posix(): PlannedTrial(
                     words=tuple(trial.overrides), digest=row.digest
