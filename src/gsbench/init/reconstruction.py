@@ -1,4 +1,4 @@
-"""From photographs to a COLMAP model: features, matches, mapping or triangulation, alignment."""
+"""Reconstruction of a COLMAP model from photographs: features, matches, mapping or triangulation, alignment."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ Fill = Callable[["DatabaseTask", Job, Progress, Timer], dict[str, int]]
 
 @dataclass(frozen=True)
 class Matching:
-    """What makes features and matches, as functions that a process can be given.
+    """Functions that make features and matches; other processes call them.
 
     ``fill`` runs in COLMAP's process, ``prepare`` in one of its own before.
     """

@@ -45,7 +45,7 @@ NO_PAIR = (
 
 @dataclass(frozen=True)
 class Geometry:
-    """What the points of a model say about its cameras."""
+    """Measurements of the points of a model, which say whether its cameras are sound."""
 
     images: int  # that see a point
     points: int
@@ -55,7 +55,7 @@ class Geometry:
 
     @property
     def fault(self) -> str:
-        """Why the model is wrong, although its images have poses; "" for a sound model."""
+        """The reason why the model is wrong, although its images have poses; "" if it is sound."""
         if self.images == 0:
             return "no image sees a point"
         if not self.angle >= MIN_ANGLE_DEG:  # the rays of equal images, too
