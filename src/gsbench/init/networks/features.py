@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbench.errors import GsbenchError
-from gsbench.files import atomic, file_sha256
+from gsbench.files import DAMAGE, atomic, file_sha256
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +136,7 @@ class FeatureStore:
                 width, height, file_width, file_height = (int(side) for side in data["sizes"])
                 arrays = data["keypoints"], data["descriptors"], data["scores"]
                 return Features(*arrays, (width, height), (file_width, file_height))
-        except Exception:  # noqa: BLE001  numpy may raise any exception on a damaged file
+        except DAMAGE:
             return None  # the file is made again
 
     def write_features(self, name: str, features: Features) -> None:
@@ -157,7 +157,7 @@ class FeatureStore:
         """The stored matches [M, 2] of a pair, or None if the file is missing or damaged."""
         try:
             matches = np.load(self.matches_path(first, second), allow_pickle=False)
-        except Exception:  # noqa: BLE001  as in `read_features`
+        except DAMAGE:
             return None
         return matches if matches.ndim == 2 and matches.shape[1] == 2 else None
 
