@@ -111,6 +111,7 @@ def _features_only(name: str, sha256: str, source: str) -> WeightsFile:
     """A copy of the convolutional layers of torchvision's file, without its classifier."""
     return WeightsFile((name,), None, sha256, source)
 
+
 BACKBONES: dict[str, Backbone] = {
     "vgg": Backbone(
         build=_vgg16,
@@ -248,13 +249,20 @@ def load_lpips(
 
 
 def find_first_weights(specs: tuple[WeightsFile, ...], folder: Path | None, download: bool) -> Path:
-    """Find one of the alternatives ``specs`` on this machine, or download the first if allowed."""
+    """Find one of the alternatives ``specs`` on this machine, or download the first if allowed.
+
+    Raises ``MissingWeightsError``, which names all of them, if there is none.
+    """
     for spec in specs[1:]:
         try:
             return find_weights(spec, folder, download=False)
         except MissingWeightsError:
             continue
-    return find_weights(specs[0], folder, download)
+    try:
+        return find_weights(specs[0], folder, download)
+    except MissingWeightsError as error:
+        others = [f"or {spec.names[0]}, from {spec.source}" for spec in specs[1:]]
+        raise MissingWeightsError("; ".join([str(error), *others])) from error
 
 
 def _feature_distance(
