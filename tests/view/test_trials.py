@@ -1,7 +1,9 @@
 """Photographs and the page's camera, against the cameras that they come from."""
 
+import io
 import math
 import shutil
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -305,4 +307,41 @@ def test_what_is_gone_from_a_trial_is_named(small_runs, tmp_path):
 def test_a_damaged_record_of_causes_is_refused(tmp_path, content):
     (tmp_path / "lineage.npz").write_bytes(content)
     with refusal(r"lineage\.npz cannot be read"):
+        read_causes(tmp_path / "lineage.npz", 1)
+
+
+def _npz(**arrays):
+    content = io.BytesIO()
+    np.savez(content, **arrays)
+    return content.getvalue()
+
+
+def _with_size(count):
+    """An array of one value whose header announces ``count``."""
+    content = io.BytesIO()
+    header = {"descr": "|u1", "fortran_order": False, "shape": (count,)}
+    np.lib.format.write_array_header_1_0(content, header)
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as archive:
+        archive.writestr("causes.npy", content.getvalue() + b"0")
+        archive.writestr("ids.npy", content.getvalue() + b"0")
+    return packed.getvalue()
+
+
+LYING = {
+    "a size that no machine has": _with_size(10**15),
+    "texts as causes": _npz(causes=np.array(["clone"]), ids=np.array([0])),
+    "a cause that there is not": _npz(causes=np.array([200], np.uint8), ids=np.array([0])),
+    "fractions": _npz(causes=np.array([0.5]), ids=np.array([0])),
+    "an identity that there is not": _npz(causes=np.array([0], np.uint8), ids=np.array([7])),
+    "texts as identities": _npz(causes=np.array([0], np.uint8), ids=np.array(["0"])),
+    "no causes": _npz(ids=np.array([0])),
+    "an object": _npz(causes=np.array([{}], dtype=object), ids=np.array([0])),
+}
+
+
+@pytest.mark.parametrize("case", LYING)
+def test_a_record_of_causes_that_lies_is_refused_in_one_line(case, tmp_path):
+    (tmp_path / "lineage.npz").write_bytes(LYING[case])
+    with refusal(r"lineage\.npz cannot be read .*run this trial again"):
         read_causes(tmp_path / "lineage.npz", 1)

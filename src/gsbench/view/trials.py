@@ -4,8 +4,6 @@ A picture is the render, the initial cloud, or large Gaussians coloured by their
 """
 
 import math
-import zipfile
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -29,6 +27,7 @@ from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians, rgb_to_dc
 from gsbench.gaussians.paper_values import VOLUME_THRESHOLD
 from gsbench.gaussians.ply import read_ply
 from gsbench.init.base import MODEL_FOLDER, PointCloud
+from gsbench.parsing import ARRAY_ERRORS, one_line, read_arrays
 from gsbench.raster.base import Rasterizer, RenderOutput
 from gsbench.runs.keys import INIT
 from gsbench.runs.layout import GROUND_TRUTH, LINEAGE, POINT_CLOUD, RESULTS, STORE
@@ -38,8 +37,7 @@ from gsbench.scene.images import png_name, read_image
 from gsbench.scene.types import PINHOLE_NAMES, Camera, View
 from gsbench.words import split_outside_brackets
 
-# raised by numpy for a file that is missing or damaged
-DAMAGE = (OSError, ValueError, LookupError, EOFError, zipfile.BadZipFile, zlib.error)
+CAUSES = set(map(int, Cause))
 DIMMED = 0.35  # brightness of the render behind Gaussians coloured by their causes
 TEXT_COLOR, SHADOW = (255, 255, 255), (0, 0, 0)
 TEXT_SIZE = 1 / 36  # of a picture's height; smaller if a word does not fit its pane
@@ -133,10 +131,17 @@ def load_viewed(trial: TrialResult, device: torch.device) -> ViewedTrial:
 def read_causes(path: Path, num_gaussians: int) -> NDArray[np.uint8]:
     """The cause of each remaining Gaussian, [N], from ``lineage.npz``."""
     try:
-        with np.load(path) as lineage:
-            causes = lineage["causes"][lineage["ids"]]
-    except DAMAGE as error:
-        raise InputError(f"{path} cannot be read ({error}): run this trial again") from error
+        lineage = read_arrays(path)
+        causes: NDArray[np.uint8] = lineage["causes"][lineage["ids"]]
+        if (
+            causes.ndim != 1
+            or causes.dtype.kind not in "iu"
+            or not set(np.unique(causes)) <= CAUSES
+        ):
+            raise ValueError("it names causes that there are not")
+    except (*ARRAY_ERRORS, InputError) as error:
+        reason = one_line(str(error)).removeprefix(f"{path} ")
+        raise InputError(f"{path} cannot be read ({reason}): run this trial again") from error
     # a model and a record of two runs would give Gaussians the causes of others
     if len(causes) != num_gaussians:
         raise InputError(

@@ -19,8 +19,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbench.errors import GsbenchError
+from gsbench.errors import GsbenchError, InputError
 from gsbench.files import atomic, file_sha256
+from gsbench.parsing import ARRAY_ERRORS, read_arrays
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,11 +133,11 @@ class FeatureStore:
     def read_features(self, name: str) -> Features | None:
         """The stored features, or None if the file is missing or damaged."""
         try:
-            with np.load(self.features_path(name), allow_pickle=False) as data:
-                width, height, file_width, file_height = (int(side) for side in data["sizes"])
-                arrays = data["keypoints"], data["descriptors"], data["scores"]
-                return Features(*arrays, (width, height), (file_width, file_height))
-        except Exception:  # noqa: BLE001  numpy may raise any exception on a damaged file
+            data = read_arrays(self.features_path(name))
+            width, height, file_width, file_height = (int(side) for side in data["sizes"])
+            arrays = data["keypoints"], data["descriptors"], data["scores"]
+            return Features(*arrays, (width, height), (file_width, file_height))
+        except (*ARRAY_ERRORS, InputError):
             return None  # the file is made again
 
     def write_features(self, name: str, features: Features) -> None:
@@ -156,8 +157,8 @@ class FeatureStore:
     def read_matches(self, first: str, second: str) -> NDArray[np.uint32] | None:
         """The stored matches [M, 2] of a pair, or None if the file is missing or damaged."""
         try:
-            matches = np.load(self.matches_path(first, second), allow_pickle=False)
-        except Exception:  # noqa: BLE001  as in `read_features`
+            matches: NDArray[np.uint32] = read_arrays(self.matches_path(first, second))[""]
+        except (*ARRAY_ERRORS, InputError):
             return None
         return matches if matches.ndim == 2 and matches.shape[1] == 2 else None
 

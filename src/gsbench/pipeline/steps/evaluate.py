@@ -49,7 +49,8 @@ from gsbench.system.resources import available_threads
 from gsbench.train.trainer import snapshot_file
 
 if TYPE_CHECKING:
-    from gsbench.pipeline.parts import Parts
+    from gsbench.parsing import read_arrays
+from gsbench.pipeline.parts import Parts
 
 EXTRA = "eval.extra"  # the setting that names the user's own metrics
 TIMED_RENDERS = 5  # of each view, to measure the speed
@@ -129,8 +130,8 @@ def _build_from_model(views: Views, trained: Step, parts: Parts) -> Callable[[Pa
                 means = summarize(measure(model, f"iteration {step}", None), evaluator.unavailable)
                 at[str(step)] = Earlier(metrics=means, num_gaussians=len(model))
         if parts.eval.maps:
-            with np.load(training / LINEAGE) as lineage:
-                causes = torch.from_numpy(lineage["causes"][lineage["ids"]])  # [N]
+            lineage = read_arrays(training / LINEAGE)
+            causes = torch.from_numpy(lineage["causes"][lineage["ids"]])  # [N]
             first = scene.test[0]
             render = read_image(folder / RENDERS / png_name(first.name))
             picture = draw_ellipsoids(render, gaussians, causes, first.camera, VOLUME_THRESHOLD)
