@@ -396,8 +396,8 @@ def tables(folder: Path) -> str:
     shutil.rmtree(results, ignore_errors=True)
     for file in sorted(folder.glob("gpu_day-*.tar.gz")):  # all, rest
         shutil.unpack_archive(file, results.parent, filter="data")
-    paper = Path("src/gsbench/analysis/paper.yaml").read_text().splitlines()
-    (row, *_) = (line.strip() for line in paper if line.startswith("    bonsai:"))
+    paper = Path("src/gsbench/analysis/published/volumetric.yaml").read_text().splitlines()
+    (row, *_) = (line.strip() for line in paper if line.startswith("      bonsai:"))
     return f"{table(results)}\n\nThe paper: SSIM, PSNR, LPIPS, million Gaussians, minutes; {row}"
 
 

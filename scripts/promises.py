@@ -1,10 +1,10 @@
 """Simulate every error rate and power that the documents promise (findings/simulations.md).
 
     python scripts/promises.py                write all rows of the page (15 minutes)
-    python scripts/promises.py --only bisect  write the rows whose names have this word
+    python scripts/promises.py --only gate    write the rows whose names have this word
     python scripts/promises.py --share 0.05   print them from a twentieth of the draws
 
-Trials' results with known truth go in where results of trials go in: `judge`, looks, gate, bisect
+Trials' results with known truth go in where results of trials go in: `judge`, looks, gate
 and ledger decide as in the verbs; only the training and the files are left out.
 """
 
@@ -35,10 +35,8 @@ from gsbench.analysis.results import Arm, TrialResult
 from gsbench.analysis.statistics import REFUTED, SUPPORTED
 from gsbench.analysis.thresholds import Region
 from gsbench.analysis.unfinished import Unfinished
-from gsbench.analysis.votes import judge_votes
 from gsbench.claims import gate as gates
 from gsbench.claims import ledger as rules
-from gsbench.claims.pooling import Study, pool
 from gsbench.claims.stopping import KeyAndSeed, SequentialTest
 from gsbench.runs import ledger as records
 from gsbench.runs.experiments import Declaration, Question, trial_key
@@ -292,38 +290,13 @@ def like_these(scenes: int) -> Draw:
     return draw
 
 
-def people_like_these(people: int) -> Draw:
-    """The same of people: 20 % prefer by 90:10, the others the other arm by 52.5:47.5; 45 pairs."""
-    many = np.random.default_rng(0).binomial(45, [[0.9], [0.475]], (2, 400_000)) / 45
-    gains = 0.2 * (many[0] > 0.5).mean() + 0.8 * (many[1] > 0.5).mean() > 0.5
-
-    def draw(rng: Rng) -> float:
-        chance = np.where(rng.random((people, 1)) < 0.2, 0.9, 0.475)
-        votes = np.where(rng.random((people, 45)) < chance, 1, -1)
-        found, _ = judge_votes(votes, [f"{k % 9}" for k in range(45)], 0.05)
-        assert found is not None
-        return float(found.outcome == (REFUTED if gains else SUPPORTED))
-
-    return draw
+# ---- gate
 
 
-def pooled(rng: Rng) -> float:
-    """Three studies with effects and errors of their own: 1 if the interval misses the mean."""
-    effects = rng.normal(0.2, 0.1, 3) + rng.normal(0, 0.1, 3)
-    studies = [Study(f"study{k}", float(one), None, "paper-1") for k, one in enumerate(effects)]
-    test = pool(studies).test
-    assert test is not None
-    interval = test.interval()
-    return float(not interval.low <= 0.2 <= interval.high)
-
-
-# ---- gate and bisect
-
-
-def gate_question(scenes: int, seeds: int, rate: float = 0.05) -> Declaration:
+def gate_question(scenes: int, seeds: int) -> Declaration:
     names = {f"scene{k}": ("sfm-adc", "sfm-adc") for k in range(scenes)}
     values: Mapping[str, Any] = {"eval": {"extra": {}}}
-    found = gates.declare_gate(METRIC, str(LEAST), names, range(seeds), values, rate)
+    found = gates.declare_gate(METRIC, str(LEAST), names, range(seeds), values)
     return replace(found, time=TIME)
 
 
@@ -350,66 +323,6 @@ def gate(scenes: int, seeds: int, loss: float, counted: str) -> Draw:
         return float(gates.result_of(verdict) == counted)
 
     return draw
-
-
-def bisect(count: int, scenes: int, seeds: int, loss: float, deviation: float) -> Draw:
-    """A bisection of ``count`` commits; 1 if it names one that is not the first worse one.
-
-    The loss is in units of the least difference that matters, the deviation that of a pair.
-    """
-    share = 0.05 / gates.most_steps(count)
-    asked = gate_question(scenes, seeds, 2 * share)
-
-    def draw(rng: Rng) -> float:
-        worse = int(rng.integers(1, count + 1))
-        made: dict[int, list[TrialResult]] = {}
-        most: dict[int, int] = {}
-
-        def read(number: int) -> list[TrialResult]:
-            return [one for one in made.get(number, []) if one.seed < most[number]]
-
-        def result(number: int) -> str:
-            for one in (0, count, number):
-                if one not in made:
-                    level = 25 - loss * LEAST * (one >= worse)
-                    noise = deviation * LEAST * math.sqrt(0.5)
-                    version = {0: gates.BASELINE, count: gates.LAST}.get(one, gates.NEW)
-                    drawn = rng.normal(level, noise, (scenes, seeds))
-                    made[one] = trials("adc", drawn, version)
-                    most[one] = 0
-            places = {gates.BASELINE: 0, gates.LAST: count, gates.NEW: number}
-
-            def run(planned: Sequence[KeyAndSeed]) -> None:
-                for version, place in places.items():
-                    own = [seed for key, seed in planned if key.endswith(f"/{version}")]
-                    most[place] = max([most[place], *(seed + 1 for seed in own)])
-
-            good, last, new = (lambda place=place: read(place) for place in places.values())
-            if number == count:
-                (verdict,) = gates.ask_gate(asked, good, new).answer(run)
-                return gates.result_of(verdict)
-            step = gates.ask_step(asked, share, good, last, new)
-            return gates.step_result(step.answer(run))
-
-        found = gates.first_worse(count, result)
-        named = found is not None and found[1] - found[0] == 1
-        return float(named and found != (worse - 1, worse))
-
-    return draw
-
-
-GRID = tuple(
-    product((4, 16, 64), (1, 3, 8), (2, 6, 12), (0.3, 0.6, 1.0, 2.0), (0.1, 0.3, 1.0))
-)  # commits, scenes, seeds, loss, deviation
-SCREENED, WORST = 12, 8  # draws in each cell; cells with the most wrong names, which are drawn anew
-
-
-def worst_bisect(share: float) -> tuple[float, float]:
-    """The rate of wrong names in the worst cells of the grid."""
-    cells = GRID[:: max(1, round(1 / share / 4))] if share < 1 else GRID
-    first = {case: repeated(bisect(*case), SCREENED, 11)[0] for case in cells}
-    worst = sorted(first, key=lambda case: first[case])[-WORST if share == 1 else -1 :]
-    return max(repeated(bisect(*case), max(20, round(200 * share)), 12) for case in worst)
 
 
 # ---- ledger
@@ -633,15 +546,6 @@ def promises() -> Iterator[Promise]:
             1500,
             like_these(count),
         )
-    for count in (9, 30):
-        yield Promise(
-            f"people like these, {count} people, skewed preferences",
-            "`judge_votes`",
-            0.05,
-            8000,
-            people_like_these(count),
-        )
-    yield Promise("pooled interval of three studies misses", "`pool`", 0.05, 8000, pooled)
     yield Promise(
         "gate: worse although nothing changed, 2 × 6",
         "`ask_gate`",
@@ -655,18 +559,6 @@ def promises() -> Iterator[Promise]:
         0.025,
         1500,
         gate(2, 6, LEAST, gates.PASSED),
-    )
-    for case in ((16, 3, 6, 0.6, 0.3), (16, 3, 6, 0.0, 0.3)):
-        count, scenes, seeds, loss, deviation = case
-        name = f"bisect of {count} commits: wrong name, {scenes} × {seeds}, "
-        name += f"loss {loss:g}, deviation {deviation:g}"
-        yield Promise(name, "`first_worse`, `ask_step`", 0.05, 500, bisect(*case))
-    yield Promise(
-        f"bisect: wrong name, the worst of {len(GRID)} cells",
-        "`first_worse`, `ask_step`",
-        0.05,
-        200,
-        found=worst_bisect,
     )
     for captures in (1, 3):
         name = f"ledger: false discoveries, captures: {captures}, retries correlate by 0.8"

@@ -36,7 +36,6 @@ def test_each_promise_of_the_page_has_a_figure(every):
 
 
 def test_a_broken_promise_is_noticed():
-    """Bisecting by comparisons with the first commit alone would name wrong ones."""
     promise = promises.Promise("always", "", 0.05, 1000, lambda rng: float(rng.random() < 0.2))
     assert not promise.holds(*promise.measure(1.0))
     power = promises.Promise("power", "", 0.8, 1000, lambda rng: float(rng.random() < 0.6), True)

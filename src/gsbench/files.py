@@ -3,13 +3,19 @@
 import errno
 import hashlib
 import json
+import lzma
 import os
 import re
 import shutil
 import stat
+import struct
+import tarfile
+import tokenize
+import zipfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from tempfile import TemporaryDirectory
 from typing import Any
 
@@ -29,6 +35,25 @@ FORBIDDEN = (errno.EROFS, errno.EACCES, errno.EPERM)
 FULL_TEXT = re.compile(
     r"No space left|requested and \d+ written|PytorchStreamWriter failed|unexpected pos|disk is "
     r"full"
+)
+# What the readers of arrays, pictures and archives (numpy, plyfile, zipfile, tarfile and their
+# decompressors) raise for a damaged file. MemoryError: a header may announce any number of values.
+DAMAGE = (
+    OSError,
+    ValueError,
+    LookupError,
+    TypeError,
+    EOFError,
+    ArithmeticError,
+    MemoryError,
+    RuntimeError,
+    SyntaxError,
+    struct.error,
+    tokenize.TokenError,
+    zlib.error,
+    lzma.LZMAError,
+    zipfile.BadZipFile,
+    tarfile.TarError,
 )
 NEARLY_NOTHING = 64 * 1024  # free bytes; with less, any failed write counts as a full disk
 
@@ -189,6 +214,17 @@ def require_regular(path: Path) -> None:
         mode = path.stat().st_mode
         if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
             raise InputError(f"{path} is not a regular file: put a copy of its content there")
+
+
+def is_safe_member(name: str) -> bool:
+    """Return whether the file of this name in an archive stays below the folder it is unpacked to.
+
+    Backslashes and drives lead out on Windows. No file can have a name with a NUL or a line break.
+    """
+    path = PurePosixPath(name)
+    leads_out = path.is_absolute() or ".." in path.parts
+    leads_out |= "\\" in name or bool(PureWindowsPath(name).drive)
+    return not leads_out and bool(path.parts) and is_one_line(name)
 
 
 def sync_to_disk(path: Path) -> None:

@@ -12,10 +12,6 @@ import os
 import re
 import reprlib
 import stat
-import struct
-import tokenize
-import zipfile
-import zlib
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -37,7 +33,7 @@ from pydantic import (
 from pydantic_core import CoreSchema, ErrorDetails, core_schema, from_json
 
 from gsbench.errors import InputError
-from gsbench.files import open_plain
+from gsbench.files import DAMAGE, open_plain
 from gsbench.words import as_line
 
 log = logging.getLogger(__name__)
@@ -287,23 +283,6 @@ def _fault_of_keys(mapping: dict[Any, Any]) -> str:
 
 # ---- arrays
 
-# what numpy and zipfile raise for a file that is damaged, foreign, or lies about its size
-ARRAY_ERRORS = (
-    OSError,
-    ValueError,
-    LookupError,
-    EOFError,
-    ArithmeticError,
-    MemoryError,
-    RuntimeError,
-    SyntaxError,
-    TypeError,
-    struct.error,
-    tokenize.TokenError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
-
 
 def read_arrays(path: Path) -> dict[str, Any]:
     """The arrays of an ``.npz`` file by name, or that of an ``.npy`` file under ""; none is code.
@@ -319,7 +298,7 @@ def read_arrays(path: Path) -> dict[str, Any]:
                 return {"": loaded}
             with loaded:
                 return dict(loaded.items())
-        except ARRAY_ERRORS as error:
+        except DAMAGE as error:
             reason = str(error) or type(error).__name__
             raise DamagedError(path, f"cannot be read ({reason})") from None
 

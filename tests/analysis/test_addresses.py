@@ -7,12 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsbench.analysis.addresses import ArmName, trials_of_arm
-from gsbench.analysis.cells import with_variants
 from gsbench.renders.imported import find_destination
 from gsbench.renders.truth import ReferenceImages
 from gsbench.runs.experiments import Arm
 from gsbench.verbs.results import explain_cell
-from gsbench.verbs.vote import choose_arms
 from gsbench.view.trials import find_trial
 from tests.analysis.helpers import trials_of
 from tests.helpers import refusal
@@ -67,11 +65,9 @@ ARMS = {
 
 @pytest.mark.parametrize("word, count", ARMS.items())
 def test_all_verbs_read_an_arm_alike(runs, word, count):
-    trials = with_variants(trials_of(runs))
     readers = {
         "explain": lambda: explain_cell(f"exp:garden:psnr:{word}", runs),
         "view": lambda: find_trial(f"exp:garden:{word}:1", runs),
-        "vote": lambda: choose_arms(trials, (word, "adc")),
     }
     for reader in readers.values():
         if count == 1:

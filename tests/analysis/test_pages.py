@@ -1,6 +1,5 @@
 """Every page that gsbench writes, with hostile text in each of its fields."""
 
-import random
 import re
 from functools import partial
 from pathlib import Path
@@ -12,9 +11,7 @@ from gsbench.analysis import table_formats
 from gsbench.analysis.report.build import build_report
 from gsbench.claims.check_page import to_html
 from gsbench.claims.export import write_archive
-from gsbench.claims.vote_page import make_round
 from gsbench.cli import run
-from gsbench.runs.experiments import Arm
 from gsbench.view import page as model_page
 from tests.analysis.helpers import loaded
 from tests.claims.test_page import made, page_of
@@ -51,8 +48,6 @@ def pages(folder, monkeypatch):
     write_runs(runs, views=7, seeds=(0, 1), pictures=True, effect={"psnr": 1.0})
     monkeypatch.setenv("GSBENCH_RUNS", str(runs))
     trials = loaded(runs)
-    arms = [Arm("sfm", "adc"), Arm("sfm", "volumetric")]
-    make_round(trials.trials, arms, 4, 1, folder / "vote", random.Random(0))
     write_archive(trials, folder / "exp.zip")
     assert run(["site", str(folder / "exp.zip"), "--out", str(folder / "site")]) == 0
     assert run(["tables", "exp", "--format", "html", "--out", str(folder / "tables")]) == 0
@@ -60,7 +55,6 @@ def pages(folder, monkeypatch):
     return {
         "report.html.j2": build_report(trials),
         "site.html.j2": (folder / "site/index.html").read_text(),
-        "vote.html.j2": (folder / "vote/index.html").read_text(),
         "table_page.html.j2": table.read_text(),
         "page.html.j2": to_html(page_of(made(folder / "claims", tuple("abcdef")))),
     }

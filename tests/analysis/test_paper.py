@@ -10,11 +10,9 @@ from gsbench.analysis.cells import Cell
 from gsbench.analysis.paper import (
     DIFFERS,
     INTERVAL,
-    QUANTITIES,
     ROUNDING,
     PrintedNumber,
     agreement,
-    load_paper,
     load_published,
     paper_tables,
     published_names,
@@ -22,13 +20,22 @@ from gsbench.analysis.paper import (
 )
 from gsbench.analysis.table_formats import to_html_page, to_latex, to_markdown
 from gsbench.analysis.tables import build_table
-from gsbench.eval.facts import find_metric
 from gsbench.system.install import conf_dir
 from gsbench.verbs.results import tables
 from tests.analysis.helpers import trials_of
 from tests.analysis.test_tables import texts
 from tests.helpers import refusal
 from tests.trials import write_runs, write_trial
+
+
+def numbers(table):
+    """{(scene, init, densify, quantity): the printed number}"""
+    return {
+        (scene, *arm, key): table.find(scene, *arm, key)
+        for scene in table.scenes
+        for arm in table.arms
+        for key in table.quantities
+    }
 
 
 def cell(mean, std=None, count=3):
@@ -43,7 +50,7 @@ def garden(make_experiment):
 @pytest.mark.shared
 def test_the_numbers_are_those_of_the_printed_tables(shared):
     """Every number of the tables in the paper's text, row by row, with its printed digits."""
-    paper, text = load_paper(), (shared / "paper.md").read_text()
+    tables, text = load_published().tables, (shared / "paper.md").read_text()
     rows = [
         [c.strip().strip("*") for c in line.strip("|").split("|")]
         for line in text.splitlines()
@@ -54,29 +61,27 @@ def test_the_numbers_are_those_of_the_printed_tables(shared):
     assert len(table1) == 13
     for row in table1:
         scene = name.get(row[-1], row[-1].lower())
-        keys = [
-            (scene, "dim", arm, q) for q in QUANTITIES["table1"] for arm in ("adc", "volumetric")
-        ]
-        assert [paper.tables["table1"][key].text for key in keys] == row[1:11]
+        table, shown = tables["table1"], ("ssim", "psnr", "lpips_vgg_raw", "gaussians_millions")
+        keys = [(q, arm) for q in (*shown, "train_minutes") for arm in ("adc", "volumetric")]
+        assert [table.find(scene, "dim", arm, q).text for q, arm in keys] == row[1:11]
     table2 = [row for row in rows if len(row) == 5 and re.fullmatch(r"[\d.]+", row[1])]
     assert len(table2) == 12
     for row in table2:
         scene = name.get(row[0], row[0].lower())
         arms = (("sfm", "adc"), ("dim", "adc"), ("sfm", "volumetric"), ("dim", "volumetric"))
-        assert [
-            paper.tables["table2"][scene, init, arm, "lpips_vgg_raw"].text for init, arm in arms
-        ] == row[1:]
+        found = [tables["table2"].find(scene, *arm, "lpips_vgg_raw").text for arm in arms]
+        assert found == row[1:]
 
 
 def test_the_papers_contradictions_follow_from_its_numbers():
-    paper = load_paper()
-    table1, table2 = (paper.tables[name] for name in ("table1", "table2"))
+    paper = load_published()
+    table1, table2 = map(numbers, paper.tables.values())
     text = "\n".join(paper.contradictions)
 
     def pairs(quantity):
         keys = [
             [(scene, "dim", arm, quantity) for arm in ("adc", "volumetric")]
-            for scene in paper.scenes("table1")
+            for scene in paper.tables["table1"].scenes
         ]
         return [(table1[one].value, table1[other].value) for one, other in keys]
 
@@ -113,7 +118,7 @@ def test_the_papers_contradictions_follow_from_its_numbers():
         ):
             name = {"adc": "3DGS", "volumetric": "Ours"}[key[2]]
             assert f"{key[0]} {name} {table1[key].text}/{printed.text}" in text
-    assert set(paper.scenes("table1")) - set(paper.scenes("table2")) == {"train"}
+    assert set(paper.tables["table1"].scenes) - set(paper.tables["table2"].scenes) == {"train"}
 
 
 def test_a_printed_number_has_the_range_that_rounds_to_it():
@@ -145,7 +150,7 @@ def test_table1_has_the_papers_rows_and_marks_what_was_not_run(make_experiment):
     measured, difference = paper_tables(experiment, "table1")
     rows = [row.labels[0] for row in measured.rows]
     # a scene that the paper lacks comes last
-    assert rows == [*load_paper().scenes("table1"), "courtyard", "mean of 3 scenes"]
+    assert rows == [*load_published().tables["table1"].scenes, "courtyard", "mean of 3 scenes"]
     by_scene = {row.labels[0]: row for row in measured.rows}
     assert by_scene["stump"].entries[0].text == "— (0/3)"
     arms = ("adc", "volumetric")
@@ -228,14 +233,15 @@ def test_every_paper_names_its_source_and_has_sane_numbers(name):
     assert paper.title
     assert "github.com/" in paper.source or "arxiv.org/" in paper.source
     assert paper.conventions
-    assert all(find_metric(key) is not None for key in paper.quantities)
     bounds = {"psnr": (10, 45), "ssim": (0.3, 1), "lpips_vgg_raw": (0, 1)}
-    for (_, key), printed in paper.printed.items():
-        low, high = bounds[key]
-        assert low < printed.value < high
-    # scenes and methods have the names of gsbench
-    assert all((conf_dir() / f"scene/{scene}.yaml").is_file() for scene, _ in paper.printed)
-    assert (conf_dir() / f"densify/{paper.densify}.yaml").is_file()
+    bounds |= {"gaussians_millions": (0, 10), "train_minutes": (1, 1000)}
+    for table in paper.tables.values():
+        for (scene, init, densify, key), printed in numbers(table).items():
+            low, high = bounds[key]
+            assert low < printed.value < high
+            # scenes, initial clouds and methods have the names of gsbench
+            for file in (f"scene/{scene}", f"init/{init}", f"densify/{densify}"):
+                assert (conf_dir() / f"{file}.yaml").is_file()
 
 
 def test_measured_values_are_shown_beside_the_printed_numbers(tmp_path, capsys):

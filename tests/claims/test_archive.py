@@ -339,7 +339,6 @@ def test_a_search_stays_a_search_and_a_tuned_arm_stays_tuned(runs, tmp_path, sai
         one: unpack_archive(tmp_path / f"{one}.zip", tmp_path / one) for one in ("vth", "search")
     }
     assert compare(opened["search"]).pairs == ()
-    assert "of a search" in refused("pool --arm volumetric", tmp_path / "search.zip")
     for one in (load_experiment(runs, "vth"), opened["vth"]):
         sheet = to_markdown(fairness_table(one.trials, ADC, VOLUMETRIC))
         assert "the best of 1 point by psnr" in sheet

@@ -15,21 +15,15 @@ from gsbench.claims.export import write_archive
 from gsbench.claims.gate import (
     NOT_DECIDED,
     PASSED,
-    SPARE,
     WORSE,
     ask_gate,
-    ask_step,
     declare_gate,
     describe,
-    describe_step,
     deviations,
-    first_worse,
-    most_steps,
     result_of,
-    step_result,
-    too_small_to_place,
 )
 from gsbench.cli import run
+from gsbench.errors import InputError
 from gsbench.runs.trial_record import Code
 from tests.analysis.helpers import loaded
 from tests.helpers import refusal
@@ -210,7 +204,7 @@ def test_the_exit_code_of_gate_is_its_result(
             write_as(trial, psnr=26 + effect + 0.001 * trained[-1])
         return 0
 
-    monkeypatch.setattr("gsbench.verbs.versions.run_trials", train)
+    monkeypatch.setattr("gsbench.verbs.gate.run_trials", train)
     # As without weights: trials lack a metric, and whether it can be computed now is asked for.
     lacking = lambda files, values, unavailable_now=None: "" if unavailable_now else "it lacks flip"  # noqa: E731
     monkeypatch.setattr("gsbench.runs.trial_folder.TrialFolder.why_not_done", lacking)
@@ -222,82 +216,30 @@ def test_the_exit_code_of_gate_is_its_result(
     assert len(old) == 4
 
 
-@pytest.mark.parametrize("worse", range(1, 13))
-def test_bisecting_finds_any_commit_within_the_largest_number_of_steps(worse):
-    asked_for = []
+@pytest.mark.parametrize(
+    "words, effect, code",
+    [
+        ("scene=courtyard --least .2", 1.0, 0),
+        ("scene=courtyard --least .2", -1.0, 1),
+        ("scene=courtyard --least 10", 0.0, 0),
+        ("scene=courtyard --least .002 --seeds 2", 0.0, 125),  # undecided
+        ("scene=courtyard --least .2", None, 125),  # it does not train
+        ("scene=courtyard --metric psn", 1.0, 128),
+        ("scene=elsewhere", 1.0, 128),
+        ("scene=courtyard --sees 3", 1.0, 128),
+    ],
+)
+def test_exit_codes_under_git_bisect_run(runs, tmp_path, monkeypatch, words, effect, code):
+    def train(planned):
+        if effect is None:
+            raise InputError("densify._target_=mine.Mine cannot be imported")
+        for trial in planned:
+            write_as(trial, psnr=26 + effect + 0.01 * trial.values["seed"])
+        return 0
 
-    def result(commit):
-        asked_for.append(commit)
-        return WORSE if commit >= worse else PASSED
-
-    assert first_worse(12, result) == (worse - 1, worse)
-    assert len(asked_for) == len(set(asked_for)) <= most_steps(12) - SPARE
-
-
-def test_bisecting_skips_commits_that_are_undecided_or_do_not_train():
-    assert first_worse(12, lambda commit: PASSED) is None
-    answers = {6: NOT_DECIDED, 7: None}
-    for worse, found in ((9, (8, 9)), (8, (5, 8))):
-
-        def result(commit, worse=worse):
-            return answers.get(commit, WORSE if commit >= worse else PASSED)
-
-        assert first_worse(12, result) == found
-    asked_for = []
-
-    def never(commit):
-        asked_for.append(commit)
-        return WORSE if commit == 12 else NOT_DECIDED
-
-    assert first_worse(12, never) == (0, 12)
-    assert len(asked_for) <= most_steps(12)
-    # a commit that does not train costs no step
-    assert first_worse(12, lambda commit: WORSE if commit == 12 else None) == (0, 12)
-
-
-# ---- steps of a bisection
-
-
-def step(tmp_path, loss, place, noise=0.01):
-    """The result and words of a commit like the first one, the last one, or between both."""
-    losses = {"first": 0.0, "last": loss, "between": loss / 2}
-    good, last = trials(tmp_path / "a", 0.0, noise), trials(tmp_path / "b", -loss, noise)
-    # the same noise would make two versions equal to the last bit
-    new = trials(tmp_path / "c", -losses[place] + 0.0017, noise)
-    asked_step = ask_step(asked(), 0.05 / 7, lambda: good, lambda: last, lambda: new)
-    verdicts = asked_step.verdicts()
-    assert len({one.final for one in verdicts}) == 1
-    return step_result(verdicts), describe_step(verdicts)
-
-
-@pytest.mark.parametrize("loss", [0.06, 0.3])
-@pytest.mark.parametrize("place, result", [("first", PASSED), ("last", WORSE)])
-def test_a_loss_below_the_least_that_matters_is_placed_too(tmp_path, loss, place, result):
-    found, words = step(tmp_path, loss, place)
-    assert found == result
-    assert words.startswith(f"{result}; against the first: ")
-    assert "; against the last: " in words
-
-
-def test_a_commit_between_both_ends_or_within_the_noise_is_undecided(tmp_path):
-    assert step(tmp_path / "x", 0.3, "between")[0] == NOT_DECIDED
-    assert step(tmp_path / "y", 0.06, "first", noise=0.3)[0] == NOT_DECIDED
-
-
-def test_a_commit_that_is_equal_to_an_end_is_like_it(tmp_path):
-    good, last = trials(tmp_path / "a", 0.0, 0.01), trials(tmp_path / "b", -0.3, 0.01)
-    for new, result in ((good, PASSED), (last, WORSE)):
-        verdicts = ask_step(
-            asked(), 0.01, lambda: good, lambda: last, lambda new=new: new
-        ).verdicts()
-        assert step_result(verdicts) == result
-        assert "equal to the last bit" in describe_step(verdicts)
-
-
-def test_a_loss_that_steps_cannot_see_is_said_before_they_begin(tmp_path):
-    good, *bad = (trials(tmp_path / str(loss), -loss, 0.1) for loss in (0.0, 0.1, 0.5))
-    small, large = (
-        ask_gate(asked(), lambda: good, lambda one=one: one).verdicts()[0] for one in bad
-    )
-    assert too_small_to_place(large, 0.05 / 7) is None
-    assert "the search may end with a range" in str(too_small_to_place(small, 0.05 / 7))
+    monkeypatch.setattr("gsbench.verbs.gate.run_trials", train)
+    lacking = lambda files, values, unavailable_now=None: "" if unavailable_now else "it lacks flip"  # noqa: E731
+    monkeypatch.setattr("gsbench.runs.trial_folder.TrialFolder.why_not_done", lacking)
+    trials(tmp_path / "old", 0, 0.01, scenes=("courtyard",))
+    write_archive(load_experiment(tmp_path / "old", "gate"), tmp_path / "exp.zip")
+    assert run(split(f"gate exp.zip init=sfm densify=adc {words} --bisect")) == code

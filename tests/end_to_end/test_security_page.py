@@ -90,20 +90,13 @@ VERB_ROWS = {
     ),
     "`check --from`": ([["check", "--from", "a.zip", str(CLAIMS)]], set(), ""),
     "`gate`": ([["export", "--results", "tiny"], GATE], COMMIT, ""),
-    "`bisect`": (
-        [],
-        set(),
-        "system/test_work_trees.py::test_neither_hooks_nor_filters_of_the_repository_run",
-    ),
-    "`tables`, `report`, `explain`, `plan`, `pool`, `site`, `vote`": (
+    "`tables`, `report`, `explain`, `plan`, `site`": (
         [
             ["tables", FINISHED],
             ["report", FINISHED],
             ["explain", f"{FINISHED}:courtyard:psnr:adc"],
             ["plan", FINISHED],
-            ["pool", "a.zip", "--arm", "volumetric"],
             ["site", "a.zip", "--out", "site"],
-            ["vote", "make", FINISHED, "--arms", "adc,volumetric", "--out", "vote"],
         ],
         set(),
         "",
@@ -312,9 +305,6 @@ def plans(trial, shown):
 # rows whose tests are where their files are made
 ELSEWHERE = {
     "`ledger.jsonl`": "tests/runs/test_ledger.py::test_a_line_that_was_changed_is_found",
-    "`votes/ROUND/key.json`": "tests/claims/test_votes.py::test_a_changed_key_is_refused",
-    "`votes/ROUND/PERSON.json`": "tests/claims/test_votes.py::"
-    "test_a_change_of_stored_votes_costs_that_file_and_is_shown",
 }
 HERE = {
     "`results.json`": results,

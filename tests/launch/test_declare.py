@@ -128,8 +128,6 @@ def test_claims_are_kept_beside_declared_metrics(tmp_path, caplog):
     # the first declaration stays, with its time
     assert declare_questions(home, claims("psnr", 2021)) == first
     declare([declaring(tmp_path, "psnr")])
-    for number in "12":  # votes are judged by their own round alone
-        declare_questions(home, claims("psnr", f"202{number}", vote_round=number))
     assert not caplog.text
     with caplog.at_level(logging.WARNING):
         declare_questions(home, claims("ssim", 2022))
@@ -137,7 +135,6 @@ def test_claims_are_kept_beside_declared_metrics(tmp_path, caplog):
     every = read_declarations(home)
     assert [one.primary for one in every if one.kind == "claims"] == ["psnr", "ssim"]
     assert [one.primary for one in every if one.kind == "sweep"] == ["psnr"]
-    assert [one.vote_round for one in every if one.kind == "votes"] == ["1", "2"]
 
 
 @pytest.mark.parametrize("write", [add_to_plan, declare, lambda trials: ask(trials[0].files.home)])

@@ -52,7 +52,8 @@ def as_zip(files, place, home="predictions/"):
 def as_tar(files, place):
     with tarfile.open(place.with_suffix(".tar.gz"), "w:gz") as archive:
         for name, content in files.items():
-            info = tarfile.TarInfo(name)
+            info = tarfile.TarInfo("renamed")
+            info.pax_headers = {"path": name}  # which may have a NUL
             info.size = len(content)
             archive.addfile(info, io.BytesIO(content))
     return place.with_suffix(".tar.gz")
@@ -102,11 +103,14 @@ def test_only_renders_and_photographs_are_unpacked_and_only_for_a_while(form, me
     "change, message",
     [
         ({"color/../../evil.png": b"x"}, "leads out of the archive"),
+        ({"color/a\nb.png": b"x"}, "is no file's name"),
         ({"other/color/a.png": b"x", "other/gt-color/a.png": b"x"}, "and has 2"),
+        (None, "and has none"),
     ],
 )
 def test_strange_archives_are_refused(pack, change, message, members, tmp_path):
-    archive = pack(members | change, tmp_path / "predictions")
+    files = {"color/a.txt": b"x", "gt-color/a.txt": b"x"} if change is None else members | change
+    archive = pack(files, tmp_path / "predictions")
     with refusal(message), opened_renders(archive):
         pass
     assert not list(tmp_path.rglob("evil.png"))
@@ -137,6 +141,12 @@ def test_files_that_are_no_archive_of_predictions_are_refused(
     monkeypatch.setattr("gsbench.renders.predictions.MAX_TOTAL_BYTES", total - 1)
     with refusal(r"unpacks to .* kB, more than"), opened_renders(big):
         pass
+
+
+@pytest.mark.parametrize("name", ["color/a\0.png", "/color/a.png", "C:/color/a.png"])
+def test_archives_without_a_usable_name_are_refused(name, tmp_path, refused):
+    files = {name: b"x", name.replace("color", "gt-color"): b"x"}
+    assert "leads out of the archive" in refused("evaluate", as_tar(files, tmp_path / "names"))
 
 
 @pytest.mark.parametrize("said", [9, 11])

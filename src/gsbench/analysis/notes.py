@@ -149,10 +149,6 @@ SENTENCES: dict[str, str] = {
         "deviation: the baseline was made with {library} {baseline:all}, the new trials with "
         "{new:all}"
     ),
-    "small loss": (
-        "the last commit differs by {difference}, which a step with {seeds:n seed} shows in only "
-        "{chance} of 100 cases: the search may end with a range; allow more --seeds or scenes"
-    ),
     "contradiction": (
         "{idea}: the ledger says {recorded}, but its trials say {now}: one of them was edited"
     ),
@@ -168,8 +164,7 @@ SENTENCES: dict[str, str] = {
     "unusable": "Left out ({count}): {folders:few}.",
     "agreement": (
         "Metrics agree with people only in part. Their rank correlation with viewers' scores of "
-        "3DGS models was {metrics:list} in one study (arXiv 2511.06830, table 3). gsbench vote "
-        "asks people."
+        "3DGS models was {metrics:list} in one study (arXiv 2511.06830, table 3)."
     ),
     # ---- trials: who made them, on what, and doubts
     "worthless": "{mark} {trial} is {what}.",

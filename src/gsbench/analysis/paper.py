@@ -1,4 +1,4 @@
-"""Printed numbers of papers, the method's Tables 1 and 2 as measured, and the differences."""
+"""Printed numbers of papers, their tables as measured, and the differences."""
 
 import math
 from collections import Counter
@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
-from typing import Any
 
 import yaml
 
@@ -22,20 +21,11 @@ from gsbench.words import did_you_mean, signed
 OWN = "_own"
 STAND_FOR = {"dim_paper": "dim"}  # our initialiser -> the paper's initialiser that it repeats
 CONFIDENCE = 0.95
-PAPER_TABLES = ("table1", "table2")
-QUANTITIES = {
-    "table1": ("ssim", "psnr", "lpips_vgg_raw", "gaussians_millions", "train_minutes"),
-    "table2": ("lpips_vgg_raw",),
-}
-ARMS = {
-    "table1": (("dim", "adc"), ("dim", "volumetric")),
-    "table2": (("sfm", "adc"), ("dim", "adc"), ("sfm", "volumetric"), ("dim", "volumetric")),
-}
+PAPER = "volumetric"  # the paper of the method
 PRINTED_NAMES = {"adc": "3DGS", "volumetric": "Ours", "sfm": "SfM", "dim": "DIM"}
 # marks of measured cells beside printed numbers (`agreement`)
 ROUNDING, INTERVAL, DIFFERS = "=", "≈", "≠"
 
-Key = tuple[str, str, str, str]  # scene, init, densify, quantity
 FindPrinted = Callable[[str, Arm, str], "PrintedNumber | None"]  # by scene, arm and quantity
 
 
@@ -60,59 +50,45 @@ class PrintedNumber:
 
 
 @dataclass(frozen=True)
-class Paper:
-    """The paper of the method.
+class PrintedTable:
+    """A printed table: ``scenes`` has, for each quantity, the printed text of each arm.
 
-    ``tables`` has its tables by name. ``contradictions`` has a sentence on each place where it
-    contradicts itself. ``setup`` has what it says on settings, by topic.
+    Arms are pairs of the names of an initialiser and a densifier.
     """
 
-    tables: Mapping[str, Mapping[Key, PrintedNumber]]
-    contradictions: tuple[str, ...]
-    setup: Mapping[str, str]
+    quantities: Sequence[str]
+    arms: Sequence[tuple[str, str]]
+    scenes: Mapping[str, Sequence[Sequence[str]]]
 
-    def scenes(self, name: str) -> list[str]:
-        """The scenes of the table ``name`` in the printed order."""
-        return list(dict.fromkeys(scene for scene, *_ in self.tables[name]))
+    def find(self, scene: str, init: str, densify: str, key: str) -> PrintedNumber | None:
+        """The number of an arm; None if it is not printed."""
+        for quantity_key, texts in zip(self.quantities, self.scenes.get(scene, ()), strict=False):
+            for arm, text in zip(self.arms, texts, strict=True):
+                if (quantity_key, *arm) == (key, init, densify):
+                    return PrintedNumber(text)
+        return None
 
 
 @dataclass(frozen=True)
 class Published:
-    """Another paper's numbers: ``scenes`` has the printed text of its method's ``quantities``."""
+    """A paper's numbers.
+
+    - ``source``: where the numbers were read.
+    - ``conventions``: of the measurement, as far as the source states them.
+    - ``setup``: what it says on settings, by topic.
+    - ``contradictions``: a sentence on each place where it contradicts itself.
+    """
 
     title: str
-    source: str  # where the numbers were read
-    conventions: str  # of the measurement, as far as the source states them
-    densify: str  # gsbench's densifier of the paper's method
-    quantities: Sequence[str]
-    scenes: Mapping[str, Sequence[str]]
+    source: str
+    conventions: str
     setup: Mapping[str, str]
-
-    @property
-    def printed(self) -> dict[tuple[str, str], PrintedNumber]:
-        """The printed numbers by scene and quantity."""
-        printed = {}
-        for scene, texts in self.scenes.items():
-            for key, text in zip(self.quantities, texts, strict=True):
-                printed[scene, key] = PrintedNumber(text)
-        return printed
-
-
-@cache
-def load_paper() -> Paper:
-    """The method's paper, from the file that ships with gsbench."""
-    content = _read("paper.yaml")
-    tables: dict[str, dict[Key, PrintedNumber]] = {name: {} for name in PAPER_TABLES}
-    for name, table in tables.items():
-        for scene, rows in content[name]["scenes"].items():
-            for key, texts in zip(QUANTITIES[name], rows, strict=True):
-                for (init, densify), text in zip(ARMS[name], texts, strict=True):
-                    table[scene, init, densify, key] = PrintedNumber(text)
-    return Paper(tables, tuple(content["contradictions"]), content["setup"])
+    tables: Mapping[str, PrintedTable]
+    contradictions: Sequence[str] = ()
 
 
 def published_names() -> list[str]:
-    """The names of the other papers whose numbers ship with gsbench."""
+    """The names of the papers whose numbers ship with gsbench."""
     folder = files("gsbench.analysis").joinpath("published")
     return sorted(
         file.name.removesuffix(".yaml") for file in folder.iterdir() if file.name.endswith(".yaml")
@@ -120,7 +96,7 @@ def published_names() -> list[str]:
 
 
 @cache
-def load_published(name: str) -> Published:
+def load_published(name: str = PAPER) -> Published:
     """The numbers of the paper ``name``; raises InputError for an unknown name."""
     names = published_names()
     if name not in names:
@@ -128,17 +104,23 @@ def load_published(name: str) -> Published:
             f"no published numbers {name!r}{did_you_mean(name, names)} (there are: "
             f"{', '.join(names)})"
         )
-    return Published(**_read(f"published/{name}.yaml"))
-
-
-def _read(name: str) -> Any:
-    return yaml.safe_load(files("gsbench.analysis").joinpath(name).read_text(encoding="utf-8"))
+    file = files("gsbench.analysis").joinpath(f"published/{name}.yaml")
+    content = yaml.safe_load(file.read_text(encoding="utf-8"))
+    tables = {
+        table: PrintedTable(
+            printed["quantities"],
+            [(init, densify) for init, densify in printed["arms"]],
+            printed["scenes"],
+        )
+        for table, printed in content["tables"].items()
+    }
+    return Published(**content | {"tables": tables})
 
 
 def layout_of(name: str) -> str | None:
     """The paper's table that the experiment repeats (``table1`` for ``table1_own``), or None."""
     table = name.removesuffix(OWN)
-    return table if table in PAPER_TABLES else None
+    return table if table in load_published().tables else None
 
 
 def paper_tables(
@@ -152,7 +134,9 @@ def paper_tables(
     ``name`` is ``table1`` or ``table2``. If only one initialiser was run and it is not DIM, it
     replaces DIM in Table 1.
     """
-    paper, arms = load_paper(), ARMS[name]
+    paper = load_published()
+    printed = paper.tables[name]
+    arms = printed.arms
     trials = list(experiment.trials if trials is None else trials)
     inits = {trial.init for trial in trials}
     # the paper's initialiser -> ours
@@ -171,10 +155,10 @@ def paper_tables(
         raise InputError(
             f"experiment {experiment.name!r} has no trial for {name} ({needed}); use --layout plain"
         )
-    scenes = paper.scenes(name)
+    scenes = list(printed.scenes)
     scenes += sorted({trial.scene for trial in trials} - set(scenes))
     columns = ("densify",) if name == "table1" else ("init", "densify")
-    metrics = metrics or QUANTITIES[name]
+    metrics = metrics or printed.quantities
     title = name.replace("table", "Table ")
     measured = build_table(
         experiment,
@@ -189,12 +173,12 @@ def paper_tables(
     )
     papers_init = {own: init for init, own in run_as.items()}
     keys = [metric.key for metric in choose_quantities(trials, metrics)]
-    compared = [key for key in keys if key in QUANTITIES[name]]
+    compared = [key for key in keys if key in printed.quantities]
     if left_out := [key for key in keys if key not in compared]:
         notes.append(f"Not compared, since the paper prints no such number: {', '.join(left_out)}.")
 
     def find(scene: str, arm: Arm, key: str) -> PrintedNumber | None:
-        return paper.tables[name].get((scene, papers_init[arm.init], arm.densify, key))
+        return printed.find(scene, papers_init[arm.init], arm.densify, key)
 
     title = f"{title}, difference from the printed values"
     return [
@@ -217,7 +201,8 @@ def published_table(trials: Sequence[TrialResult], name: str) -> Table:
     trials.
     """
     paper = load_published(name)
-    scenes, printed = list(paper.scenes), paper.printed
+    printed = next(iter(paper.tables.values()))
+    scenes = list(printed.scenes)
     own = [trial for trial in trials if trial.scene in scenes]
     if not own:
         raise InputError(
@@ -227,15 +212,20 @@ def published_table(trials: Sequence[TrialResult], name: str) -> Table:
         f"{paper.title}.",
         f"Read from {paper.source}.",
         f"Conventions: {paper.conventions}.",
-        f"The printed numbers are of densify={paper.densify}; other arms are shown for "
-        "orientation.",
     ]
+    densifiers = [densify for _, densify in printed.arms]
+    if len(densifiers) == 1:
+        notes.append(
+            f"The printed numbers are of densify={densifiers[0]}; other arms are shown for "
+            "orientation."
+        )
 
     def find(scene: str, arm: Arm, key: str) -> PrintedNumber | None:
-        return printed.get((scene, key))
+        of_paper = printed.arms[0] if len(printed.arms) == 1 else (arm.init, arm.densify)
+        return printed.find(scene, *of_paper, key)
 
     return _differences(
-        f"Difference from {name}", name, own, scenes, paper.quantities, find, notes, paper.setup
+        f"Difference from {name}", name, own, scenes, printed.quantities, find, notes, paper.setup
     )
 
 

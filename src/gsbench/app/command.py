@@ -110,7 +110,7 @@ def own_sweep(sweep: Sweep) -> Ended:
 
 
 def one_trial_per_scene(verb: str, settings: Sequence[str], metric: str) -> dict[str, Trial]:
-    """A trial of each scene, for a verb that compares two versions of one trainer (gate, bisect).
+    """A trial of each scene, for a verb that compares two versions of one trainer (gate).
 
     Raises InputError for settings that make more than one arm, and for a metric that the trials do
     not compute.

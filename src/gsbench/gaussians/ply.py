@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from plyfile import PlyData, PlyElement, PlyParseError
+from plyfile import PlyData, PlyElement
 
 from gsbench.errors import InputError
-from gsbench.files import atomic, require_regular
+from gsbench.files import DAMAGE, atomic, require_regular
 from gsbench.gaussians.foreign_columns import check_columns, with_filter_applied
 from gsbench.gaussians.model import MAX_SH_DEGREE, NUM_SH_REST, Gaussians
 from gsbench.gaussians.ply_files import read_header, read_ply_data
@@ -37,8 +37,6 @@ COLUMNS = (
 # Marks files of gsbench, whose values need no doubt.
 OWN_COMMENT = "written by gsbench"
 
-# errors that plyfile and numpy raise for a damaged file; OverflowError is not a ValueError
-DAMAGE = (OSError, LookupError, PlyParseError, ValueError, TypeError, OverflowError, MemoryError)
 REST = "f_rest_"
 REST_COUNTS = tuple(3 * ((degree + 1) ** 2 - 1) for degree in range(MAX_SH_DEGREE + 1))
 # Replaces an infinite logit; negated for an opacity of 0. Its opacity, 1 - 2^-23, is as close to 1

@@ -7,7 +7,9 @@ import zipfile
 import zlib
 from pathlib import Path
 
-from plyfile import PlyData
+from plyfile import PlyData, PlyParseError
+
+from gsbench.files import DAMAGE
 
 MAX_HEADER = 1 << 16  # bytes
 END = b"end_header"
@@ -72,7 +74,7 @@ def _names_in_zip(path: Path) -> set[str]:
     try:
         with zipfile.ZipFile(path) as archive:
             return {name.rpartition("/")[2] for name in archive.namelist()}
-    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError):
+    except DAMAGE:
         return set()
 
 
@@ -92,12 +94,15 @@ def read_ply_data(path: Path) -> PlyData:
     """Return the content of a PLY file.
 
     Unlike plyfile, it accepts a byte order mark and comments with characters beyond ASCII. Raises
-    ValueError as `read_header` does, and plyfile's errors.
+    ValueError as `read_header` does, and other errors of `gsbench.files.DAMAGE`.
     """
     header = read_header(path)
     with path.open("rb") as stream:
         marked = stream.read(len(codecs.BOM_UTF8)) == codecs.BOM_UTF8
-    if header.isascii() and not marked:
-        return PlyData.read(str(path))
-    content = path.read_bytes().removeprefix(codecs.BOM_UTF8)
-    return PlyData.read(io.BytesIO(NOT_ASCII.sub(b"?", header) + content[len(header) :]))
+    try:
+        if header.isascii() and not marked:
+            return PlyData.read(str(path))
+        content = path.read_bytes().removeprefix(codecs.BOM_UTF8)
+        return PlyData.read(io.BytesIO(NOT_ASCII.sub(b"?", header) + content[len(header) :]))
+    except PlyParseError as error:
+        raise ValueError(str(error)) from error

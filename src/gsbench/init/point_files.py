@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbench.errors import InputError
-from gsbench.files import require_regular
+from gsbench.files import DAMAGE, require_regular
 from gsbench.gaussians.ply_files import read_ply_data
 from gsbench.init.point_tables import MAX_FRACTION, color_columns, plain_name, read_table
 from gsbench.parsing import one_line, without_byte_order_mark
@@ -43,8 +43,7 @@ def read_points(path: Path) -> tuple[Array, NDArray[np.uint8] | None]:
                 f"known are .ply, {', '.join(TEXT_SUFFIXES)}: convert it to PLY, for example with "
                 "CloudCompare"
             )
-    # readers may raise any exception on a damaged file, numpy even tokenizer errors
-    except Exception as error:
+    except DAMAGE as error:
         raise InputError(
             f"{path}: not a readable file of points ({one_line(str(error))})"
         ) from error

@@ -8,21 +8,20 @@ has them in ``predictions/``.
 import tarfile
 import tempfile
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import IO
 
 from gsbench.errors import InputError
-from gsbench.files import require_regular
+from gsbench.files import DAMAGE, is_safe_member, require_regular
 from gsbench.words import readable_bytes
 
 RENDERED, PHOTOGRAPHS = "color", "gt-color"
 # Archives may come from strangers: this stops one that unpacks to far more than test views need.
 MAX_TOTAL_BYTES = 20 << 30
 CHUNK = 1 << 20
-# raised by the two libraries for damaged, encrypted or foreign archives
-DAMAGE = (tarfile.TarError, zipfile.BadZipFile, EOFError, OSError, ValueError, RuntimeError)
+PNG = ".png"
 
 
 @contextmanager
@@ -33,7 +32,7 @@ def opened_renders(place: Path) -> Iterator[tuple[Path, Path | None]]:
     """
     if place.is_dir():
         for home in (place, place / "predictions"):
-            if (home / PHOTOGRAPHS).is_dir():
+            if all((home / folder).is_dir() for folder in (RENDERED, PHOTOGRAPHS)):
                 yield home / RENDERED, home / PHOTOGRAPHS
                 return
         yield place, None
@@ -44,7 +43,9 @@ def opened_renders(place: Path) -> Iterator[tuple[Path, Path | None]]:
     with tempfile.TemporaryDirectory(prefix="gsbench-") as scratch:
         try:
             _unpack(place, Path(scratch))
-        except DAMAGE as error:
+        except InputError:
+            raise
+        except DAMAGE as error:  # of a damaged, encrypted or foreign archive
             raise InputError(
                 f"{place} cannot be unpacked ({error}): give a folder, a .zip or a .tar.gz"
             ) from None
@@ -55,15 +56,14 @@ def _unpack(archive: Path, scratch: Path) -> None:
     """Write the renders and photographs of an archive below ``scratch``, and no other member."""
     if zipfile.is_zipfile(archive):
         with zipfile.ZipFile(archive) as packed:
-            files = [member for member in packed.infolist() if not member.is_dir()]
-            sizes = {member.filename: member.file_size for member in files}
+            files = {member.filename: member for member in packed.infolist() if not member.is_dir()}
+            sizes = {name: member.file_size for name, member in files.items()}
             for name, target in _wanted(archive, sizes).items():
-                with packed.open(name) as source:
+                with packed.open(files[name]) as source:
                     _write(source, scratch / target, sizes[name])
     else:
         with tarfile.open(archive) as packed_tar:
-            regular = [member for member in packed_tar if member.isfile()]
-            members = {member.name.removeprefix("./"): member for member in regular}
+            members = {member.name: member for member in packed_tar if member.isfile()}
             sizes = {name: member.size for name, member in members.items()}
             for name, target in _wanted(archive, sizes).items():
                 content = packed_tar.extractfile(members[name])
@@ -72,43 +72,39 @@ def _unpack(archive: Path, scratch: Path) -> None:
                     _write(content, scratch / target, sizes[name])
 
 
-def _wanted(archive: Path, sizes: dict[str, int]) -> dict[str, str]:
-    """The members that are renders or photographs, with the places to write them to."""
-    home = _home(archive, list(sizes))
-    wanted = {}
+def _wanted(archive: Path, sizes: dict[str, int]) -> dict[str, Path]:
+    """The members that are renders or photographs, with the places to write them to.
+
+    Names are checked before the layout is looked at. Raises `InputError` for a picture whose name
+    leads out of the archive, and unless one folder of the archive has both kinds of pictures.
+    """
+    homes: dict[Path, dict[str, Path]] = {}  # by the folder that has both: members and places
     for name in sizes:
-        if not name.startswith(home):
+        path = Path(name.removeprefix("./"))
+        kind = next((part for part in path.parts if part in (RENDERED, PHOTOGRAPHS)), None)
+        if kind is None or path.suffix != PNG:
             continue
-        inside = PurePosixPath(name.removeprefix(home))
-        if inside.parts[:1] in ((RENDERED,), (PHOTOGRAPHS,)) and inside.suffix == ".png":
-            # a name may lead out of the folder, by dots or, on Windows, by backslashes
-            if ".." in inside.parts or "\\" in name:
-                raise InputError(f"{archive}: {name!r} leads out of the archive")
-            wanted[name] = str(inside)
-    total = sum(sizes[name] for name in wanted)
-    if total > MAX_TOTAL_BYTES:
-        most = readable_bytes(MAX_TOTAL_BYTES)
-        raise InputError(
-            f"{archive} unpacks to {readable_bytes(total)}, more than the limit of {most}"
-        )
-    return wanted
-
-
-def _home(archive: Path, names: Sequence[str]) -> str:
-    """The folder in the archive that has both, with a slash at its end; "" for its top level."""
-    both = sorted(_parents(names, RENDERED) & _parents(names, PHOTOGRAPHS))
+        if not is_safe_member(name):
+            raise InputError(f"{archive}: {name!r} leads out of the archive, or is no file's name")
+        home = Path(*path.parts[: path.parts.index(kind)])
+        homes.setdefault(home, {})[name] = path.relative_to(home)
+    both = [
+        places
+        for places in homes.values()
+        if {RENDERED, PHOTOGRAPHS} == {place.parts[0] for place in places.values()}
+    ]
     if len(both) != 1:
         raise InputError(
             f"{archive} must have one folder with {RENDERED}/ and {PHOTOGRAPHS}/, as nerfbaselines "
             f"writes it, and has {len(both) or 'none'}"
         )
+    total = sum(sizes[name] for name in both[0])
+    if total > MAX_TOTAL_BYTES:
+        most = readable_bytes(MAX_TOTAL_BYTES)
+        raise InputError(
+            f"{archive} unpacks to {readable_bytes(total)}, more than the limit of {most}"
+        )
     return both[0]
-
-
-def _parents(names: Sequence[str], folder: str) -> set[str]:
-    """The folders that contain a ``folder`` of this name, with a slash at their ends."""
-    starts = (f"/{name}".partition(f"/{folder}/") for name in names)
-    return {f"{start}/".lstrip("/") for start, found, _ in starts if found}
 
 
 def _write(source: IO[bytes], target: Path, size: int) -> None:

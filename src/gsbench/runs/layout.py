@@ -25,8 +25,6 @@ DECLARED = "declared.jsonl"  # declared questions, with their times
 FORGOTTEN = ".forgotten"  # records of removed trials, since what they showed was seen
 LEDGER = "ledger.jsonl"  # ideas, tests and results in their order (`gsbench ledger`)
 TUNING = "tuning.json"  # of a search: its ranges and points
-VOTES = "votes"  # a folder per round of people's votes (`gsbench vote`)
-VOTE_KEY = "key.json"  # of a round: which arm was on which side; beside it a file per person
 SEED = "-seed"  # between hash and seed in the name of a trial's folder
 TRIAL_GLOB = f"*/*/*{SEED}*"  # all trials' folders
 

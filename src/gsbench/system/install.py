@@ -11,7 +11,6 @@ from typing import Any
 from urllib.parse import urlsplit
 from urllib.request import url2pathname
 
-from gsbench.errors import InputError
 from gsbench.system.programs import NEUTRAL, safe_environment
 
 DISTRIBUTION = "gsbench-3dgs"  # the name on the package index, where "gsbench" is another project
@@ -66,7 +65,6 @@ def conf_dir() -> Path:
 
 
 SECONDS_FOR_GIT = 10
-SECONDS_FOR_A_TREE = 300
 # gsbench may run in a git hook, whose environment names the repository of the hook by these
 # variables.
 REPOSITORY_VARIABLES = (
@@ -116,96 +114,26 @@ def _has_filters(folder: Path) -> bool:
     return any(re.match(r"(local|worktree)\s+filter\.", line, re.I) for line in listed.splitlines())
 
 
-class WorkTrees:
-    """Work trees of commits of ``folder``'s repository, below the empty folder ``place``.
+def _git(folder: Path, *words: str) -> str | None:
+    """The output of git in ``folder``; None if there is no git or no repository, or if it fails.
 
-    They belong to a new repository that shares the objects. So the user's checkout and its list of
-    work trees do not change, and no hook, filter or other program of the repository's configuration
-    runs.
-    """
-
-    def __init__(self, folder: Path, place: Path) -> None:
-        # the path of the folder within its work tree
-        self.prefix = run_git(folder, "rev-parse", "--show-prefix")
-        self._folder, self._place = folder, place
-        objects = run_git(folder, "rev-parse", "--path-format=absolute", "--git-path", "objects")
-        run_git(place, "init", "--quiet", "--template=", "own")
-        (place / "own" / ".git" / "objects" / "info").mkdir(parents=True, exist_ok=True)
-        (place / "own" / ".git" / "objects" / "info" / "alternates").write_text(
-            f"{objects}\n", encoding="utf-8"
-        )
-
-    def commits(self, first: str, last: str) -> list[tuple[str, str, str]]:
-        """List (hash, date, subject) of the commits from ``first`` to ``last``.
-
-        Commits inside merges are left out. Raises InputError if one of them is not a commit, or if
-        ``first`` does not come before ``last``.
-        """
-        names = [
-            run_git(self._folder, "rev-parse", "--verify", "--end-of-options", f"{name}^{{commit}}")
-            for name in (first, last)
-        ]
-        log = ("log", "--no-show-signature", "--no-color", "--format=%H%x09%cs%x09%s")
-        good = run_git(self._folder, *log, "-1", names[0])
-        between = f"{names[0]}..{names[1]}"
-        later = run_git(
-            self._folder, *log, "--first-parent", "--ancestry-path", "--reverse", between
-        )
-        if not later:
-            raise InputError(f"{last} does not come after {first}: give the good commit first")
-        parts = [[*line.split("\t", 2), "", ""] for line in (good, *later.split("\n"))]
-        return [(commit, date, subject) for commit, date, subject, *_ in parts]
-
-    def tree(self, commit: str) -> Path:
-        """The work tree of a commit, made at the first call."""
-        path = self._place / commit
-        if not path.exists():
-            run_git(
-                self._place / "own", "worktree", "add", "--quiet", "--detach", str(path), commit
-            )
-        return path
-
-
-def run_git(folder: Path, *words: str, seconds: float = SECONDS_FOR_A_TREE) -> str:
-    """Run git in ``folder`` and return its output.
-
-    git gets `SAFE_SETTINGS` and no `REPOSITORY_VARIABLES`. Raises InputError with git's message if
-    it fails.
+    git gets `SAFE_SETTINGS` and no `REPOSITORY_VARIABLES`.
     """
     environment = {
         key: value for key, value in safe_environment().items() if key not in REPOSITORY_VARIABLES
     }
+    settings = (word for setting in SAFE_SETTINGS for word in ("-c", setting))
     try:
         return subprocess.run(
-            [
-                "git",
-                *(word for setting in SAFE_SETTINGS for word in ("-c", setting)),
-                "-C",
-                os.path.abspath(folder),
-                *words,
-            ],
+            ["git", *settings, "-C", os.path.abspath(folder), *words],
             cwd=NEUTRAL,
             # read only: no locks, no network
             env=environment | {"GIT_OPTIONAL_LOCKS": "0", "GIT_NO_LAZY_FETCH": "1"},
             capture_output=True,
             encoding="utf-8",
-            errors="replace",  # subjects of commits may have any encoding
-            timeout=seconds,
+            errors="replace",  # names of files may have any encoding
+            timeout=SECONDS_FOR_GIT,
             check=True,
         ).stdout.strip()
-    except OSError as error:
-        raise InputError(f"git cannot be started ({error.strerror or error}): install it") from None
-    except subprocess.TimeoutExpired:
-        raise InputError(f"git {words[0]} took more than {seconds:g} s in {folder}") from None
-    except subprocess.CalledProcessError as error:
-        raise InputError(
-            f"git {words[0]}: {(error.stderr or error.stdout).strip() or 'it failed'}"
-        ) from None
-
-
-def _git(folder: Path, *words: str) -> str | None:
-    """The output of `run_git`; None if there is no git or no repository, or if it fails."""
-    try:
-        return run_git(folder, *words, seconds=SECONDS_FOR_GIT)
-    except InputError:
+    except (OSError, subprocess.TimeoutExpired, subprocess.CalledProcessError):
         return None

@@ -1,4 +1,4 @@
-"""Verbs for what goes to others or comes from them: evaluate, export, pool and site."""
+"""Verbs for what goes to others or comes from them: evaluate, export and site."""
 
 import logging
 import shutil
@@ -8,15 +8,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gsbench.analysis.addresses import TRIAL
-from gsbench.analysis.pairing import BASELINE
-from gsbench.analysis.quantities import asked_quantity
 from gsbench.analysis.results import TrialResult, load_all_trials
 from gsbench.errors import InputError
 from gsbench.eval.protocol import PROTOCOLS
 from gsbench.files import atomic, own_output, writable_output
 from gsbench.normalization import Normalization
 from gsbench.settings import is_folder_name
-from gsbench.verbs.arguments import ArgumentParser, add_where, names, path
+from gsbench.verbs.arguments import ArgumentParser, path
 from gsbench.words import readable_bytes
 
 DONE, LEFT_OUT = 0, 1
@@ -194,37 +192,6 @@ def export_init(model: Path, out: Path, normalization: Normalization) -> None:
         moved = read_model(model)
         normalize_model(moved, normalization, undo=True)
         moved.write_binary(out / MODEL_FOLDER)
-
-
-def pool(argv: Sequence[str], runs: Path) -> int:
-    """Run the verb: 0, or 1 if a source was left out; raises InputError if none can be read."""
-    # here, since they are slow to import
-    from gsbench.claims.pooling import PooledQuestion, describe, markdown_table, pool_sources
-
-    parser = ArgumentParser("pool", "It is their mean, each with the same weight.")
-    parser.add_argument("sources", nargs="+", type=path, metavar="ARCHIVE")
-    parser.add_argument(
-        "--arm", type=names, required=True, help="a densifier; names it goes by, comma between"
-    )
-    parser.add_argument(
-        "--baseline", type=names, default=(BASELINE,), help=f"to compare with ({BASELINE})"
-    )
-    parser.add_argument(
-        "--metric", default="psnr", help="such as psnr (the default), ssim, lpips_vgg"
-    )
-    add_where(parser)
-    parser.add_argument("--protocol", help="only studies by this one, such as paper-1")
-    options = parser.parse_args(argv)
-    wanted = PooledQuestion(options.arm, options.baseline, options.metric, dict(options.where))
-    pooled, notes, faults = pool_sources(options.sources, wanted, options.protocol)
-    arms = f"{options.arm[0]} against {options.baseline[0]}"
-    shown = asked_quantity(options.metric)
-    title = f"{arms}, difference in {shown.name}{BETTER[shown.direction]}"
-    table = markdown_table(pooled)
-    print("\n".join([title, "", *table, "", *describe(pooled), *notes, *faults]))
-    for fault in faults:
-        print(f"gsbench: {fault}", file=sys.stderr)
-    return LEFT_OUT if faults else DONE
 
 
 def site(argv: Sequence[str], runs: Path) -> int:

@@ -19,9 +19,8 @@ from gsbench.analysis.cells import (
 from gsbench.analysis.fairness import fairness_table
 from gsbench.analysis.pairing import BASELINE
 from gsbench.analysis.paper import (
-    PAPER_TABLES,
     layout_of,
-    load_paper,
+    load_published,
     paper_tables,
     published_names,
     published_table,
@@ -59,7 +58,7 @@ def tables(argv: Sequence[str], runs: Path) -> int:
         print("\n".join(list_experiments(runs)) or f"no experiment in {runs} yet")
         return 0
     if options.experiment == PAPER_NOTES and not (runs / PAPER_NOTES).exists():
-        print("\n".join(f"- {line}" for line in load_paper().contradictions))
+        print("\n".join(f"- {line}" for line in load_published().contradictions))
         return 0
     experiment = load_experiment(runs, options.experiment)
     for warning in experiment.warnings:
@@ -191,7 +190,7 @@ def _tables_parser() -> ArgumentParser:
     )
     parser.add_argument(
         "--layout",
-        choices=[*PAPER_TABLES, "plain", FAIRNESS],
+        choices=[*load_published().tables, "plain", FAIRNESS],
         help=f"the paper's layout for any experiment; {FAIRNESS}: for each pair of arms in what "
         "they differ, what was tuned, and whose defaults those are",
     )

@@ -22,12 +22,13 @@ from gsbench.densify.volumetric import log_volume
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import quantize
 from gsbench.events import Cause
+from gsbench.files import DAMAGE
 from gsbench.gaussians.initial import gaussians_from_cloud
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians, rgb_to_dc
 from gsbench.gaussians.paper_values import VOLUME_THRESHOLD
 from gsbench.gaussians.ply import read_ply
 from gsbench.init.base import MODEL_FOLDER, PointCloud
-from gsbench.parsing import ARRAY_ERRORS, one_line, read_arrays
+from gsbench.parsing import one_line, read_arrays
 from gsbench.raster.base import Rasterizer, RenderOutput
 from gsbench.runs.keys import INIT
 from gsbench.runs.layout import GROUND_TRUTH, LINEAGE, POINT_CLOUD, RESULTS, STORE
@@ -139,7 +140,7 @@ def read_causes(path: Path, num_gaussians: int) -> NDArray[np.uint8]:
             or not set(np.unique(causes)) <= CAUSES
         ):
             raise ValueError("it names causes that there are not")
-    except (*ARRAY_ERRORS, InputError) as error:
+    except DAMAGE as error:
         reason = one_line(str(error)).removeprefix(f"{path} ")
         raise InputError(f"{path} cannot be read ({reason}): run this trial again") from error
     # a model and a record of two runs would give Gaussians the causes of others

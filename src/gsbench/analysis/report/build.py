@@ -18,7 +18,7 @@ from gsbench.analysis.judgement import Verdict
 from gsbench.analysis.ledger_table import describe_ledger, ledger_tables
 from gsbench.analysis.notes import texts
 from gsbench.analysis.pairing import BASELINE, pair_trials
-from gsbench.analysis.paper import layout_of, load_paper, paper_tables
+from gsbench.analysis.paper import layout_of, load_published, paper_tables
 from gsbench.analysis.quantities import COSTS, choose_quantities, relative_change
 from gsbench.analysis.ranks import rank_all
 from gsbench.analysis.report.charts import ForestRow, forest_plot, line_chart, rank_plot
@@ -28,8 +28,6 @@ from gsbench.analysis.results import Experiment, TrialResult, group_by, trials_o
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry, fill
 from gsbench.analysis.tables import build_table, with_agreement
 from gsbench.analysis.verdicts import PairVerdicts, seeds_to_resolve
-from gsbench.analysis.vote_words import describe_round, disagreements, load_rounds, vote_table
-from gsbench.analysis.votes import RoundVerdict
 from gsbench.errors import InputError
 from gsbench.eval.facts import find_metric
 from gsbench.parsing import read_if_sound
@@ -77,14 +75,13 @@ def build_report(
         trials=trials,
         versus=[compare_arms(trials, own, experiment.older) for own in judged],
         ledger=show_ledger(experiment.folder),
-        votes=[show_votes(one, trials, judged) for one in load_rounds(experiment.folder)],
         declared=texts([*comparison.declared_notes, *verdict_words.families(judged)]),
         unused=[*([CHOSEN.format(chosen)] if where else []), *texts(comparison.remarks)],
         tables=[_without_verdicts(table) for table in with_agreement(tables)],
         ranks=[
             rank_plot(ranking) for ranking in rank_all(trials, choose_quantities(trials)) if pairs
         ],
-        contradictions=[] if paper_table is None else load_paper().contradictions,
+        contradictions=[] if paper_table is None else load_published().contradictions,
         search=search_summary(experiment.folder),
         say=verdict_words,
         seeds_to_resolve=seeds_to_resolve,
@@ -166,23 +163,6 @@ def show_ledger(folder: Path) -> dict[str, Any] | None:
     except InputError as error:
         return {"lines": [str(error)], "tables": []}
     return {"lines": describe_ledger(ledger), "tables": ledger_tables(ledger)}
-
-
-def show_votes(
-    verdict: RoundVerdict, trials: Sequence[TrialResult], judged: Sequence[PairVerdicts]
-) -> dict[str, Any]:
-    """Everything that the page shows of a round of people's votes."""
-    views, faults = [], list[str]()
-    for pair in verdict.pairs:
-        try:
-            views += [(pair, view) for view in disagreements(pair, trials)]
-        except InputError as error:
-            faults.append(str(error))
-    return {
-        "lines": [*describe_round(verdict), *faults],
-        "tables": [vote_table(pair, verdict.final, trials, judged) for pair in verdict.pairs],
-        "views": views,
-    }
 
 
 def _costs(baseline: Sequence[TrialResult], other: Sequence[TrialResult]) -> list[str]:

@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbench.errors import GsbenchError, InputError
-from gsbench.files import atomic, file_sha256
-from gsbench.parsing import ARRAY_ERRORS, read_arrays
+from gsbench.errors import GsbenchError
+from gsbench.files import DAMAGE, atomic, file_sha256
+from gsbench.parsing import read_arrays
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +137,7 @@ class FeatureStore:
             width, height, file_width, file_height = (int(side) for side in data["sizes"])
             arrays = data["keypoints"], data["descriptors"], data["scores"]
             return Features(*arrays, (width, height), (file_width, file_height))
-        except (*ARRAY_ERRORS, InputError):
+        except DAMAGE:
             return None  # the file is made again
 
     def write_features(self, name: str, features: Features) -> None:
@@ -158,7 +158,7 @@ class FeatureStore:
         """The stored matches [M, 2] of a pair, or None if the file is missing or damaged."""
         try:
             matches: NDArray[np.uint32] = read_arrays(self.matches_path(first, second))[""]
-        except (*ARRAY_ERRORS, InputError):
+        except DAMAGE:
             return None
         return matches if matches.ndim == 2 and matches.shape[1] == 2 else None
 

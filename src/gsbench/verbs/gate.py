@@ -1,0 +1,144 @@
+"""The verb ``gsbench gate``: is this version of a trainer worse? (docs/gate.md)"""
+
+import argparse
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from gsbench.analysis.cells import select_trials
+from gsbench.analysis.comparison import unused_trials
+from gsbench.analysis.notes import texts
+from gsbench.analysis.results import TrialResult, group_by
+from gsbench.analysis.verdict_words import reason, with_notes
+from gsbench.app.command import one_trial_per_scene, run_trials
+from gsbench.claims import gate as gates
+from gsbench.claims.archive import unpack_archive
+from gsbench.claims.stopping import KeyAndSeed, finished_trials
+from gsbench.config.compose import Trial, with_seed
+from gsbench.errors import GsbenchError, InputError, TrainingError
+from gsbench.files import checked_runs_folder, make_runs_folder
+from gsbench.launch.record import declare_questions
+from gsbench.runs.experiments import trial_key
+from gsbench.verbs.arguments import ArgumentParser, add_question, add_where, path
+from gsbench.words import listed, printable
+
+EXIT_CODES = {gates.PASSED: 0, gates.WORSE: 1, gates.NOT_DECIDED: 3}
+# exit codes of `git bisect run`: the commit cannot be tested; the search ends (128 and more)
+SKIP, STOP = 125, 128
+
+
+def gate(argv: Sequence[str], runs: Path) -> int:
+    """Run the verb: 0 passed, 1 worse, 3 not decided.
+
+    Raises GsbenchError (exit code 1) if trials fail, and InputError (2) for bad input. With
+    ``--bisect`` nothing is raised, and the codes are those of ``git bisect run``.
+    """
+    parser = ArgumentParser(
+        "gate",
+        "It trains this version on scenes and seeds of an archive (gsbench export --results), seed "
+        "by seed until it is decided. Exit code 0: not worse by --least; 1: worse, or a trial "
+        "failed; 3: undecided; 2: bad input (docs/gate.md).",
+    )
+    parser.add_argument("archive", type=path, help="the results of the version that you trust")
+    add_question(parser)
+    parser.add_argument(
+        "--seeds", type=int, help="the largest number of seeds; default: all that the archive has"
+    )
+    add_where(parser)
+    parser.flag(
+        "--bisect",
+        "for `git bisect run gsbench gate …`: exit code 125 if it is undecided or does not train, "
+        "128 for bad input",
+    )
+    if "--bisect" not in argv:
+        return EXIT_CODES[_result(parser.parse_args(argv))]
+    try:
+        code = EXIT_CODES[_result(parser.parse_args(argv))]
+    except GsbenchError as error:
+        print(f"gsbench: {printable(str(error))}", file=sys.stderr)
+        return STOP if isinstance(error, InputError) else SKIP
+    return SKIP if code == EXIT_CODES[gates.NOT_DECIDED] else code
+
+
+def _result(options: argparse.Namespace) -> str:
+    """Train the new version until it is decided, and print the answer; returns it."""
+    by_scene = one_trial_per_scene("gate", options.settings, options.metric)
+    example = next(iter(by_scene.values()))  # its settings are those of all, apart from the scene
+    home = example.files.home
+    with tempfile.TemporaryDirectory() as folder:
+        archived = unpack_archive(options.archive, Path(folder)).trials
+        baseline = _baseline(select_trials(archived, dict(options.where)), by_scene)
+        seeds = _seeds(baseline, options.seeds)
+        arms = {
+            scene: (str(old[0].arm), by_scene[scene].folder.parent.name)
+            for scene, old in baseline.items()
+        }
+        declaration = gates.declare_gate(options.metric, options.least, arms, seeds, example.values)
+        trials = {
+            (trial_key(scene, arms[scene][1], gates.NEW), seed): with_seed(trial, seed)
+            for scene, trial in by_scene.items()
+            for seed in seeds
+        }
+        make_runs_folder(checked_runs_folder(str(home.parent)))
+        old = [trial for of_scene in baseline.values() for trial in of_scene if trial.seed in seeds]
+
+        def new() -> list[TrialResult]:
+            return finished_trials(home, trials.values())
+
+        asked = gates.ask_gate(declare_questions(home, declaration), lambda: old, new)
+
+        def run(planned: Sequence[KeyAndSeed]) -> None:
+            try:
+                code = run_trials([trials[key] for key in planned if key in trials])
+            except InputError as error:  # code of a commit that cannot be imported, too
+                raise (TrainingError if options.bisect else InputError)(str(error)) from error
+            if code:
+                raise (InputError if code == 2 and not options.bisect else TrainingError)(
+                    "the new version's trials fail: nothing is compared"
+                )
+
+        (verdict,) = asked.answer(run)
+        if verdict.answer is None and not verdict.equal:
+            why = with_notes(reason(verdict), verdict)
+            raise InputError(f"the versions cannot be compared: {why}")
+        made = [*asked.read()]
+        left_out = texts(unused_trials(made, [verdict]))
+        new_trials = [trial for trial in made if trial.config_hash == gates.NEW]
+        deviations = map(str, gates.deviations(old, new_trials))
+        print("\n".join([gates.describe(verdict), *left_out, *deviations]))
+    return gates.result_of(verdict)
+
+
+def _baseline(
+    archived: Sequence[TrialResult], by_scene: Mapping[str, Trial]
+) -> dict[str, list[TrialResult]]:
+    """The archive's trials of each scene.
+
+    If one of its arms there has the name of the new trial's arm, only that one counts. Raises
+    InputError for a scene that the archive lacks, and if several arms or settings are left.
+    """
+    baseline = {}
+    for scene, new in by_scene.items():
+        old = [trial for trial in archived if trial.scene == scene]
+        if not old:
+            scenes = listed(sorted({trial.scene for trial in archived}))
+            raise InputError(f"the archive has no trial on {scene} (it has {scenes})")
+        old = [trial for trial in old if str(trial.arm) == new.folder.parent.name] or old
+        if len(variants := group_by(old, lambda trial: (trial.arm, trial.config_hash))) > 1:
+            arms = listed([f"{arm} ({settings})" for arm, settings in variants])
+            raise InputError(
+                f"the archive has several arms on {scene}, {arms}: choose by --where KEY=VALUE"
+            )
+        baseline[scene] = old
+    return baseline
+
+
+def _seeds(baseline: Mapping[str, Sequence[TrialResult]], most: int | None) -> list[int]:
+    """The seeds that all scenes have, ``most`` at most; raises InputError if there are fewer."""
+    shared = sorted(
+        set.intersection(*({trial.seed for trial in trials} for trials in baseline.values()))
+    )
+    if most is not None and not 0 < most <= len(shared):
+        raise InputError(f"--seeds {most}: the archive has {len(shared)} seeds of all scenes")
+    return shared[:most]
