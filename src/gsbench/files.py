@@ -36,7 +36,7 @@ FULL_TEXT = re.compile(
     r"No space left|requested and \d+ written|PytorchStreamWriter failed|unexpected pos|disk is "
     r"full"
 )
-# What the readers of arrays, pictures and archives (numpy, plyfile, zipfile, tarfile and their
+# Errors that readers of arrays, pictures and archives (numpy, plyfile, zipfile, tarfile and their
 # decompressors) raise for a damaged file. MemoryError: a header may announce any number of values.
 DAMAGE = (
     OSError,

@@ -33,7 +33,7 @@ from pydantic import (
 from pydantic_core import CoreSchema, ErrorDetails, core_schema, from_json
 
 from gsbench.errors import InputError
-from gsbench.files import DAMAGE, open_plain
+from gsbench.files import open_plain
 from gsbench.words import as_line
 
 log = logging.getLogger(__name__)
@@ -171,8 +171,8 @@ def read_json(path: Path) -> Any:
     return value
 
 
-def read_yaml(path: Path) -> Any:
-    """The value in a YAML file.
+def read_yaml(path: Path, loader: Any = None) -> Any:
+    """The value in a YAML file, read by `SafeLoader` or a ``loader`` derived from it.
 
     Raises as `read_bytes` does, and DamagedError if it is no YAML or has a fault. Numbers may be
     infinite, because users write settings in YAML and a class may have an infinite default.
@@ -181,7 +181,7 @@ def read_yaml(path: Path) -> Any:
     try:
         text = content.decode("utf-8")
         fault = _danger_in_yaml(text)
-        value = None if fault else yaml.load(text, Loader=_Loader)
+        value = None if fault else yaml.load(text, Loader=loader or SafeLoader)
     except (yaml.YAMLError, ValueError, TypeError, OverflowError, RecursionError) as error:
         reason = getattr(error, "problem", None) or error  # PyYAML's own text has several lines
         raise DamagedError(path, f"is not YAML ({reason})") from None
@@ -190,7 +190,7 @@ def read_yaml(path: Path) -> Any:
     return value
 
 
-class _Loader(LOADER):
+class SafeLoader(LOADER):
     """A safe loader for which a key that occurs twice in a mapping is an error.
 
     YAML would silently drop the first.
@@ -279,28 +279,6 @@ def _fault_of_keys(mapping: dict[Any, Any]) -> str:
     if len(kinds) > 1 or not kinds <= {str, int}:  # JSON with sorted keys needs keys of one type
         return "keys that are not all texts, or all integers"
     return next((f"a key that is {fault}" for key in mapping if (fault := _fault_of_leaf(key))), "")
-
-
-# ---- arrays
-
-
-def read_arrays(path: Path) -> dict[str, Any]:
-    """The arrays of an ``.npz`` file by name, or that of an ``.npy`` file under ""; none is code.
-
-    Raises FileNotFoundError, and DamagedError for a file that is not as numpy writes it.
-    """
-    import numpy as np  # here, since most commands need none
-
-    with _opened(path) as descriptor, os.fdopen(os.dup(descriptor), "rb") as stream:
-        try:
-            loaded = np.load(stream, allow_pickle=False)
-            if isinstance(loaded, np.ndarray):
-                return {"": loaded}
-            with loaded:
-                return dict(loaded.items())
-        except DAMAGE as error:
-            reason = str(error) or type(error).__name__
-            raise DamagedError(path, f"cannot be read ({reason})") from None
 
 
 # ---- JSON files through dataclasses, for writing and reading; the annotations say what is allowed

@@ -1,9 +1,7 @@
 """Photographs and the page's camera, against the cameras that they come from."""
 
-import io
 import math
 import shutil
-import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -34,7 +32,6 @@ from gsbench.view.trials import (
     model_file,
     model_folder,
     photograph_at,
-    read_causes,
     read_test_views,
     side_by_side,
 )
@@ -292,8 +289,6 @@ def test_what_is_gone_from_a_trial_is_named(small_runs, tmp_path):
     renders = replace(trial.record, evaluated_from="renders")
     with refusal("was evaluated from renders: it has no model"):
         model_file(replace(trial, record=renders))
-    with refusal("is of 40 Gaussians, the model has 1: run"):
-        read_causes(trial.path / "lineage.npz", 1)
     for folder, words in (
         (trial.path / "ground_truth", "holds no picture of a test view"),
         (tmp_path / "runs" / "store", "is gone: run this trial again"),
@@ -301,47 +296,3 @@ def test_what_is_gone_from_a_trial_is_named(small_runs, tmp_path):
         shutil.rmtree(folder)
         with refusal(words):
             load_viewed(trial, torch.device("cpu"))
-
-
-@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 no zip", b"no zip at all"])
-def test_a_damaged_record_of_causes_is_refused(tmp_path, content):
-    (tmp_path / "lineage.npz").write_bytes(content)
-    with refusal(r"lineage\.npz cannot be read"):
-        read_causes(tmp_path / "lineage.npz", 1)
-
-
-def _npz(**arrays):
-    content = io.BytesIO()
-    np.savez(content, **arrays)
-    return content.getvalue()
-
-
-def _with_size(count):
-    """An array of one value whose header announces ``count``."""
-    content = io.BytesIO()
-    header = {"descr": "|u1", "fortran_order": False, "shape": (count,)}
-    np.lib.format.write_array_header_1_0(content, header)
-    packed = io.BytesIO()
-    with zipfile.ZipFile(packed, "w") as archive:
-        archive.writestr("causes.npy", content.getvalue() + b"0")
-        archive.writestr("ids.npy", content.getvalue() + b"0")
-    return packed.getvalue()
-
-
-LYING = {
-    "a size that no machine has": _with_size(10**15),
-    "texts as causes": _npz(causes=np.array(["clone"]), ids=np.array([0])),
-    "a cause that there is not": _npz(causes=np.array([200], np.uint8), ids=np.array([0])),
-    "fractions": _npz(causes=np.array([0.5]), ids=np.array([0])),
-    "an identity that there is not": _npz(causes=np.array([0], np.uint8), ids=np.array([7])),
-    "texts as identities": _npz(causes=np.array([0], np.uint8), ids=np.array(["0"])),
-    "no causes": _npz(ids=np.array([0])),
-    "an object": _npz(causes=np.array([{}], dtype=object), ids=np.array([0])),
-}
-
-
-@pytest.mark.parametrize("case", LYING)
-def test_a_record_of_causes_that_lies_is_refused_in_one_line(case, tmp_path):
-    (tmp_path / "lineage.npz").write_bytes(LYING[case])
-    with refusal(r"lineage\.npz cannot be read .*run this trial again"):
-        read_causes(tmp_path / "lineage.npz", 1)

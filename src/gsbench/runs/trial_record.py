@@ -274,6 +274,8 @@ class Training(Record):
     # gsbench's commit, and whether files were edited
     checkout: dict[str, Any] = field(default_factory=dict)
     initial_cloud: InitialCloud | None = None
+    # compiling kernels for it, in no other time; None if another program trained
+    compile_seconds: Amount | None = None
     evaluated_from: Literal["model", "renders"] | None = None
     trained_by: ExternalTrainer | None = None
 

@@ -18,17 +18,16 @@ from PIL import Image, ImageDraw, ImageFont
 from gsbench.analysis.addresses import TRIAL, fitting
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.results import TrialResult, load_experiment
+from gsbench.densify.lineage import read_causes
 from gsbench.densify.volumetric import log_volume
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import quantize
 from gsbench.events import Cause
-from gsbench.files import DAMAGE
 from gsbench.gaussians.initial import gaussians_from_cloud
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians, rgb_to_dc
 from gsbench.gaussians.paper_values import VOLUME_THRESHOLD
 from gsbench.gaussians.ply import read_ply
 from gsbench.init.base import MODEL_FOLDER, PointCloud
-from gsbench.parsing import one_line, read_arrays
 from gsbench.raster.base import Rasterizer, RenderOutput
 from gsbench.runs.keys import INIT
 from gsbench.runs.layout import GROUND_TRUTH, LINEAGE, POINT_CLOUD, RESULTS, STORE
@@ -38,7 +37,6 @@ from gsbench.scene.images import png_name, read_image
 from gsbench.scene.types import PINHOLE_NAMES, Camera, View
 from gsbench.words import split_outside_brackets
 
-CAUSES = set(map(int, Cause))
 DIMMED = 0.35  # brightness of the render behind Gaussians coloured by their causes
 TEXT_COLOR, SHADOW = (255, 255, 255), (0, 0, 0)
 TEXT_SIZE = 1 / 36  # of a picture's height; smaller if a word does not fit its pane
@@ -127,29 +125,6 @@ def load_viewed(trial: TrialResult, device: torch.device) -> ViewedTrial:
         views=read_test_views(trial, model_dir),
         background=tuple(background),
     )
-
-
-def read_causes(path: Path, num_gaussians: int) -> NDArray[np.uint8]:
-    """The cause of each remaining Gaussian, [N], from ``lineage.npz``."""
-    try:
-        lineage = read_arrays(path)
-        causes: NDArray[np.uint8] = lineage["causes"][lineage["ids"]]
-        if (
-            causes.ndim != 1
-            or causes.dtype.kind not in "iu"
-            or not set(np.unique(causes)) <= CAUSES
-        ):
-            raise ValueError("it names causes that there are not")
-    except DAMAGE as error:
-        reason = one_line(str(error)).removeprefix(f"{path} ")
-        raise InputError(f"{path} cannot be read ({reason}): run this trial again") from error
-    # a model and a record of two runs would give Gaussians the causes of others
-    if len(causes) != num_gaussians:
-        raise InputError(
-            f"{path} is of {len(causes)} Gaussians, the model has {num_gaussians}: run this trial "
-            "again"
-        )
-    return causes
 
 
 def model_folder(trial: TrialResult) -> Path:

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from gsbench.errors import GsbenchError
 from gsbench.files import DAMAGE, atomic, file_sha256
-from gsbench.parsing import read_arrays
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,10 +132,10 @@ class FeatureStore:
     def read_features(self, name: str) -> Features | None:
         """The stored features, or None if the file is missing or damaged."""
         try:
-            data = read_arrays(self.features_path(name))
-            width, height, file_width, file_height = (int(side) for side in data["sizes"])
-            arrays = data["keypoints"], data["descriptors"], data["scores"]
-            return Features(*arrays, (width, height), (file_width, file_height))
+            with np.load(self.features_path(name), allow_pickle=False) as data:
+                width, height, file_width, file_height = (int(side) for side in data["sizes"])
+                arrays = data["keypoints"], data["descriptors"], data["scores"]
+                return Features(*arrays, (width, height), (file_width, file_height))
         except DAMAGE:
             return None  # the file is made again
 
@@ -157,7 +156,7 @@ class FeatureStore:
     def read_matches(self, first: str, second: str) -> NDArray[np.uint32] | None:
         """The stored matches [M, 2] of a pair, or None if the file is missing or damaged."""
         try:
-            matches: NDArray[np.uint32] = read_arrays(self.matches_path(first, second))[""]
+            matches = np.load(self.matches_path(first, second), allow_pickle=False)
         except DAMAGE:
             return None
         return matches if matches.ndim == 2 and matches.shape[1] == 2 else None
