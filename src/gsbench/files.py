@@ -10,6 +10,7 @@ import shutil
 import stat
 import struct
 import tarfile
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -36,7 +37,7 @@ FULL_TEXT = re.compile(
     r"full"
 )
 # Errors that readers of arrays, pictures and archives (numpy, plyfile, zipfile, tarfile and their
-# decompressors) raise for damaged files. MemoryError: a header may announce any number of values.
+# decompressors) raise for a damaged file. MemoryError: a header may announce any number of values.
 DAMAGE = (
     OSError,
     ValueError,
@@ -48,6 +49,7 @@ DAMAGE = (
     RuntimeError,
     SyntaxError,
     struct.error,
+    tokenize.TokenError,
     zlib.error,
     lzma.LZMAError,
     zipfile.BadZipFile,

@@ -27,6 +27,7 @@ TRAINING = {
     "causes": {"initial": 5},
     "scene_extent": 4.5,
     "seconds": 60.0,
+    "compile_seconds": 20.0,
     "peak_memory_mb": 100.0,
     "machine": {"cpu": "c"},
     "checkout": {"commit": "abc", "edited": True},
@@ -110,8 +111,8 @@ def test_results_combine_the_results_of_the_steps(made):
         "declared": None,
     }
     assert {name: getattr(found, name) for name in expected} == expected
-    assert found.seconds.keys() == {"init", "train", "evaluate"}
-    assert found.seconds["train"] == 60.0
+    assert found.seconds.keys() == {"init", "train", "evaluate", "compile"}
+    assert (found.seconds["train"], found.seconds["compile"]) == (60.0, 20.0)
     assert found.hashes["data"] == "0abc"
     assert (found.events["cloned"], found.events["pruned_size"], found.events["added"]) == (5, 1, 0)
     assert (found.code.commit, found.code.edited) == ("abc", True)

@@ -252,6 +252,7 @@ def running(tmp_path, monkeypatch):
     class Parts:
         threads = 3
         raster = "proven"
+        program = "a program that trains"
 
         def __init__(self, values):
             self.values = values

@@ -32,7 +32,6 @@ from gsbench.view.trials import (
     model_file,
     model_folder,
     photograph_at,
-    read_causes,
     read_test_views,
     side_by_side,
 )
@@ -290,8 +289,6 @@ def test_what_is_gone_from_a_trial_is_named(small_runs, tmp_path):
     renders = replace(trial.record, evaluated_from="renders")
     with refusal("was evaluated from renders: it has no model"):
         model_file(replace(trial, record=renders))
-    with refusal("is of 40 Gaussians, the model has 1: run"):
-        read_causes(trial.path / "lineage.npz", 1)
     for folder, words in (
         (trial.path / "ground_truth", "holds no picture of a test view"),
         (tmp_path / "runs" / "store", "is gone: run this trial again"),
@@ -299,10 +296,3 @@ def test_what_is_gone_from_a_trial_is_named(small_runs, tmp_path):
         shutil.rmtree(folder)
         with refusal(words):
             load_viewed(trial, torch.device("cpu"))
-
-
-@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 no zip", b"no zip at all"])
-def test_a_damaged_record_of_causes_is_refused(tmp_path, content):
-    (tmp_path / "lineage.npz").write_bytes(content)
-    with refusal(r"lineage\.npz cannot be read"):
-        read_causes(tmp_path / "lineage.npz", 1)

@@ -1,4 +1,4 @@
-"""Reconstruction of a COLMAP model from photographs: features, matches, mapping or triangulation, alignment."""
+"""Reconstruction of a COLMAP model: features, matches, mapping or triangulation, alignment."""
 
 from __future__ import annotations
 

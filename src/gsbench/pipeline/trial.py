@@ -73,6 +73,7 @@ from gsbench.scene.types import Capture, Scene
 from gsbench.system.install import version_of
 from gsbench.system.locks import hold
 from gsbench.system.stopping import reinstall_handlers
+from gsbench.train.kernels import compiled_beside
 from gsbench.train.proof import Proven
 
 log = logging.getLogger(__name__)
@@ -221,15 +222,18 @@ def _run(trial: Trial, folder: TrialFolder) -> TrialRecord:
         trial_steps = TrialSteps(parts, store)
         entries: dict[str, StoredResult] = {}
         code: dict[str, str] = {}
-        for step in trial_steps.steps():
-            if step.stage.name == keys.TRAIN.name:
-                scene = trial_steps.views.scene
-                counts = len(scene.train), len(scene.test)
-                log.info("%s: %d training and %d test views", folder.label, *counts)
-            entries[step.stage.name] = entry = store.get(step)
-            code |= step.code
-            if step.stage is keys.INIT:
-                link_or_copy(entry.path / REPORT_FILE, folder.path / layout.INIT_REPORT)
+        on_cpu = parts.program is None and parts.device.type == "cpu"
+        with compiled_beside(parts.rasterizer, on_cpu) as kernels_ready:
+            for step in trial_steps.steps():
+                if step.stage.name == keys.TRAIN.name:
+                    scene = trial_steps.views.scene
+                    counts = len(scene.train), len(scene.test)
+                    log.info("%s: %d training and %d test views", folder.label, *counts)
+                    kernels_ready()
+                entries[step.stage.name] = entry = store.get(step)
+                code |= step.code
+                if step.stage is keys.INIT:
+                    link_or_copy(entry.path / REPORT_FILE, folder.path / layout.INIT_REPORT)
         capture, scene = trial_steps.capture, trial_steps.views.scene
         results = results_of(values, capture, scene, parts.raster, entries, code)
         published = _publish(folder.path, entries, capture.normalization)
@@ -289,7 +293,7 @@ def _publish(
 # ---- the content of results.json
 
 # packages on whose versions a result depends
-PACKAGES = ("torch", "numpy", "numba", "pycolmap", "kornia", "gsplat")
+PACKAGES = ("torch", "numpy", "numba", "pycolmap", "kornia", "gsplat", "piq")
 # fields that results.json copies from the training and from the evaluation without changes
 OF_TRAINING = (
     "iterations",
@@ -328,6 +332,8 @@ def results_of(
     seconds = {"init": init.seconds, "train": training.seconds, "evaluate": evaluated.seconds}
     if is_ready_made:
         del seconds["train"]
+    if training.compile_seconds is not None:
+        seconds["compile"] = training.compile_seconds
     only_renders = training.evaluated_from == FROM_RENDERS
     views = [*scene.train, *scene.test]
     copied = {name: getattr(training, name) for name in OF_TRAINING}

@@ -1,14 +1,22 @@
-"""Compilation of kernels by numba: options, the cache on disk, and a message to the user."""
+"""Compilation of kernels by numba: options, the cache on disk, and a message to the user.
+
+Of all processes that use a cache, one compiles a kernel; the others wait and load it.
+"""
 
 import functools
 import hashlib
 import logging
 import os
 import tempfile
-from collections.abc import Callable
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from gsbench.system.compile_clock import CLOCK
+from gsbench.system.locks import hold
 from gsbench.system.machine import load_numba, numba_target
 
 numba = load_numba()  # first: it protects the import of numba
@@ -73,7 +81,7 @@ def cache_folder(package: Path = PACKAGE) -> Path:
 
 
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile ``function`` at its first call.
+    """Compile ``function`` at its first call, or earlier by ``compile(signature)``.
 
     The kernel runs without the GIL and without Python's division checks, and is cached on disk.
     Reference counts are off, too (``_nrt``): numba would update them atomically at each inlined
@@ -83,9 +91,34 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     previous = config.CACHE_DIR
     config.CACHE_DIR = str(cache_folder())
     try:
-        return njit(nogil=True, cache=True, error_model="numpy", _nrt=False)(function)
+        dispatcher = njit(nogil=True, cache=True, error_model="numpy", _nrt=False)(function)
     finally:
         config.CACHE_DIR = previous
+    compile_now = dispatcher.compile  # numba, too, calls this method, at the first call
+
+    def compile_in_turn(signature: Any) -> Any:
+        with _turn():
+            return compile_now(signature)
+
+    dispatcher.compile = compile_in_turn
+    return dispatcher
+
+
+_one_thread = threading.Lock()
+
+
+@contextmanager
+def _turn() -> Iterator[None]:
+    """Hold the cache, so that no other process compiles the same kernel; the time is counted."""
+    with _one_thread:
+        started = time.perf_counter()
+        try:
+            folder = cache_folder()
+            folder.mkdir(parents=True, exist_ok=True)
+            with hold(folder / "compiling.lock", "the compilation of kernels"):
+                yield
+        finally:
+            CLOCK.seconds += time.perf_counter() - started
 
 
 def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -103,7 +136,7 @@ class _Announcement(event.Listener):
         ours = event.data["dispatcher"].py_func.__module__.startswith("gsbench.")
         if ours and not self._announced:
             self._announced = True
-            _logger.warning("compiling for this processor, some 10 s, once")
+            _logger.warning("compiling kernels for this processor, some 30 s, once")
 
     def on_end(self, event: event.Event) -> None:
         pass

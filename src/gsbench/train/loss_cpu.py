@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numba import types
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -231,6 +232,15 @@ def gradient_rows(
             sign = select(a > b, splat(l1_factor), select(a < b, splat(-l1_factor), ZERO))
             store(line, i, fma(similarity, -ssim_factor, sign))
         _write_row(line, center, numbers, gradient)
+
+
+# Each kernel and the types of its arguments in a training, where targets are 8-bit photographs.
+_INT, _FLOAT, _FLOATS = types.int64, types.float32, types.float32[::1]
+_IMAGES = (_FLOATS, _INT, _INT, _INT, _INT, _FLOATS, types.uint8[::1], _FLOAT, _FLOATS)
+KERNELS = (
+    (similarity_rows, (*_IMAGES, types.float64[:, ::1])),
+    (gradient_rows, (*_IMAGES, _FLOAT, _FLOAT, _FLOATS)),
+)
 
 
 class CompiledLoss:

@@ -24,6 +24,7 @@ from gsbench.raster.base import RenderOutput
 from gsbench.raster.executors import find_executor, lacks
 from gsbench.runs.layout import CURVES, EVENTS, HISTOGRAMS
 from gsbench.scene.types import Scene
+from gsbench.system.compile_clock import CLOCK
 from gsbench.system.device import free_bytes
 from gsbench.system.stopping import deferred, requested
 from gsbench.train.checkpoint import CheckpointWriter, load_checkpoint
@@ -142,14 +143,14 @@ class Trainer:
     ) -> None:
         """Iterate to the end, a signal to stop or the end of the time budget; write all files."""
         options = self.options
-        first_step, started, earlier_seconds = self.step, time.perf_counter(), self.seconds
+        first_step, started, earlier_seconds = self.step, _clock(), self.seconds
         last_checkpoint = time.monotonic()
         with (folder / CURVES).open("a") as metrics, (folder / EVENTS).open("a") as events:
             while self.step < options.iterations:
                 # Before the refinement: the losses of this iteration are those of this model.
                 counts = {"num_gaussians": len(self.gaussians)}
                 event = self.iterate(folder)
-                self.seconds = earlier_seconds + time.perf_counter() - started
+                self.seconds = earlier_seconds + _clock() - started
                 out_of_time = (
                     options.max_seconds is not None and self.seconds >= options.max_seconds
                 )
@@ -167,7 +168,7 @@ class Trainer:
                     if self.resolution is not None:
                         record["scale"] = self.scale
                     # Measure again: on a GPU, `wait` has waited for queued work.
-                    self.seconds = earlier_seconds + time.perf_counter() - started
+                    self.seconds = earlier_seconds + _clock() - started
                     rate = (self.step - first_step) / max(self.seconds - earlier_seconds, 1e-9)
                     append(metrics, record | {"seconds": round(self.seconds, 3)})
                     on_status(Status(self.step, self.losses.smoothed, len(self.gaussians), rate))
@@ -340,6 +341,11 @@ class Trainer:
             log.info("going on from iteration %d", self.step)
         for name in (CURVES, EVENTS, HISTOGRAMS):
             drop_after(folder / name, self.step)
+
+
+def _clock() -> float:
+    """Seconds, without those in which kernels were compiled."""
+    return time.perf_counter() - CLOCK.seconds
 
 
 def _last_state(folder: Path) -> str:

@@ -4,8 +4,6 @@ A picture is the render, the initial cloud, or large Gaussians coloured by their
 """
 
 import math
-import zipfile
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -20,6 +18,7 @@ from PIL import Image, ImageDraw, ImageFont
 from gsbench.analysis.addresses import TRIAL, fitting
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.results import TrialResult, load_experiment
+from gsbench.densify.lineage import read_causes
 from gsbench.densify.volumetric import log_volume
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import quantize
@@ -38,8 +37,6 @@ from gsbench.scene.images import png_name, read_image
 from gsbench.scene.types import PINHOLE_NAMES, Camera, View
 from gsbench.words import split_outside_brackets
 
-# raised by numpy for a file that is missing or damaged
-DAMAGE = (OSError, ValueError, LookupError, EOFError, zipfile.BadZipFile, zlib.error)
 DIMMED = 0.35  # brightness of the render behind Gaussians coloured by their causes
 TEXT_COLOR, SHADOW = (255, 255, 255), (0, 0, 0)
 TEXT_SIZE = 1 / 36  # of a picture's height; smaller if a word does not fit its pane
@@ -128,22 +125,6 @@ def load_viewed(trial: TrialResult, device: torch.device) -> ViewedTrial:
         views=read_test_views(trial, model_dir),
         background=tuple(background),
     )
-
-
-def read_causes(path: Path, num_gaussians: int) -> NDArray[np.uint8]:
-    """The cause of each remaining Gaussian, [N], from ``lineage.npz``."""
-    try:
-        with np.load(path) as lineage:
-            causes = lineage["causes"][lineage["ids"]]
-    except DAMAGE as error:
-        raise InputError(f"{path} cannot be read ({error}): run this trial again") from error
-    # a model and a record of two runs would give Gaussians the causes of others
-    if len(causes) != num_gaussians:
-        raise InputError(
-            f"{path} is of {len(causes)} Gaussians, the model has {num_gaussians}: run this trial "
-            "again"
-        )
-    return causes
 
 
 def model_folder(trial: TrialResult) -> Path:

@@ -18,6 +18,7 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from gsbench.densify.lineage import read_causes
 from gsbench.densify.volumetric import log_volume
 from gsbench.eval.evaluator import Evaluator, MetricContext, Psnr, quantize, summarize
 from gsbench.eval.facts import to_record
@@ -129,8 +130,7 @@ def _build_from_model(views: Views, trained: Step, parts: Parts) -> Callable[[Pa
                 means = summarize(measure(model, f"iteration {step}", None), evaluator.unavailable)
                 at[str(step)] = Earlier(metrics=means, num_gaussians=len(model))
         if parts.eval.maps:
-            with np.load(training / LINEAGE) as lineage:
-                causes = torch.from_numpy(lineage["causes"][lineage["ids"]])  # [N]
+            causes = torch.from_numpy(read_causes(training / LINEAGE, len(gaussians)))
             first = scene.test[0]
             render = read_image(folder / RENDERS / png_name(first.name))
             picture = draw_ellipsoids(render, gaussians, causes, first.camera, VOLUME_THRESHOLD)

@@ -26,6 +26,7 @@ from gsbench.runs.keys import TRAIN, Step, options_of, rasterizer_inputs, step_o
 from gsbench.runs.layout import LINEAGE, POINT_CLOUD, TRAINING
 from gsbench.runs.trial_record import InitialCloud
 from gsbench.scene.types import Capture
+from gsbench.system.compile_clock import CLOCK
 from gsbench.system.install import own_checkout
 from gsbench.system.machine import describe_machine
 from gsbench.system.resources import peak_memory_mb, reset_peak_memory
@@ -84,6 +85,7 @@ def train_step(views: Views, parts: Parts) -> Step:
             "num_init_points": len(initial),
             "num_gaussians": len(gaussians),
             "seconds": trainer.seconds,
+            "compile_seconds": CLOCK.report(),
             "peak_memory_mb": peak_memory_mb(device),
         }
         write_training(folder, summary, densifier.lineage, views, device, start)

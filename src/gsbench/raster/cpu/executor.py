@@ -114,11 +114,12 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         if flags[:, BAD_VALUE].any():
             raise_for_values(gaussians)
         # Only now is it known how many Gaussians are visible.
-        order = arena.take("order", (int(flags[:, VISIBLE].sum()),), np.uint64)
+        visible = flags[:, VISIBLE].copy()
+        order = arena.take("order", (int(visible.sum()),), np.uint64)
         spare = arena.take("spare", order.shape, np.uint64)
         sort_by_depth(
             edges[:-1],
-            flags[:, VISIBLE].copy(),
+            visible,
             keys,
             order,
             spare,
@@ -147,7 +148,7 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
             composite_tiles(*_tiles(frame, first, past), *pixels)
 
         self._runner.run(TILE_SHARDS, composite)
-        return image, alpha, radii, ForwardPass(frame, flags[:, VISIBLE])
+        return image, alpha, radii, ForwardPass(frame, visible)
 
     def _list_tiles(
         self,
