@@ -21,7 +21,16 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator
 
 from gsbench.files import open_plain, require_no_links
-from gsbench.parsing import Amount, Count, DamagedError, Record, parse_typed, read_bytes, read_typed
+from gsbench.parsing import (
+    Amount,
+    Count,
+    DamagedError,
+    Raw,
+    Record,
+    parse_typed,
+    read_bytes,
+    read_typed,
+)
 from gsbench.runs.config_hash import config_hash
 from gsbench.runs.experiments import Arm, make_home
 from gsbench.runs.keys import CODE_OF_STAGE
@@ -151,9 +160,9 @@ class Question(Record):
 class PlannedTrial(Record):
     """A planned trial: its words and digest, and folder and Unix time of its command."""
 
-    words: tuple[str, ...]
+    words: tuple[Raw, ...]
     digest: Digest = ""
-    cwd: str = ""
+    cwd: Raw = ""
     time: Amount = 0.0
 
 
@@ -163,8 +172,8 @@ class Command(Record):
     ``shows`` are the ids of earlier questions that it repeats: these are its idea's newest.
     """
 
-    words: tuple[str, ...]
-    cwd: str
+    words: tuple[Raw, ...]
+    cwd: Raw
     time: Amount
     trials: dict[Folder, PlannedTrial] = field(default_factory=dict)
     questions: tuple[Question, ...] = ()
@@ -190,8 +199,8 @@ Line = Command | Finished
 
 
 class _OldTrial(Record):
-    overrides: tuple[str, ...]
-    cwd: str
+    overrides: tuple[Raw, ...]
+    cwd: Raw
     time: Amount
 
 
