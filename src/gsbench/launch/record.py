@@ -117,8 +117,8 @@ def planned_rows(trials: Sequence[Trial]) -> list[Row]:
         if key not in configs:  # all seeds share it
             configs[key] = digest_of(values), flatten(yaml.safe_load(trial.yaml))
         digest, config = configs[key]
-        names = (values[group]["name"] for group in ("scene", "init", "densify"))
-        rows.append(Row(*names, key.name, values["seed"], config=config, digest=digest))
+        scene, init, densify = (values[group]["name"] for group in ("scene", "init", "densify"))
+        rows.append(Row(scene, init, densify, key.name, values["seed"], config, digest))
     return with_variants(rows)
 
 

@@ -396,9 +396,9 @@ def _content(path: Path) -> bytes:
 
 
 def _parsed(text: bytes, path: Path) -> Line:
-    kind = Finished if b'"finished"' in text[:12] else Command
-    line: Line = parse_typed(text, kind, path)
-    return line
+    if text.startswith(b'{"finished"'):
+        return parse_typed(text, Finished, path)
+    return parse_typed(text, Command, path)
 
 
 def _text(line: Line) -> str:
