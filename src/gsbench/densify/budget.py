@@ -91,9 +91,6 @@ class Budgeted(Densifier):
     - ``governor``: thresholds are adjusted so that the count follows that curve and ends at it
       (`govern`).
 
-    Under ``soft`` and ``hard``, the training may also set a limit for each round
-    (`gsbench.densify.base.CountSchedule`).
-
     A subclass calls `allowance` before it adds Gaussians. To support ``freeze`` and ``governor``,
     it also overrides `forecast`, and multiplies its growth thresholds by ``strictness`` and its
     opacity for pruning by ``cull``.
@@ -169,13 +166,7 @@ class Budgeted(Densifier):
 
     def allowance(self, refinement: Refinement) -> int | None:
         """The number of Gaussians that may be added now; None: no limit."""
-        count = len(refinement.gaussians)
-        allowed = allowance(count, self.limit(refinement.step), self.cap)
-        schedule = self.context.schedule
-        if schedule is None or self.cap not in ("soft", "hard"):
-            return allowed
-        most = schedule.limit(refinement, self.max_gaussians if self.cap == "hard" else None)
-        return max(0, most - count) if allowed is None else max(0, min(allowed, most - count))
+        return allowance(len(refinement.gaussians), self.limit(refinement.step), self.cap)
 
     def forecast(self, refinement: Refinement) -> int:
         """The count after a round with the present ``strictness`` and ``cull``, without a cap."""
