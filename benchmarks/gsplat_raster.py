@@ -7,8 +7,8 @@
 The contract is that of ``gsbench.raster.base``. This module calls gsplat's functions one by one, so
 that the conventions of 3DGS hold, which gsplat's ``rasterization`` does not follow: the near plane
 is 0.2, and a Gaussian reaches the tiles of a square of 3 sigma along its larger axis at any
-opacity. It works with gsplat 1.5.3 and with 1.6, whose harmonics take other arguments. Some differences are
-inside gsplat's kernels and remain:
+opacity. It works with gsplat 1.5.3 and with 1.6, whose harmonics take other arguments. Some
+differences are inside gsplat's kernels and remain:
 
 - ``image`` and ``alpha``: gsplat 1.5 clamps alpha to 0.999 (1.6 to 0.99, as the contract), and the
   clamp blocks the gradient. A tile at the edge of the square is included if any part of it is

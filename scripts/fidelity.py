@@ -15,6 +15,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import itertools
+import json
 import math
 import re
 import sys
@@ -26,6 +27,7 @@ from typing import Any
 
 import yaml
 
+from gsbench.config.schema import CLASS_DEFAULTS
 from gsbench.parsing import LOADER
 
 ROOT = Path(__file__).parents[1]
@@ -55,11 +57,15 @@ def facts_of(name: str) -> dict[str, str]:
 @cache
 def _with_defaults(name: str) -> dict[str, Any]:
     """The settings of an arm, which override those of the arms in its ``defaults``."""
+    settings: dict[str, Any] = {}
     content = _own_settings(name)
-    parents = [parent for parent in content.pop("defaults", []) if parent != "_self_"]
-    return {
-        key: value for parent in parents for key, value in _with_defaults(parent).items()
-    } | content
+    for parent in content.pop("defaults", []):
+        if parent.startswith("/schema/"):  # the options of a class
+            _, _, group, cls = parent.removesuffix("@_here_").split("/")
+            settings |= json.loads(CLASS_DEFAULTS.read_text(encoding="utf-8"))[group][cls]
+        elif parent != "_self_":
+            settings |= _with_defaults(parent)
+    return settings | content
 
 
 def _own_settings(name: str) -> dict[str, Any]:

@@ -10,6 +10,7 @@ import shutil
 import stat
 import struct
 import tarfile
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -35,7 +36,7 @@ FULL_TEXT = re.compile(
     r"No space left|requested and \d+ written|PytorchStreamWriter failed|unexpected pos|disk is "
     r"full"
 )
-# What the readers of arrays, pictures and archives (numpy, plyfile, zipfile, tarfile and their
+# Errors that readers of arrays, pictures and archives (numpy, plyfile, zipfile, tarfile and their
 # decompressors) raise for a damaged file. MemoryError: a header may announce any number of values.
 DAMAGE = (
     OSError,
@@ -48,6 +49,7 @@ DAMAGE = (
     RuntimeError,
     SyntaxError,
     struct.error,
+    tokenize.TokenError,
     zlib.error,
     lzma.LZMAError,
     zipfile.BadZipFile,

@@ -6,10 +6,12 @@ mechanism checks every value.
 """
 
 import dataclasses
+import json
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache, partial
+from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any, Literal
 
@@ -42,6 +44,9 @@ from gsbench.train.options import TrainConfig, scale_steps
 
 NO_DENSIFIER = "gsbench.densify.NoDensifier"
 TUNE = "hydra.sweeper.tune"
+# the options of the classes of densifiers and initialisers, which only torch could tell; written by
+# scripts/class_defaults.py
+CLASS_DEFAULTS = Path(__file__).with_name("class_defaults.json")
 
 ExperimentName = Annotated[
     str,
@@ -196,12 +201,16 @@ def register_schemas() -> None:
 
     The root's schema has those of the groups. They are registered by themselves, too, for files of
     users that name one (``defaults: [/schema/scene/base@_here_, _self_]``), under ``schema/``, so
-    that Hydra does not offer them as choices.
+    that Hydra does not offer them as choices. So are the options of classes
+    (``/schema/densify/ADC``), on which the files of arms are built.
     """
     store = ConfigStore.instance()
     store.store(name="config_schema", node=_names_and_defaults(Config))
     for group, schema in GROUP_SCHEMAS.items():
         store.store(group=f"schema/{group}", name="base", node=_names_and_defaults(schema))
+    for group, classes in json.loads(CLASS_DEFAULTS.read_text(encoding="utf-8")).items():
+        for name, defaults in classes.items():
+            store.store(group=f"schema/{group}", name=name, node=defaults)
     settings = {"params": {}, "grids": [], "tune": dataclasses.asdict(TuneSettings())}
     for plugin, own in (("Launcher", {}), ("Sweeper", settings)):
         target = {"_target_": f"hydra_plugins.gsbench.Gsbench{plugin}"}

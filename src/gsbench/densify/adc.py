@@ -74,6 +74,7 @@ class ADC(Budgeted):
     prunes_by_size: ClassVar[bool] = True
 
     gradient: Literal["signed", "absolute"] = "signed"  # absolute: AbsGS, arXiv 2404.10484
+    # NDC, mean over the iterations in which a Gaussian was visible
     gradient_threshold: PositiveFloat = 2e-4
     threshold_inclusive: bool = True  # >= as 3DGS; False: > as gsplat
     # a larger Gaussian is split, else cloned ("percent_dense" of 3DGS)

@@ -41,7 +41,7 @@ class AbsGS(ADC):
     }
 
     split_size: PositiveFloat = 0.001
-    split_threshold: PositiveFloat = 4e-4
+    split_threshold: PositiveFloat = 4e-4  # of splits, by the absolute gradient
     opacity_ceiling: OpenFraction = 0.8
     ceiling_interval: PositiveInt = 500
 
@@ -142,7 +142,8 @@ class QuantileADC(ADC):
     ADC.
     """
 
-    growth_rate: PositiveFloat = 0.05
+    growth_rate: PositiveFloat = 0.05  # of the present count, in each round
+    # with the lowest opacities, in each round
     prune_share: Annotated[float, Interval(ge=0, lt=1)] = 0.01
 
     def candidates(self, refinement: Refinement) -> tuple[Tensor, Tensor]:

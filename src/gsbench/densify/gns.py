@@ -55,12 +55,13 @@ class GNS(EdgeAware):
     If the training ends before the pressure does, the final count is above ``max_gaussians``.
     """
 
-    cap: Literal["root"] = "root"
-    max_gaussians: PositiveInt = 600_000
+    cap: Literal["root"] = "root"  # for the growth; the selection then ends at max_gaussians
+    max_gaussians: PositiveInt = 600_000  # final count; before, up to overgrowth times as many
     overgrowth: Annotated[float, Ge(1)] = 3.0
-    pressure: PositiveFloat = 2e-4
+    pressure: PositiveFloat = 2e-4  # initial weight of the term in the loss
+    # of the window's length, from the end of the window
     pressure_length: Annotated[float, Interval(gt=0)] = 0.552
-    selected_opacity: OpenFraction = 0.001
+    selected_opacity: OpenFraction = 0.001  # lower opacities are pruned under pressure
 
     def begin(self, gaussians: Gaussians, context: DensifyContext) -> None:
         super().begin(gaussians, context)

@@ -40,8 +40,10 @@ class LongAxis(ADC):
 
     gradient: Literal["signed", "absolute"] = "absolute"
     gradient_threshold: PositiveFloat = 8e-4
+    # d, in units of 3 sigma, along the longest axis; its scale is multiplied by 1 - d, the others
+    # by sqrt(1 - d^2)
     split_distance: OpenFraction = 0.45
-    opacity_factor: Annotated[float, Interval(gt=0, le=1)] = 0.6
+    opacity_factor: Annotated[float, Interval(gt=0, le=1)] = 0.6  # of the children
 
     def grown(self, refinement: Refinement) -> Grown:
         values = refinement.gaussians.values
@@ -148,9 +150,11 @@ class EdgeAware(LongAxis):
     gradient_threshold: PositiveFloat = 3e-4
     score_views: PositiveInt = 10
     cap: Literal["root", "curve", "hard"] = "root"  # type: ignore[assignment]
-    max_gaussians: PositiveInt = 1_000_000
+    max_gaussians: PositiveInt = 1_000_000  # theirs: 3,000,000
     opacity_reset_value: OpenFraction = 0.05
+    # below it, pruned at the iteration of the third round; 0: none
     early_prune_opacity: Fraction = 0.02
+    # with the lowest opacities, pruned three rounds after an opacity reset; 0: none
     recovery_share: Fraction = 0.2
 
     def observe(self, step: int, render: RenderOutput) -> None:

@@ -41,7 +41,8 @@ class MCMC(Budgeted):
     }
 
     stop: int = 25_000
-    max_gaussians: PositiveInt = 1_000_000
+    max_gaussians: PositiveInt = 1_000_000  # exact
+    # hard | governor: the count follows a curve instead of growing by a share
     cap: Literal["hard", "governor"] = "hard"
     growth: NonNegativeFloat = 0.05  # share of the present count that each refinement adds
     min_opacity: OpenFraction = 0.005  # dead at and below it
@@ -215,14 +216,16 @@ class MRNF(Budgeted):
     start: NonNegativeInt = 0
     stop: int = 25_000
     interval: PositiveInt = 200
-    max_gaussians: PositiveInt = 1_000_000
+    max_gaussians: PositiveInt = 1_000_000  # theirs: 5,000,000
     cap: Literal["hard", "curve"] = "hard"
-    grow_until: NonNegativeInt = 15_000
+    grow_until: NonNegativeInt = 15_000  # after it, only pruned Gaussians are replaced
     growth_threshold: NonNegativeFloat = 0.003
-    growth_share: Fraction = 0.07
-    score_views: PositiveInt = 10
+    growth_share: Fraction = 0.07  # of the candidates, split in each round
+    score_views: PositiveInt = 10  # drawn in each round
     prune_opacity: Annotated[float, Interval(ge=0, lt=1)] = 1 / 255
+    # subtracted from every opacity in each round; falls to 0 at decay_until
     opacity_decay: Annotated[float, Interval(ge=0, lt=1)] = 0.004
+    # share by which every scale shrinks in each round; falls to 0 at decay_until
     scale_decay: Annotated[float, Interval(ge=0, lt=1)] = 0.002
     decay_until: PositiveInt = 30_000  # iterations; the length of the training
     noise_rate: NonNegativeFloat = 50.0  # times the learning rate of the means

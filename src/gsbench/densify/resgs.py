@@ -58,11 +58,13 @@ class ResGS(ADC):
     gradient: Literal["signed", "absolute"] = "absolute"
     gradient_threshold: PositiveFloat = 6.7e-4
     parent_opacity: OpenFraction = 0.3
+    # 2^(1/3): divides the threshold for each level that a Gaussian is behind the stage
     level_factor: Annotated[float, Ge(1)] = 2 ** (1 / 3)
     phase_ends: Sequence[OpenFraction] = field(default_factory=lambda: [0.16, 0.47])
     stages_a_phase: PositiveInt = 3
     warm_up: Annotated[float, Interval(ge=0, lt=1)] = 0.044
-    fade: Annotated[float, Interval(gt=0, le=1)] = 0.8
+    fade: Annotated[float, Interval(gt=0, le=1)] = 0.8  # factor on all opacities
+    # of the window: from the end of the first phase on, that iteration included
     fade_start: OpenFraction = 0.16
     fade_interval: PositiveInt = 500
     fade_stop: NonNegativeInt = 25_000

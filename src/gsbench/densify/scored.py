@@ -46,13 +46,13 @@ class FastGS(AbsGS):
     STATISTICS: ClassVar[dict[str, torch.dtype]] = {"count": torch.float32, "score": torch.float32}
     needs_footprint = True
 
-    split_threshold: PositiveFloat = 1.2e-3
+    split_threshold: PositiveFloat = 1.2e-3  # of splits, by the absolute gradient
     # freeze and governor need a forecast before there are scores
     cap: Literal["soft", "hard", "curve"] = "soft"
-    score_views: PositiveInt = 10
-    error_threshold: Fraction = 0.1
-    least_count: NonNegativeFloat = 5.0
-    final_interval: PositiveInt = 3000
+    score_views: PositiveInt = 10  # drawn in each round
+    error_threshold: Fraction = 0.1  # a pixel is bad if its L1 error, scaled to [0, 1], is above it
+    least_count: NonNegativeFloat = 5.0  # a candidate grows if it covers more bad pixels per view
+    final_interval: PositiveInt = 3000  # after the window
     final_opacity: OpenFraction = 0.1
     final_score: Fraction = 0.9
 
@@ -129,10 +129,10 @@ class Taming(ADC):
     STATISTICS: ClassVar[dict[str, torch.dtype]] = {"score": torch.float32}
     needs_footprint = True
 
-    max_gaussians: PositiveInt = 1_000_000
+    max_gaussians: PositiveInt = 1_000_000  # the budget
     cap: Literal["curve", "hard"] = "curve"
-    score_views: PositiveInt = 10
-    prune_rounds: PositiveInt = 27
+    score_views: PositiveInt = 10  # drawn in each round
+    prune_rounds: PositiveInt = 27  # only this many first rounds prune
     weight_gradient: NonNegativeFloat = 25.0  # mean gradient since the last round
     weight_opacity: NonNegativeFloat = 100.0
     weight_depth: NonNegativeFloat = 5.0  # view z

@@ -61,7 +61,7 @@ class SteepGS(ADC):
         "opacity_reset": OPACITY_RESET,
     }
 
-    eigenvalue_threshold: Annotated[float, Lt(0)] | None = -1e-6
+    eigenvalue_threshold: Annotated[float, Lt(0)] | None = -1e-6  # loss per squared extent
     opacity_factor: Annotated[float, Interval(gt=0, le=1)] = 0.5
 
     def observe(self, step: int, render: RenderOutput) -> None:

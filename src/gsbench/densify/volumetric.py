@@ -79,6 +79,7 @@ class Volumetric(ADC):
         ),
     }
 
+    # V_th, in the units of the COLMAP model cubed
     volume_threshold: PositiveFloat = VOLUME_THRESHOLD
     threshold_mode: ThresholdMode = "absolute"
     volume_quantile: OpenFraction = 0.9978  # 99.78 % of the volumes of Mip-NeRF 360 lie below 0.03
@@ -90,9 +91,11 @@ class Volumetric(ADC):
     split_isotropic: bool = True
     volume_children: Annotated[int, Interval(ge=2, le=MAX_CHILDREN)] = 2
     keep_parent: bool = False
+    # sampled from the parent's density | parent_mean
     placement: Literal["sampled", "parent_mean"] = "sampled"
+    # after_adc | before_adc | after_prune; under a cap, the first rule takes places first
     volume_order: Literal["after_adc", "before_adc", "after_prune"] = "after_adc"
-    volume_start: NonNegativeInt | None = None
+    volume_start: NonNegativeInt | None = None  # null: as in ADC
     volume_stop: NonNegativeInt | None = None
     volume_interval: PositiveInt | None = None
     governor_dimension: Literal[1, 3] = 3
