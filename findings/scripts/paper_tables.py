@@ -78,7 +78,9 @@ def share_below(model: Path) -> tuple[int, float]:
     from plyfile import PlyData
 
     vertex = PlyData.read(model)["vertex"]
-    volumes = 4 / 3 * np.pi * np.exp(sum(vertex[f"scale_{axis}"].astype(float) for axis in range(3)))
+    volumes = (
+        4 / 3 * np.pi * np.exp(sum(vertex[f"scale_{axis}"].astype(float) for axis in range(3)))
+    )
     return len(volumes), float((volumes <= THRESHOLD).mean())
 
 
