@@ -10,6 +10,7 @@ import shutil
 import stat
 import struct
 import tarfile
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -48,11 +49,14 @@ DAMAGE = (
     RuntimeError,
     SyntaxError,
     struct.error,
+    tokenize.TokenError,
     zlib.error,
     lzma.LZMAError,
     zipfile.BadZipFile,
     tarfile.TarError,
 )
+GIT_LFS = b"version https://git-lfs"  # the start of a pointer that stands for a file
+LFS_REMEDY = "a pointer of Git LFS (git lfs pull)"
 NEARLY_NOTHING = 64 * 1024  # free bytes; with less, any failed write counts as a full disk
 
 

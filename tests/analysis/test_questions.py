@@ -203,7 +203,7 @@ def test_fresh_seeds_can_be_used_again_by_a_further_try():
 
 
 def test_a_baseline_that_is_trained_later_is_awaited():
-    before, (question,), _ = asked(sweep("mine"))
+    _before, (question,), _ = asked(sweep("mine"))
     assert question.digests == {HERE: ("", "sfm-mine/0")}
     assert str(question.baseline) == "sfm-adc"
 

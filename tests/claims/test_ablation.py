@@ -127,9 +127,7 @@ def test_ablate_writes_an_experiment_with_a_grid_for_each_combination(runs, said
     words = ["ablate", *ABLATE, "densify=volumetric_once", "name=parts"]
     assert said(*words, "--out", file) == f"{file}: 20 trials of gsbench +experiment=parts\n"
     assert said(*words) == file.read_text()
-    trials = compose_trials(
-        [f"hydra.searchpath=['file://{file.parents[1]}']", "+experiment=parts"]
-    )
+    trials = compose_trials([f"hydra.searchpath=['file://{file.parents[1]}']", "+experiment=parts"])
     assert len(trials) == 20
     assert {trial.values["eval"]["baseline"] for trial in trials} == {"volumetric_once"}
     off = [

@@ -8,7 +8,7 @@ import pytest
 
 from gsbench.verbs.plan import PLANNED, plan
 from tests.helpers import change_json, refusal
-from tests.trials import write_results, write_runs, write_trial
+from tests.trials import write_runs, write_trial
 
 
 @pytest.fixture

@@ -73,7 +73,7 @@ def estimate_components(differences: Sequence[NDArray[np.float64]]) -> Component
     )
     counts = np.array([len(values) for values in differences], dtype=float)
     total = int(counts.sum())
-    between, shares = None, (1.0,)
+    between, shares = None, tuple[float, ...]([1.0])
     if len(differences) > 1:
         shares = _shares(differences)
         means = np.array([values.mean() for values in differences])

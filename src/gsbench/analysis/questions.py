@@ -33,8 +33,15 @@ from gsbench.words import counted, least_text
 ORDINALS = ("first", "second", "third", "fourth", "fifth")
 LAST_LOOK = 0.6  # of a question's level
 # settings that each scene may have for itself, and those that only say how results are read
-OF_A_SCENE = ("scene", "init.path", "train.iterations", "eval.primary", "eval.baseline")
-OF_A_SCENE += ("eval.controls", "densify.switches")
+OF_A_SCENE = (
+    "scene",
+    "init.path",
+    "train.iterations",
+    "eval.primary",
+    "eval.baseline",
+    "eval.controls",
+    "densify.switches",
+)
 
 
 # ---- levels and looks
@@ -254,7 +261,7 @@ def choose_pairs(
 def _unlike(arm: Arm, other: Arm, configs: Mapping[Arm, Mapping[str, str]]) -> int:
     """The number of swept settings that both arms have with different values."""
     swept = dict([*arm.variant, *other.variant])
-    one, two = (configs[own] | dict(own.variant) for own in (arm, other))
+    one, two = ({**configs[own], **dict(own.variant)} for own in (arm, other))
     return sum(key in one and key in two and one[key] != two[key] for key in swept)
 
 

@@ -84,13 +84,14 @@ def _run_until_decided(trials: Sequence[Trial], run: Run) -> None:
     Decided pairs of arms get no further trials. Raises InputError for a sweep that cannot be tested
     in this way.
     """
+    rows = planned_rows(trials)
+    check_looks(trials, rows)
     make_runs_folder(checked_runs_folder(trials[0].values["runs"]))
     questions = record(trials)
     if not questions:
         raise InputError(
             "launch.stop_when_decided compares arms, and this sweep has one: give two densifiers"
         )
-    rows = planned_rows(trials)
     by_place = {
         (row.scene, row.digest, row.seed): trial for row, trial in zip(rows, trials, strict=True)
     }

@@ -22,10 +22,10 @@ from gsbench import __version__
 from gsbench.analysis.comparison import compare
 from gsbench.analysis.fairness import searches_of
 from gsbench.analysis.images import PixelMeasures, textured_error
-from gsbench.analysis.judge import RUNNING, STOPPED
 from gsbench.analysis.old_declarations import all_questions
 from gsbench.analysis.quantities import TEXTURED
 from gsbench.analysis.results import Experiment, TrialResult, group_by, newest_code, read_views
+from gsbench.analysis.verdicts import RUNNING, STOPPED
 from gsbench.claims.archive import (
     CRATE,
     FORMAT,

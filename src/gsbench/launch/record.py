@@ -59,8 +59,8 @@ def record(trials: Sequence[Trial], asks: bool = True) -> list[Question]:
         ) -> Command | None:
             found, shown = ask(rows, asked, measured, history) if asked else ([], [])
             asked_now.extend([*found, *(one for one in history.questions if one.id in shown)])
-            last = {one.idea.name: one.id for one in history.questions}
-            shown = [name for name in shown if name not in last.values()]
+            if set(shown) <= set().union(*history.newest.values()):
+                shown = []  # they are the newest ones already
             planned = {
                 trial.folder.relative_to(home).as_posix(): PlannedTrial(
                     words=tuple(trial.overrides), digest=row.digest
@@ -117,8 +117,8 @@ def planned_rows(trials: Sequence[Trial]) -> list[Row]:
         if key not in configs:  # all seeds share it
             configs[key] = digest_of(values), flatten(yaml.safe_load(trial.yaml))
         digest, config = configs[key]
-        names = (values[group]["name"] for group in ("scene", "init", "densify"))
-        rows.append(Row(*names, key.name, values["seed"], config=config, digest=digest))
+        scene, init, densify = (values[group]["name"] for group in ("scene", "init", "densify"))
+        rows.append(Row(scene, init, densify, key.name, values["seed"], config, digest))
     return with_variants(rows)
 
 

@@ -21,7 +21,16 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator
 
 from gsbench.files import open_plain, require_no_links
-from gsbench.parsing import Amount, Count, DamagedError, Record, parse_typed, read_bytes, read_typed
+from gsbench.parsing import (
+    Amount,
+    Count,
+    DamagedError,
+    Raw,
+    Record,
+    parse_typed,
+    read_bytes,
+    read_typed,
+)
 from gsbench.runs.config_hash import config_hash
 from gsbench.runs.experiments import Arm, make_home
 from gsbench.runs.keys import CODE_OF_STAGE
@@ -151,9 +160,9 @@ class Question(Record):
 class PlannedTrial(Record):
     """A planned trial: its words and digest, and folder and Unix time of its command."""
 
-    words: tuple[str, ...]
+    words: tuple[Raw, ...]
     digest: Digest = ""
-    cwd: str = ""
+    cwd: Raw = ""
     time: Amount = 0.0
 
 
@@ -163,8 +172,8 @@ class Command(Record):
     ``shows`` are the ids of earlier questions that it repeats: these are its idea's newest.
     """
 
-    words: tuple[str, ...]
-    cwd: str
+    words: tuple[Raw, ...]
+    cwd: Raw
     time: Amount
     trials: dict[Folder, PlannedTrial] = field(default_factory=dict)
     questions: tuple[Question, ...] = ()
@@ -190,8 +199,8 @@ Line = Command | Finished
 
 
 class _OldTrial(Record):
-    overrides: tuple[str, ...]
-    cwd: str
+    overrides: tuple[Raw, ...]
+    cwd: Raw
     time: Amount
 
 
@@ -236,6 +245,17 @@ class History:
                 if name in by_id:
                     by_id[name] = by_id.pop(name)
         return tuple(by_id.values())
+
+    @cached_property
+    def newest(self) -> dict[str, set[str]]:
+        """The ids of the questions that the last command about each idea asked or repeated."""
+        ideas, found = {one.id: one.idea.name for one in self.questions}, dict[str, set[str]]()
+        for command in self.commands:
+            own: dict[str, set[str]] = {}
+            for name in (*(one.id for one in command.questions), *command.shows):
+                own.setdefault(ideas.get(name, ""), set()).add(name)
+            found |= own
+        return found
 
     def _with_baseline(self, question: Question, later: Sequence[Command]) -> Question:
         if all(first for first, _ in question.digests.values()):
@@ -376,9 +396,9 @@ def _content(path: Path) -> bytes:
 
 
 def _parsed(text: bytes, path: Path) -> Line:
-    kind = Finished if b'"finished"' in text[:12] else Command
-    line: Line = parse_typed(text, kind, path)
-    return line
+    if text.startswith(b'{"finished"'):
+        return parse_typed(text, Finished, path)
+    return parse_typed(text, Command, path)
 
 
 def _text(line: Line) -> str:

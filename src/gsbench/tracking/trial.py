@@ -1,7 +1,6 @@
 """A trial in a tracker's terms: names, curves, results and pictures, read from its files."""
 
 import re
-import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +18,7 @@ from gsbench.runs.nested import flatten, sha256_of
 from gsbench.runs.rows import read_rows
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import TrialRecord
+from gsbench.words import command, markdown_code, markdown_text
 
 NOTE = "note"  # the tag that describes a finished trial, in Markdown
 # characters that MLflow refuses in a picture's name
@@ -216,12 +216,12 @@ class TrackedTrial:
         if results.num_gaussians is not None:
             texts.append(f"{results.num_gaussians:,} Gaussians")
         lines = [
-            f"{', '.join(texts)} after {results.iterations:,} iterations.",
-            f"Folder: `{self.path}`",
+            markdown_text(f"{', '.join(texts)} after {results.iterations:,} iterations."),
+            f"Folder: {markdown_code(self.path)}",
         ]
         planned = read_history(self.folder.home).planned.get(self.folder.path)
         if planned is not None:
-            lines.append(f"Again: `{shlex.join(['gsbench', *planned.words])}`")
+            lines.append(f"Again: {markdown_code(command(*planned.words))}")
         return "\n\n".join(lines)
 
     def _pictures(self, count: int) -> dict[str, Array]:
