@@ -273,7 +273,8 @@ def _differences(
         "so the spread of its own trials is not taken into account; a single trial has no interval."
     )
     headings = ("scene", "init", "densify")
-    return Table(title, headings, tuple(columns), tuple(rows), (legend, *notes, *setup_notes))
+    below = legend, " ".join(notes), " ".join(setup_notes)
+    return Table(title, headings, tuple(columns), tuple(rows), tuple(filter(None, below)))
 
 
 def _difference(
