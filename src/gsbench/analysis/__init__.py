@@ -1,19 +1,17 @@
 """Tables, statistics and reports. They are made from result files alone, without torch."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from gsbench.analysis.cells import to_frame
 from gsbench.analysis.results import load_experiment
-
-if TYPE_CHECKING:
-    from gsbench.analysis.frames import judge_frame as judge
 
 __all__ = ["judge", "load_experiment", "to_frame"]
 
 
 def __getattr__(name: str) -> Any:
-    if name == "judge":  # imported at its first use, since SciPy is slow to import
-        from gsbench.analysis.frames import judge_frame
+    """`judge` is imported when it is asked for, since SciPy is slow to import."""
+    if name == "judge":
+        from gsbench.analysis.frames import judge
 
-        return judge_frame
+        return judge
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

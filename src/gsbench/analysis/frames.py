@@ -18,6 +18,7 @@ from gsbench.analysis.quantities import asked_quantity
 from gsbench.analysis.questions import LeastEffect, read_least
 from gsbench.analysis.results import Experiment, TrialResult, group_by
 from gsbench.analysis.sentences import DECLARED_TABLE, TABLE
+from gsbench.analysis.verdicts import Verdict
 from gsbench.errors import InputError
 from gsbench.eval.facts import find_metric
 from gsbench.files import write_text
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 METHOD, SCENE, SEED = COLUMNS = ("method", "scene", "seed")
-DIRECTIONS = {"higher": 1, "lower": -1}
+DIRECTIONS = {"": 0, "higher": 1, "lower": -1}
 
 
 class Declared(Record):
@@ -60,35 +61,54 @@ def read_declared(file: Path) -> Declared:
         raise InputError(f"{file}: no such file: judge --declare writes it") from None
 
 
-def judge_frame(
+def judge(
     frame: pd.DataFrame,
     baseline: str,
     metric: str,
     least: float | str | None = None,
-    better: str | None = None,
-    declared: Declared | None = None,
-    name: str = "results",
-) -> Comparison:
-    """The verdicts on all methods of a table against ``baseline``, in ``metric``, at 5 % each.
+    direction: int = 0,
+) -> dict[str, Verdict]:
+    """The verdict on each method of a ``frame`` against ``baseline`` in ``metric``, by its name.
 
-    ``frame`` has the columns method, scene, seed, and one for each metric; a missing value is a
-    training that failed. ``least`` is the least difference that matters, as 0.1 or "10%"; None
-    takes the metric's usual one. ``better`` is "higher" or "lower", needed for a metric that
-    gsbench does not know. Raises InputError for a table or question that cannot be judged.
+    The frame has the columns method, scene, seed and metrics, a row for each training; a missing
+    value is a training that failed. ``least`` is the least difference that matters, such as 0.1 or
+    "10%"; by default the metric's usual one. ``direction`` (1: more is better, -1: less) is needed
+    for metrics that gsbench does not know. A verdict has 5 %, and holds if metric, scenes and seeds
+    were chosen before.
+
+    Raises InputError, one line, for a frame that lacks a column, has a training twice, or has no
+    such baseline.
 
     Examples:
         >>> import pandas as pd
-        >>> rows = [(m, "room", k, v + k) for m, v in (("base", 20), ("mine", 21)) for k in (0, 1)]
-        >>> table = pd.DataFrame(rows, columns=["method", "scene", "seed", "psnr"])
-        >>> judge_frame(table, "base", "psnr", least=0.1).answers[0].badge
-        'UNDECIDED'
+        >>> rows = [("base", "garden", k, 26.0 + k / 10) for k in range(3)]
+        >>> rows += [("mine", "garden", k, 27.0 + k / 9) for k in range(3)]
+        >>> frame = pd.DataFrame(rows, columns=["method", "scene", "seed", "psnr"])
+        >>> judge(frame, "base", "psnr")["mine"].outcome
+        'supported'
     """
-    trials = _trials(frame, metric, better, name)
+    answers = compare_methods(frame, baseline, metric, least, direction).answers
+    return {answer.arm.densify: answer.verdict for answer in answers}
+
+
+def compare_methods(
+    frame: pd.DataFrame,
+    baseline: str,
+    metric: str,
+    least: float | str | None = None,
+    direction: int = 0,
+    declared: Declared | None = None,
+    name: str = "results",
+) -> Comparison:
+    """The answers on all methods of a table, as `judge` gives them, or to a ``declared`` question.
+
+    Raises InputError for a table or question that cannot be judged.
+    """
+    trials = _trials(frame, metric, direction, name)
     methods = list(dict.fromkeys(trial.densify for trial in trials))
     if baseline not in methods:
         raise InputError(
-            f"--baseline {baseline}: no such method{did_you_mean(baseline, methods)} (there are "
-            f"{listed(methods)})"
+            f"no method {baseline!r}{did_you_mean(baseline, methods)} (there are {listed(methods)})"
         )
     ideas = [method for method in methods if method != baseline]
     if declared is not None:
@@ -98,7 +118,7 @@ def judge_frame(
     sign = asked_quantity(metric, trials).direction
     if not sign:
         raise InputError(
-            f"whether more of {metric} is better is not known: give --better higher or lower"
+            f"{metric}: say whether more is better (--better higher, direction 1) or less"
         )
     size = _least(metric, trials, least)
     questions = [
@@ -165,14 +185,15 @@ def _trials(frame: pd.DataFrame, metric: str, better: str | None, name: str) -> 
     for column in (*COLUMNS, metric):
         if column not in columns:
             raise InputError(
-                f"the table has no column {column}{did_you_mean(column, columns)} (it has "
+                f"the table has no column {column!r}{did_you_mean(column, columns)} (it has "
                 f"{listed(columns)}; a row needs {listed(COLUMNS)} and metrics)"
             )
+    if not len(frame):
+        raise InputError("the table has no rows")
     values = {key: _numbers(frame[key]) for key in columns if key not in COLUMNS}
     metrics = {key: column for key, column in values.items() if column is not None}
     if metric not in metrics:
         raise InputError(f"the column {metric} has a value that is no number")
-    direction = DIRECTIONS[better] if better else 0
     facts = {
         key: MetricRecord(label=key, direction=direction if key == metric else 0)  # type: ignore[arg-type]
         for key in metrics
@@ -185,7 +206,7 @@ def _trials(frame: pd.DataFrame, metric: str, better: str | None, name: str) -> 
         trials.append(_trial(name, method, scene, seed, own, facts))
     for place, same in group_by(trials, lambda one: (one.densify, one.scene, one.seed)).items():
         if len(same) > 1:
-            raise InputError(f"{place[0]} on {place[1]} has seed {place[2]} twice")
+            raise InputError(f"{place[0]}, {place[1]}, seed {place[2]} is twice in it")
     return trials
 
 

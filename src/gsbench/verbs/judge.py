@@ -13,7 +13,7 @@ from gsbench.analysis.frames import (
     DIRECTIONS,
     METHOD,
     Declared,
-    judge_frame,
+    compare_methods,
     read_declared,
 )
 from gsbench.errors import InputError
@@ -40,12 +40,12 @@ def judge(argv: Sequence[str], runs: Path) -> int:
     elif options.baseline is None:
         raise InputError("judge needs --baseline NAME, one of the methods")
     frame = _frame(options, declared.metric if declared else options.metric)
-    comparison = judge_frame(
+    comparison = compare_methods(
         frame,
         declared.baseline if declared else options.baseline,
         declared.metric if declared else options.metric,
         declared.least if declared else options.least,
-        (declared.better or None) if declared else options.better,
+        DIRECTIONS[(declared.better if declared else options.better) or ""],
         declared,
         options.results.stem,
     )
@@ -81,7 +81,7 @@ def _parser() -> ArgumentParser:
     parser.add_argument("--metric", default="psnr", help="a column that decides (psnr)")
     parser.add_argument(
         "--better",
-        choices=list(DIRECTIONS),
+        choices=[name for name in DIRECTIONS if name],
         help="which values are better, for a metric that gsbench does not know",
     )
     parser.add_argument(
