@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from gsbench.analysis.comparison import Comparison, compare
 from gsbench.analysis.quantities import asked_quantity
@@ -179,7 +179,7 @@ def _digest(method: str) -> str:
     return method.replace("+", "_")  # what follows a plus stands for code
 
 
-def _trials(frame: pd.DataFrame, metric: str, better: str | None, name: str) -> list[TrialResult]:
+def _trials(frame: pd.DataFrame, metric: str, direction: int, name: str) -> list[TrialResult]:
     """The rows as trials; raises InputError for missing columns, repeated rows and no numbers."""
     columns = [str(column) for column in frame.columns]
     for column in (*COLUMNS, metric):
@@ -194,8 +194,9 @@ def _trials(frame: pd.DataFrame, metric: str, better: str | None, name: str) -> 
     metrics = {key: column for key, column in values.items() if column is not None}
     if metric not in metrics:
         raise InputError(f"the column {metric} has a value that is no number")
+    sign: Literal[-1, 0, 1] = 1 if direction > 0 else -1 if direction else 0
     facts = {
-        key: MetricRecord(label=key, direction=direction if key == metric else 0)  # type: ignore[arg-type]
+        key: MetricRecord(label=key, direction=sign if key == metric else 0)
         for key in metrics
         if find_metric(key) is None
     }
