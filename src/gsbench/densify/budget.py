@@ -125,7 +125,7 @@ class Budgeted(Densifier):
     stop: int = 15_000
     interval: PositiveInt = 100
     max_gaussians: PositiveInt | None = PAPER_CAP  # None: no limit, as 3DGS
-    # The paper has a cap of 3.4 million. Its eight capped counts are 3.41 to 3.57 million, so its cap
+    # The paper has a cap of 3.4 million. Its eight capped counts are 3.41 to 3.57 million: its cap
     # was not hard, and it also applied to the baseline: without it, bicycle, garden and stump reach
     # 6.1, 5.7 and 4.8 million. It was soft or freeze; which of them is not known.
     cap: CapKind = "soft"
