@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsbench.scene.own_reader import PosedImages
+from gsbench.scene.record import Photograph, RawCapture
 from gsbench.scene.types import CameraModel
 
 
@@ -18,7 +18,7 @@ class LLFF:
         file = folder / "poses_bounds.npy"
         rows = np.load(file)[:, :15].reshape(-1, 3, 5)
         files = sorted((folder / self.photographs).iterdir())
-        images = {}
+        found = []
         for photograph, row in zip(files, rows, strict=True):
             # the camera's axes in the world, its centre, and its size and focal length in px
             down, right, back, center, (height, width, focal) = row.T
@@ -26,5 +26,5 @@ class LLFF:
             params = (focal, width / 2, height / 2)
             camera = CameraModel("SIMPLE_PINHOLE", int(width), int(height), params)
             name = photograph.relative_to(folder).as_posix()
-            images[name] = camera, rotation, -rotation @ center
-        return PosedImages(images, files=[file])
+            found.append(Photograph(name, photograph, camera, rotation, -rotation @ center))
+        return RawCapture(folder, tuple(found), files=(file,))

@@ -280,7 +280,8 @@ def wheels() -> str:
     import pycolmap
 
     from gsbench.scene.colmap import model_points, read_reference
-    from gsbench.scene.readers import read_colmap
+    from gsbench.scene.options import SceneConfig
+    from gsbench.scene.pipe import read_capture
 
     new, pinned = STATE / "new", Path("constraints.txt").read_text().split()
     shutil.rmtree(new, ignore_errors=True)
@@ -295,7 +296,7 @@ def wheels() -> str:
     for unused in ("wheels", "site/gsplat/cuda/csrc/third_party/glm/doc"):  # 20 MB
         shutil.rmtree(new / unused, ignore_errors=True)
     # Keypoints and tracks, 20 MB of bonsai's model, only tell which points the chosen images see.
-    capture = read_colmap("bonsai", os.environ["GPU_DAY_SCENE"])
+    capture = read_capture(SceneConfig("bonsai", "colmap", path=os.environ["GPU_DAY_SCENE"]))
     model = read_reference(capture)
     cloud = model_points(model)
     model.delete_all_points2D_and_points3D()

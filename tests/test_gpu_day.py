@@ -286,7 +286,7 @@ def test_without_a_compiled_gsplat_its_parts_are_not_tried(day):
 def test_the_archive_has_packages_scene_and_weights(tmp_path, shared):
     """The scene has no tracks, but gives a training the same points."""
     from gsbench.scene.colmap import model_points, read_reference
-    from gsbench.scene.readers import read_colmap
+    from tests.scene.captures import read_colmap
 
     day = Day(tmp_path)
     scene = shared / "data/herz_jesus_p25"

@@ -17,7 +17,7 @@ try:
     from gsbench import __version__
     from gsbench.errors import GsbenchError, InputError
     from gsbench.files import checked_runs_folder, storage_errors
-    from gsbench.logs import begin_command, printable_output
+    from gsbench.logs import OutputError, begin_command, open_streams, printable_output
     from gsbench.system.programs import protect_environment
     from gsbench.verbs import VERBS, load_verb
     from gsbench.words import did_you_mean
@@ -31,6 +31,7 @@ DONE, TRIAL_FAILED, BAD_INPUT = 0, 1, 2
 
 def main() -> None:
     """Entry point of the console script."""
+    open_streams()
     with printable_output():
         code = run(sys.argv[1:])
     sys.exit(code)
@@ -42,18 +43,15 @@ def run(argv: list[str]) -> int:
         protect_environment()
     begin_command()
     try:
-        if argv and argv[0] == "help":
-            return _help([])
-        if argv == ["--version"]:
-            print(f"gsbench {__version__}")
-            return DONE
-        is_verb = argv and not set(argv[0][:1]) & set("-+~") and "=" not in argv[0]
-        if set(HELP) & set(argv) and not is_verb:
-            return _help([word for word in argv if word not in HELP])
-        _require_current_folder()
-        return _verb(argv[0], argv[1:]) if is_verb else _trials(argv)
+        try:
+            return _command(argv)
+        finally:
+            sys.stdout.flush()  # here, where a full disk is explained, and not when Python ends
     except InputError as error:
         return _refuse(error, BAD_INPUT)
+    except OutputError as error:
+        _drop_output()
+        return _refuse(error, TRIAL_FAILED)
     except GsbenchError as error:
         return _refuse(error, TRIAL_FAILED)
     except KeyboardInterrupt as stop:
@@ -69,9 +67,26 @@ def run(argv: list[str]) -> int:
         print("gsbench: stopped; to continue, give the same command again", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:  # the reader of our output, such as `head`, has ended
-        # Otherwise Python flushes stdout at exit and prints the error again.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _drop_output()
         return DONE
+
+
+def _command(argv: list[str]) -> int:
+    if argv and argv[0] == "help":
+        return _help([])
+    if argv == ["--version"]:
+        print(f"gsbench {__version__}")
+        return DONE
+    is_verb = argv and not set(argv[0][:1]) & set("-+~") and "=" not in argv[0]
+    if set(HELP) & set(argv) and not is_verb:
+        return _help([word for word in argv if word not in HELP])
+    _require_current_folder()
+    return _verb(argv[0], argv[1:]) if is_verb else _trials(argv)
+
+
+def _drop_output() -> None:
+    """Let nothing more be printed: Python would print the stream's error again at its end."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _is_interrupt(error: BaseException | None) -> bool:

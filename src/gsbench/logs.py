@@ -13,6 +13,7 @@ from rich import progress as bars
 from rich.console import Console
 from rich.markup import escape
 
+from gsbench.errors import GsbenchError
 from gsbench.files import open_plain
 from gsbench.words import printable
 
@@ -30,33 +31,67 @@ class _Printable(logging.Formatter):
         return printable(super().format(record))
 
 
+class OutputError(GsbenchError):
+    """Raised if the standard output, such as a file on a full disk, cannot be written to."""
+
+
 class PrintableStream:
     """A stream that writes to ``raw`` and makes everything `printable`.
 
     Characters that its encoding lacks are escaped too, such as ↑ where only ASCII can be printed.
+    If it cannot be written to, a stream with results (``is_result``) raises OutputError; lines
+    that only accompany the work are lost.
     """
 
-    def __init__(self, raw: TextIO) -> None:
-        self.raw = raw
+    def __init__(self, raw: TextIO, is_result: bool = True) -> None:
+        self.raw, self._is_result = raw, is_result
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.raw, name)
 
     def write(self, text: str) -> int:
         encoding = getattr(self.raw, "encoding", None) or "utf-8"
-        self.raw.write(printable(text).encode(encoding, "backslashreplace").decode(encoding))
+        with self._explained():
+            self.raw.write(printable(text).encode(encoding, "backslashreplace").decode(encoding))
         return len(text)
+
+    def flush(self) -> None:
+        with self._explained():
+            self.raw.flush()
+
+    @contextmanager
+    def _explained(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            if isinstance(error, BrokenPipeError) and self._is_result:
+                raise  # its reader, such as `head`, has ended
+            if self._is_result:
+                raise OutputError(
+                    f"the output cannot be written ({error.strerror}): send it elsewhere"
+                ) from None
 
     def writelines(self, lines: Sequence[str]) -> None:
         for line in lines:
             self.write(line)
 
 
+def open_streams() -> None:
+    """Open the null device for each standard stream that is closed, as some cron jobs have them."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest free number, which is this one
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(number, "w" if number else "r", encoding="utf-8"))
+
+
 @contextmanager
 def printable_output() -> Iterator[None]:
     """Make everything that the block and its libraries print `printable`."""
     out, err = sys.stdout, sys.stderr
-    sys.stdout, sys.stderr = PrintableStream(out), PrintableStream(err)
+    sys.stdout, sys.stderr = PrintableStream(out), PrintableStream(err, is_result=False)
     try:
         yield
     finally:

@@ -163,8 +163,8 @@ def read_json(path: Path) -> Any:
     return value
 
 
-def read_yaml(path: Path) -> Any:
-    """The value in a YAML file.
+def read_yaml(path: Path, loader: Any = None) -> Any:
+    """The value in a YAML file, read by `SafeLoader` or a ``loader`` derived from it.
 
     Raises as `read_bytes` does, and DamagedError if it is no YAML or has a fault. Numbers may be
     infinite, because users write settings in YAML and a class may have an infinite default.
@@ -173,7 +173,7 @@ def read_yaml(path: Path) -> Any:
     try:
         text = content.decode("utf-8")
         fault = _danger_in_yaml(text)
-        value = None if fault else yaml.load(text, Loader=_Loader)
+        value = None if fault else yaml.load(text, Loader=loader or SafeLoader)
     except (yaml.YAMLError, ValueError, TypeError, OverflowError, RecursionError) as error:
         reason = getattr(error, "problem", None) or error  # PyYAML's own text has several lines
         raise DamagedError(path, f"is not YAML ({reason})") from None
@@ -182,7 +182,7 @@ def read_yaml(path: Path) -> Any:
     return value
 
 
-class _Loader(LOADER):
+class SafeLoader(LOADER):
     """A safe loader for which a key that occurs twice in a mapping is an error.
 
     YAML would silently drop the first.

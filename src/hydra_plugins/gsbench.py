@@ -7,7 +7,10 @@ Hydra.
 from collections.abc import Sequence
 from typing import Any
 
+from hydra.core.object_type import ObjectType
+from hydra.core.plugins import Plugins
 from hydra.core.utils import JobReturn
+from hydra.plugins.config_source import ConfigResult, ConfigSource
 from hydra.plugins.launcher import Launcher
 from hydra.plugins.sweeper import Sweeper
 from hydra.types import HydraContext, TaskFunction
@@ -50,3 +53,38 @@ class GsbenchSweeper(Sweeper):
 
     def sweep(self, arguments: list[str]) -> None:
         self.task.run_sweep(self.context, self.config)
+
+
+class GsbenchFiles(ConfigSource):
+    """A folder of the user's as Hydra reads it, whose files gsbench checks first.
+
+    Its place in the search path is ``gsbench://FOLDER``.
+    """
+
+    def __init__(self, provider: str, path: str) -> None:
+        super().__init__(provider, path)
+        sources: Any = Plugins.instance().discover(ConfigSource)
+        (files,) = (source for source in sources if source.scheme() == "file")
+        self.files: ConfigSource = files(provider, f"file://{self.path}")
+
+    @staticmethod
+    def scheme() -> str:
+        return "gsbench"
+
+    def load_config(self, config_path: str) -> ConfigResult:
+        from gsbench.config.strange_files import check_file
+
+        check_file(self.path, config_path)
+        return self.files.load_config(config_path)
+
+    def is_group(self, config_path: str) -> bool:
+        return self.files.is_group(config_path)
+
+    def is_config(self, config_path: str) -> bool:
+        return self.files.is_config(config_path)
+
+    def available(self) -> bool:
+        return self.files.available()
+
+    def list(self, config_path: str, results_filter: ObjectType | None) -> list[str]:
+        return self.files.list(config_path, results_filter)

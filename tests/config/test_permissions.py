@@ -96,20 +96,10 @@ def _words(settings):
     return [f"{key}={value_text(value)}" for key, value in settings.items()]
 
 
-@pytest.mark.parametrize(
-    "settings, said",
-    [
-        ({"runs": "theirs"}, "runs=theirs, a place to write"),
-        ({"hydra.sweeper.params.runs": "theirs"}, "runs"),
-        ({"hydra.job.env_set.PATH": "."}, "set variables in the shell"),
-    ],
-)
-def test_a_choice_that_leaves_its_groups_folder_is_a_strangers_file(settings, said, refused):
-    experiment(settings)
+def test_a_choice_that_leaves_its_groups_folder_is_refused(refused):
+    experiment({"runs": "theirs"})
     outside = os.path.relpath("conf/experiment/strange", Path(conf_dir(), "experiment"))
-    told = refused(f"+experiment={outside}")
-    # The next version of Hydra refuses such a choice by itself.
-    assert said in told or "Parent traversal ('..')" in told
+    assert "Parent traversal ('..')" in refused(f"+experiment={outside}")
 
 
 def _claims(settings):

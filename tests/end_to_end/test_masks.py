@@ -16,9 +16,9 @@ from gsbench.init.base import MODEL_FOLDER
 from gsbench.scene.colmap import read_model
 from gsbench.scene.courtyard.render import render_courtyard
 from gsbench.scene.masks import read_mask
-from gsbench.scene.readers import read_colmap
 from tests.end_to_end.conftest import trial_of
 from tests.helpers import read_json
+from tests.scene.captures import read_colmap
 
 pytestmark = pytest.mark.slow
 

@@ -14,9 +14,9 @@ from gsbench.files import file_sha256
 from gsbench.init import Sfm
 from gsbench.init.base import MODEL_FOLDER
 from gsbench.scene.courtyard.render import render_courtyard
-from gsbench.scene.readers import read_colmap
 from tests.end_to_end.conftest import trial_of
 from tests.helpers import read_json
+from tests.scene.captures import read_colmap
 
 pytestmark = pytest.mark.slow
 

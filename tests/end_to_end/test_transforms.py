@@ -17,8 +17,8 @@ from gsbench.pipeline.steps.scene import CaptureSource
 from gsbench.scene.courtyard.render import render_courtyard
 from gsbench.scene.load import load_scene
 from gsbench.scene.options import SceneConfig
-from gsbench.scene.readers import read_colmap
 from tests.helpers import read_json, write
+from tests.scene.captures import read_colmap
 
 pytestmark = pytest.mark.slow
 

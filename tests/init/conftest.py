@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gsbench.scene.courtyard.render import render_courtyard
-from gsbench.scene.readers import read_colmap
+from tests.scene.captures import read_colmap
 
 VIEWS, WIDTH, HEIGHT = 8, 320, 240
 

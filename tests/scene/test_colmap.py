@@ -18,10 +18,10 @@ from gsbench.scene.colmap import (
 )
 from gsbench.scene.colmap_checks import MODELS, ModelChecks
 from gsbench.scene.colmap_files import check_model
-from gsbench.scene.readers import read_colmap, read_photos
 from gsbench.scene.types import Camera
 from tests.helpers import refusal
 from tests.scene.cameras import cameras_of
+from tests.scene.captures import read_colmap, read_photos
 
 from .conftest import smooth_image
 

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from gsbench.errors import InputError
 from gsbench.scene.hold_out import hold_out
 from gsbench.scene.options import SceneConfig, SplitRule
-from gsbench.scene.readers import read_colmap, read_photos
 from tests.helpers import refusal
+from tests.scene.captures import read_colmap, read_photos
 from tests.scene.test_sectors import ring
 
 NAMES = [f"{k:02d}.png" for k in range(24)]

@@ -23,8 +23,9 @@ from gsbench.scene.images import (
     read_image,
 )
 from gsbench.scene.options import SplitRule
-from gsbench.scene.readers import fingerprint, read_photos
+from gsbench.scene.pipe import fingerprint
 from tests.helpers import refusal, write
+from tests.scene.captures import read_photos
 
 pytestmark = pytest.mark.skipif(
     not hasattr(os, "mkfifo"), reason="pipes and links of a POSIX system"
@@ -51,7 +52,7 @@ def photos(tmp_path):
     folder = tmp_path / "images"
     folder.mkdir()
     for name in ("a.png", "b.png", "c.png"):
-        Image.fromarray(np.full((6, 8, 3), ord(name[0]), np.uint8)).save(folder / name)
+        Image.fromarray(np.full((18, 24, 3), ord(name[0]), np.uint8)).save(folder / name)
     return folder
 
 

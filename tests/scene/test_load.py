@@ -15,10 +15,10 @@ from gsbench.scene.colmap import plain_camera, read_model
 from gsbench.scene.distortion import largest_distortion
 from gsbench.scene.load import INTRINSICS, Downscaling, ImageToPrepare, load_scene, prepare_all
 from gsbench.scene.options import SplitRule
-from gsbench.scene.readers import read_colmap
 from gsbench.scene.types import CameraModel
 from gsbench.scene.undistortion import check_lenses, flatten, undistort
 from tests.helpers import read_json, refusal
+from tests.scene.captures import read_colmap
 
 WIDTH, HEIGHT = 200, 150
 UNCHANGED = Downscaling(1, None, "lanczos")

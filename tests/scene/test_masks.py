@@ -17,9 +17,9 @@ from gsbench.scene.masks import (
     read_mask,
     resize_mask,
 )
-from gsbench.scene.readers import read_colmap, read_photos
 from gsbench.scene.types import Capture
 from tests.helpers import refusal
+from tests.scene.captures import read_colmap, read_photos
 
 
 def save(path, pixels, **options):
@@ -55,13 +55,13 @@ def test_masks_are_found_by_the_names_of_colmap(make_scene, read):
     assert capture.image_names == names
 
 
-def test_a_mask_file_with_another_name_is_not_used(tmp_path):
-    for name in ("a.jpg.png", "b.png"):
+def test_colmaps_name_of_a_mask_comes_before_that_of_its_photograph(tmp_path):
+    for name in ("a.jpg.png", "a.png", "b.png"):
         save(tmp_path / name, half())
-    save(tmp_path / "images" / "a.jpg", half())
-    assert find_masks(tmp_path, tmp_path / "images", ["a.jpg"]) == {"a.jpg": tmp_path / "a.jpg.png"}
-    with refusal(r"no mask of b\.jpg in .*: add b\.jpg\.png"):
-        find_masks(tmp_path, tmp_path / "images", ["a.jpg", "b.jpg"])
+    found = find_masks(tmp_path, ["a.jpg", "b.jpg"])
+    assert found == {"a.jpg": tmp_path / "a.jpg.png", "b.jpg": tmp_path / "b.png"}
+    with refusal(r"no mask of c\.jpg in .*: add c\.jpg\.png"):
+        find_masks(tmp_path, ["a.jpg", "c.jpg"])
 
 
 def test_masks_in_the_folder_of_bare_photographs_are_not_read_as_photographs(make_scene):

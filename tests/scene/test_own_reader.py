@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass, replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -18,7 +19,7 @@ from gsbench.pipeline.steps.scene import CaptureSource
 from gsbench.runs.user_code import UserCode
 from gsbench.scene.colmap import read_model
 from gsbench.scene.options import SceneConfig
-from gsbench.scene.own_reader import PosedImages, read_posed_images
+from gsbench.scene.record import Photograph, RawCapture, read_own
 from gsbench.scene.types import CameraModel
 
 CAMERA = CameraModel("PINHOLE", 32, 24, (30.0, 31.0, 16.0, 12.0))
@@ -35,9 +36,7 @@ def folder(tmp_path):
 
 def posed(count=4):
     """Cameras on a line."""
-    return PosedImages(
-        {f"{n}.png": (CAMERA, np.eye(3), np.array([0.1 * n, 0, 0])) for n in range(count)}, POINTS
-    )
+    return raw(*(one(f"{n}.png", translation=np.array([0.1 * n, 0, 0])) for n in range(count)))
 
 
 @dataclass
@@ -51,35 +50,41 @@ class Reader:
         return posed() if self.result is None else self.result
 
 
-def one(**changes):
-    """One image whose camera, rotation or translation is changed."""
+def one(name="0.png", **changes):
+    """A photograph whose camera, rotation or translation is changed."""
     values = {"camera": CAMERA, "rotation": np.eye(3), "translation": np.zeros(3)} | changes
-    return PosedImages({"0.png": tuple(values.values())})
+    return Photograph(name, Path(name), **values)
+
+
+def raw(*photographs, **changes):
+    return RawCapture(Path(), photographs, **({"points": POINTS} | changes))
 
 
 def camera(*params, name="PINHOLE"):
-    return one(camera=CameraModel(name, 32, 24, params))
+    return raw(one(camera=CameraModel(name, 32, 24, params)))
 
 
 FAULTS = {
-    "nothing": ({}, "read() must return gsbench.scene.own_reader.PosedImages, got dict"),
+    "nothing": ({}, "read() must return gsbench.scene.record.RawCapture, got dict"),
     "an error": (KeyError("w"), "Reader cannot read {folder} (KeyError: 'w')"),
     "an end": (SystemExit(3), "Reader cannot read {folder} (SystemExit: 3)"),
-    "a missing file": (PosedImages({"9.png": posed().images["0.png"]}), "9.png: no such file in"),
-    "a file above": (PosedImages({"../0.png": posed().images["0.png"]}), "../0.png: no such file"),
-    "an absolute path": (PosedImages({"/etc/passwd": posed().images["0.png"]}), "no such file in"),
-    "no camera": (PosedImages({"0.png": None}), "0.png: "),
+    "a missing file": (raw(one("9.png")), "9.png: no such file in"),
+    "a file above": (raw(one("../0.png")), "../0.png: no such file"),
+    "an absolute path": (raw(one("/etc/passwd")), "no such file in"),
+    "no photograph": (raw(None), "?: "),
+    "no camera": (raw(one(camera=None)), "0.png: it has no camera and pose"),
     "no model": (camera(30, 31, 16, 12, name="pinhole"), "'pinhole' is no camera model of"),
-    "no camera model": (one(camera="PINHOLE"), "0.png: "),
+    "no camera model": (raw(one(camera="PINHOLE")), "0.png: "),
     "too few parameters": (camera(30, 16, 12), "is not a camera of COLMAP: it has fx, fy, cx, cy"),
     "no focal length": (camera(0, 31, 16, 12), "is not a camera of COLMAP"),
     "a parameter": (camera(np.nan, 31, 16, 12), "parameters must be finite"),
-    "a mirror": (one(rotation=np.diag([1.0, 1, -1])), "the rotation must only rotate and move"),
-    "a scale": (one(rotation=2 * np.eye(3)), "the rotation must only rotate and move"),
-    "a matrix": (one(rotation=np.eye(4)), "a rotation [3, 3] and a translation [3]"),
-    "a place": (one(translation=[np.inf, 0, 0]), "the pose must be finite"),
-    "points": (replace(posed(), points=([[1, 2]], POINTS[1])), "points must be finite numbers"),
-    "colours": (replace(posed(), points=(POINTS[0], POINTS[0])), "must be uint8 [P, 3]"),
+    "a mirror": (raw(one(rotation=np.diag([1.0, 1, -1]))), "the rotation must only rotate"),
+    "a scale": (raw(one(rotation=2 * np.eye(3))), "the rotation must only rotate and move"),
+    "a matrix": (raw(one(rotation=np.eye(4))), "a rotation [3, 3] and a translation [3]"),
+    "a place": (raw(one(translation=[np.inf, 0, 0])), "the pose must be finite"),
+    "points": (raw(points=([[1, 2]], POINTS[1])), "points must be finite numbers"),
+    "a path of points": (raw(points="a.ply"), "points must be positions and colours"),
+    "colours": (raw(points=(POINTS[0], POINTS[0])), "must be uint8 [P, 3]"),
 }
 
 
@@ -87,7 +92,7 @@ FAULTS = {
 def test_a_fault_of_the_reader_is_named(fault, folder):
     result, said = FAULTS[fault]
     with pytest.raises(InputError) as error:
-        read_posed_images(Reader(result), folder)
+        read_own(Reader(result), folder)
     assert said.format(folder=folder) in str(error.value)
     assert "test_own_reader.Reader" in str(error.value)
     assert "\n" not in str(error.value)
@@ -99,7 +104,9 @@ def source(folder, reader, code="a", **settings):
 
 
 def test_cameras_points_and_the_readers_own_split_reach_the_capture(folder, tmp_path):
-    own = replace(posed(), split=(["0.png", "2.png", "3.png"], ["1.png"]), files=[folder / "0.png"])
+    roles = ("train", "test", "train", "train")
+    rows = [replace(row, role=role) for row, role in zip(posed().photographs, roles, strict=True)]
+    own = raw(*rows, files=(folder / "0.png",))
     made = source(folder, Reader(own), split="list")
     step = made.step
     assert step is not None
@@ -122,12 +129,11 @@ def test_results_are_stored_under_the_readers_code_its_settings_and_what_it_read
 
     first = key(Reader())
     assert key(Reader()) == first
-    moved = replace(posed(), images=dict(posed().images) | posed(1).images)
     assert key(Reader(scale=2.0)) != first
     assert key(Reader(), code="b") != first
-    assert key(Reader(replace(moved, points=None))) != first
-    shifted = {"0.png": (CAMERA, np.eye(3), np.array([0.5, 0, 0]))}
-    assert key(Reader(PosedImages(dict(posed().images) | shifted, POINTS))) != first
+    assert key(Reader(replace(posed(), points=None))) != first
+    shifted = one(translation=np.array([0.5, 0, 0]))
+    assert key(Reader(raw(shifted, *posed().photographs[1:]))) != first
 
 
 @pytest.mark.parametrize(
@@ -164,5 +170,5 @@ def test_options_of_the_reader_stand_among_the_settings_of_the_scene(monkeypatch
 
 def test_photographs_are_in_the_order_of_their_names(folder):
     """Test views are chosen by it, and a folder's order differs from file system to file system."""
-    shuffled = replace(posed(), images=dict(reversed(posed().images.items())))
-    assert list(read_posed_images(Reader(shuffled), folder).images) == [*posed().images]
+    shuffled = raw(*reversed(posed().photographs))
+    assert read_own(Reader(shuffled), folder).names == posed().names

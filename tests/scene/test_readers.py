@@ -11,12 +11,13 @@ import pytest
 from PIL import Image
 
 from gsbench.scene.colmap import read_model, read_reference
+from gsbench.scene.colmap_files import missing_model
 from gsbench.scene.hold_out import select_images, split_names
-from gsbench.scene.images import list_images, match_names
-from gsbench.scene.model_folders import missing_model
+from gsbench.scene.images import list_images
+from gsbench.scene.names import match, match_anywhere
 from gsbench.scene.options import SceneConfig, SplitRule
-from gsbench.scene.readers import read_colmap, read_photos
 from tests.helpers import refusal, write
+from tests.scene.captures import read_colmap, read_photos
 
 
 @pytest.mark.parametrize("text", [False, True])
@@ -51,7 +52,7 @@ def test_files_with_another_extension_are_used_and_missing_ones_left_out(make_sc
     half = root / "images_2" / "cam"
     half.mkdir(parents=True)
     for k in range(5):
-        Image.open(root / "images" / f"cam/{k}.JPG").resize((20, 15)).save(half / f"{k}.png")
+        Image.open(root / "images" / f"cam/{k}.JPG").resize((24, 18)).save(half / f"{k}.png")
     with caplog.at_level(logging.WARNING):
         capture = read_colmap("toy", root, images="images_2")
     assert capture.image_names == tuple(f"cam/{k}.png" for k in range(5))
@@ -82,7 +83,7 @@ def test_files_with_another_extension_are_used_and_missing_ones_left_out(make_sc
 )
 def test_names_match_their_files_and_ambiguous_ones_are_refused(wanted, files, matches):
     with refusal(None if isinstance(matches, dict) else matches):
-        assert match_names(wanted, files) == matches
+        assert match(wanted, files) == matches
 
 
 @pytest.mark.parametrize(
@@ -99,8 +100,8 @@ def test_names_match_their_files_and_ambiguous_ones_are_refused(wanted, files, m
 )
 def test_names_in_other_folders_match_by_the_last_parts_of_their_paths(wanted, files, matches):
     with refusal(None if isinstance(matches, dict) else matches):
-        assert match_names(wanted, files, other_folders=True) == matches
-    assert set(match_names(wanted, files)) <= {"b.png"}
+        assert match_anywhere(wanted, files) == matches
+    assert set(match(wanted, files)) <= {"b.png"}
 
 
 @pytest.mark.parametrize("prefix", ["images/", "/home/x/images/", "C:\\data\\images\\", "./"])
@@ -271,7 +272,7 @@ def test_fingerprint_depends_on_content_not_on_place(make_scene, tmp_path):
 def test_missing_folders_images_and_models_are_named(make_scene, tmp_path):
     with refusal("does not exist"):
         read_photos("toy", tmp_path / "nowhere")
-    with refusal(r"scene\.path is not set"):
+    with refusal(r"scene\.path must be a path"):
         read_photos("toy", "")
     empty = tmp_path / "empty"
     empty.mkdir()

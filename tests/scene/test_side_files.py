@@ -1,13 +1,10 @@
 """Files beside photographs: masks, thumbnails, smaller copies and other results."""
 
-import numpy as np
 import pytest
-from PIL import Image, ImageOps
+from PIL import Image
 
-from gsbench.scene.images import list_images
-from gsbench.scene.readers import read_photos
-from gsbench.scene.side_files import photographs_among
-from tests.helpers import refusal
+from tests.helpers import refusal, write
+from tests.scene.captures import read_photos
 from tests.scene.conftest import smooth_image
 
 COUNT = 5
@@ -20,12 +17,6 @@ def photographs(folder, pattern="{}.jpg", scale=1, seed=0, change=lambda picture
         picture = Image.fromarray(smooth_image(80 // scale, 64 // scale, seed + k))
         change(picture).save(file)
     return folder
-
-
-def normals(picture):
-    vectors = np.asarray(picture) / 127.5 - 1
-    vectors /= np.maximum(np.linalg.norm(vectors, axis=2, keepdims=True), 0.01)
-    return Image.fromarray(np.rint(127.5 * (vectors + 1)).astype(np.uint8))
 
 
 @pytest.mark.parametrize(
@@ -56,6 +47,7 @@ def normals(picture):
         ("{}.jpg.png", 1, "….*.png (5)"),
         ("depth_{}.png", 1, "…depth.png"),
         ("SYNOPHOTO_THUMB_{}.jpg", 4, "SYNO….jpg"),
+        ("lowres/{}.jpg", 4, "lowres/"),
         (".thumbnails/{}.jpg", 4, ""),
     ],
 )
@@ -66,39 +58,6 @@ def test_other_files_beside_photographs_change_no_capture(tmp_path, caplog, patt
     assert (beside.image_names, beside.fingerprint) == (alone.image_names, alone.fingerprint)
     assert named in caplog.text
     assert len(caplog.records) == bool(named)
-
-
-@pytest.mark.parametrize(
-    "own, pattern, change",
-    [
-        ("frame-{}.color.jpg", "frame-{}.depth.png", ImageOps.grayscale),
-        ("rgb_{}.jpg", "depth_{}.png", lambda picture: picture),
-        ("{}.jpg", "sam/{}.png", ImageOps.grayscale),
-        ("{}.jpg", "x/000{}_7.png", lambda picture: picture.convert("I;16")),
-        ("{}.jpg", "{}_b.png", lambda picture: ImageOps.posterize(picture, 1)),
-        ("{}.jpg", "normal/{}.png", normals),
-        ("{}.jpg", "tn_{}.jpg", lambda picture: picture.resize((30, 24))),
-        ("{}.jpg", "lowres/{}.png", lambda picture: picture.resize((33, 27))),
-        ("a{}.png", "a{}@half.png", lambda picture: picture.resize((40, 32))),
-    ],
-)
-def test_pictures_made_from_photographs_are_told_by_their_pixels(tmp_path, own, pattern, change):
-    folder = photographs(photographs(tmp_path, own), pattern, change=change)
-    assert read_photos("a", folder).image_names == tuple(own.format(k) for k in range(COUNT))
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        ImageOps.flip,  # of one size, with other content
-        lambda picture: ImageOps.flip(picture).resize((40, 32)),  # the smaller camera of a pair
-        lambda picture: ImageOps.grayscale(picture).resize((64, 64)),  # of a thermal camera
-    ],
-)
-def test_photographs_of_two_cameras_with_the_same_numbers_are_all_read(tmp_path, caplog, change):
-    folder = photographs(photographs(tmp_path, "one/{}.png"), "two/{}.png", change=change)
-    assert len(read_photos("a", folder).image_names) == 2 * COUNT
-    assert not caplog.records
 
 
 @pytest.mark.parametrize(
@@ -114,7 +73,7 @@ def test_of_folders_of_several_sizes_the_largest_is_read(tmp_path, caplog, patte
     for pattern, scale in patterns.items():
         photographs(tmp_path, pattern, scale)
     assert read_photos("a", tmp_path).image_names == tuple(kept.format(k) for k in range(COUNT))
-    assert "smaller copies" in caplog.text
+    assert "left out, no photographs" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -135,18 +94,19 @@ def test_photographs_in_folders_of_other_names_are_all_read(tmp_path, caplog, pa
     assert not caplog.records
 
 
-def test_names_without_a_common_number_belong_to_no_series(tmp_path):
-    """church and garden are two photographs, and 1 and 01 one series, whatever their formats."""
-    for name in ("church.jpg", "church.png", "x/1.jpg", "x/1.png", "x/02.jpg"):
-        photographs(tmp_path, name, change=ImageOps.grayscale)
-    for name in ("garden.jpg", "garden.png", "y_5/2.jpg", "1.jpg"):
-        photographs(tmp_path, name, seed=5)
-    names = photographs_among(tmp_path, list_images(tmp_path))
-    assert {name for name in list_images(tmp_path) if name not in names} == set()
-    photographs(tmp_path, "02.jpg", seed=9)
-    names = photographs_among(tmp_path, list_images(tmp_path))
-    left_out = {name for name in list_images(tmp_path) if name not in names}
-    assert left_out == {"x/1.jpg", "x/1.png", "x/02.jpg"}
+def test_files_of_the_photographs_names_in_folders_beside_them_are_columns(tmp_path):
+    photographs(tmp_path, "images/cam/{}.jpg")
+    for place, ending in (("depth/cam", "npy"), ("normals/cam", "png"), ("masks", "png")):
+        for k in range(3):
+            write(tmp_path / place / f"{k}.{ending}", b"any")
+    capture = read_photos("a", tmp_path)
+    names = [f"cam/{k}.jpg" for k in range(3)]
+    assert capture.depths == {name: tmp_path / f"depth/{name[:-3]}npy" for name in names}
+    assert capture.more == {
+        name: {"normals": tmp_path / f"normals/{name[:-3]}png"} for name in names
+    }
+    alone = read_photos("a", photographs(tmp_path / "alone", "images/cam/{}.jpg"))
+    assert alone.fingerprint == capture.fingerprint
 
 
 def test_a_folder_that_is_named_is_read_whatever_its_name(tmp_path):

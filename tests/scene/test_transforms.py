@@ -18,6 +18,7 @@ from gsbench.scene.transforms import read_transforms
 from gsbench.scene.transforms_keys import HARMLESS, REFUSED
 from tests.helpers import change_json, read_json, refusal
 from tests.scene.cameras import cameras_of
+from tests.scene.captures import read_with_step
 
 SHARED = {"w": 40, "h": 30, "fl_x": 50.0, "fl_y": 51.0, "cx": 19.5, "cy": 15.5}
 
@@ -53,8 +54,8 @@ def write(folder, edit=None, **changes):
 
 def cameras(folder, edit=None, **changes):
     """The cameras by name of a `write` folder."""
-    images = read_transforms(write(folder, edit, **changes)).images
-    return {name: camera for name, (camera, *_) in images.items()}
+    rows = read_transforms(write(folder, edit, **changes)).photographs
+    return {row.name: row.camera for row in rows}
 
 
 def in_each_frame(**keys):
@@ -67,10 +68,7 @@ def in_frame(number, **keys):
 
 
 def capture_of(folder, work, **options):
-    source = CaptureSource(SceneConfig(name="t", kind="transforms", path=str(folder), **options))
-    work.mkdir(exist_ok=True)
-    source.step.build(work)
-    return source.read(work)
+    return read_with_step(folder, work, name="t", kind="transforms", **options)
 
 
 def project(model, name, point):
@@ -131,20 +129,26 @@ IDENTITY = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
     "change, said",
     [
         ({"ply_file_path": "b.ply"}, "names other points than another file"),
-        ({"applied_transform": [[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0]]}, "same points"),
-        ({"applied_transform": [[1, 0, 0, 0], [0, 1, 0, 0.5], [0, 0, 1, 0]]}, "same points"),
-        ({"applied_scale": 2.0}, r"same points .* applied_transform or applied_scale"),
+        (
+            {"applied_transform": [[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0]]},
+            "the same points with another",
+        ),
+        (
+            {"applied_transform": [[1, 0, 0, 0], [0, 1, 0, 0.5], [0, 0, 1, 0]]},
+            "the same points with another",
+        ),
+        ({"applied_scale": 2.0}, r"same points with another .* applied_scale"),
     ],
 )
 def test_two_files_must_name_the_same_points_under_one_transform(tmp_path, change, said):
     folder = in_blenders_files(write(tmp_path / "in", ply_file_path="a.ply"))
     for name in ("a.ply", "b.ply"):
         (folder / name).write_text("ply")
-    assert read_transforms(folder).points == folder / "a.ply"
+    assert read_transforms(folder).points.path == folder / "a.ply"
     # the other file has no transform, which means the identity
     test = folder / "transforms_test.json"
     change_json(test, ply_file_path="a.ply", applied_transform=IDENTITY)
-    assert read_transforms(folder).points == folder / "a.ply"
+    assert read_transforms(folder).points.path == folder / "a.ply"
     change_json(test, **change)
     with refusal(said):
         read_transforms(folder)
@@ -210,14 +214,15 @@ def test_blender_scenes_with_their_angle_names_split_and_alpha_are_read(tmp_path
     capture = capture_of(tmp_path, tmp_path / "made", split="list")
     assert capture.test_names == tuple(f"test/r_{k}.png" for k in range(3))
     assert capture.train_names == tuple(f"train/r_{k}.png" for k in range(5))
-    camera = read_transforms(tmp_path).images["train/r_0.png"][0]
+    camera = {row.name: row.camera for row in read_transforms(tmp_path).photographs}[
+        "train/r_0.png"
+    ]
     assert camera.params == pytest.approx((0.5 * 40 / math.tan(0.5 * angle),) * 2 + (20, 20))
     # held out by scene.split, not by the files
     assert capture_of(tmp_path, tmp_path / "every").test_names == ("test/r_0.png",)
-    assert not any(name.startswith("val/") for name in read_transforms(tmp_path).images)
+    assert not any(name.startswith("val/") for name in read_transforms(tmp_path).names)
     (tmp_path / "transforms_test.json").unlink()
-    _, held_out = read_transforms(tmp_path).split
-    assert held_out == ["val/r_0.png", "val/r_1.png"]
+    assert read_transforms(tmp_path).named("test") == ["val/r_0.png", "val/r_1.png"]
     assert masking_step(capture, "black") is None
     step = masking_step(capture, "white")
     (tmp_path / "white").mkdir()
@@ -237,13 +242,15 @@ def test_a_line_says_which_of_both_forms_of_a_scene_is_read(tmp_path, caplog):
     assert "transforms.json is read, and transforms_train.json not" in caplog.text
 
 
-def test_a_file_with_mask_paths_needs_the_folder_of_masks(tmp_path):
-    folder = write(tmp_path / "in", in_frame(1, mask_path="masks/1.png"))
+def test_masks_and_depth_maps_that_frames_name_are_columns_of_the_record(tmp_path):
+    folder = write(tmp_path / "in", in_frame(1, mask_path="masks/1.png", depth_file_path="d/1.npy"))
     (folder / "masks" / "images").mkdir(parents=True)
+    Image.new("L", (40, 30), 255).save(folder / "masks/1.png")
     for k in range(6):
         Image.new("L", (40, 30), 255).save(folder / "masks" / "images" / f"{k}.png.png")
-    with refusal(r"mask_path is not read: .*scene\.masks"):
-        capture_of(folder, tmp_path / "a")
+    found = capture_of(folder, tmp_path / "a")
+    assert found.masks == {"images/1.png": folder / "masks/1.png"}
+    assert found.depths == {"images/1.png": folder / "d/1.npy"}
     found = capture_of(folder, tmp_path / "b", masks="masks")
     assert found.masks["images/2.png"] == folder / "masks/images/2.png.png"
 
@@ -325,8 +332,8 @@ def test_images_one_pixel_wide_are_accepted_and_a_missing_side_is_measured(tmp_p
     for k in range(len(EYES)):
         Image.new("RGB", (1, 30)).save(tmp_path / f"in/images/{k}.png")
     change_json(tmp_path / "in/transforms.json", w=1)
-    images = read_transforms(tmp_path / "in").images
-    assert {camera.width for camera, *_ in images.values()} == {1}
+    rows = read_transforms(tmp_path / "in").photographs
+    assert {row.camera.width for row in rows} == {1}
     for side in ("w", "h"):
         for camera in cameras(tmp_path / "in", **{side: None}).values():
             assert (camera.width, camera.height) == (40, 30)
@@ -344,7 +351,7 @@ def test_a_missing_file_and_a_name_that_fits_two_images_are_refused(tmp_path):
 def test_images_without_a_file_are_left_out(tmp_path, caplog):
     folder = write(tmp_path / "in")
     (folder / "images" / "4.png").unlink()
-    assert len(read_transforms(folder).images) == 5
+    assert len(read_transforms(folder).names) == 5
     assert "1 of 6 images have no file: ./images/4.png" in caplog.text
 
 
@@ -369,8 +376,8 @@ def test_scene_images_replaces_the_folder_that_the_file_names(tmp_path, keep):
         train_filenames=[f"images/{k}.png" for k in range(4)],
         test_filenames=["images/5"],
     )
-    train, test = read_transforms(folder, image_folder="images_2").split
-    assert (len(train), test) == (4, ["images_2/5.png"])
+    raw = read_transforms(folder, image_folder="images_2")
+    assert (len(raw.named("train")), raw.named("test")) == (4, ["images_2/5.png"])
     for camera in fitted.cameras.values():
         assert (camera.width, camera.height) == (24, 18)
         assert camera.focal_length_x == pytest.approx(50 * 0.6)
@@ -508,14 +515,14 @@ def test_nerfstudios_lists_of_filenames_are_the_split(tmp_path, lists, train, te
 @pytest.mark.parametrize("written", ["images/4.JPG", "images/4", "IMAGES/4.PNG", "images\\4.jpeg"])
 def test_a_file_is_found_whatever_its_extension_and_capitals(tmp_path, written):
     folder = write(tmp_path / "in", in_frame(4, file_path=written))
-    assert sorted(read_transforms(folder).images) == [f"images/{k}.png" for k in range(6)]
+    assert read_transforms(folder).names == [f"images/{k}.png" for k in range(6)]
 
 
 def test_a_byte_order_mark_of_utf8_is_skipped_and_other_encodings_are_named(tmp_path):
     file = write(tmp_path) / "transforms.json"
     text = file.read_text()
     file.write_text(text, encoding="utf-8-sig")
-    assert len(read_transforms(tmp_path).images) == 6
+    assert len(read_transforms(tmp_path).names) == 6
     for encoding, said in (
         ("utf-16", "json cannot be read: it is UTF-16 or UTF-32: save it as UTF-8"),
         ("utf-32", "json cannot be read: it is UTF-16 or UTF-32: save it as UTF-8"),

@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from gsbench.scene.options import SplitRule
-from gsbench.scene.readers import read_colmap, read_photos
 from gsbench.scene.twins import copies_by_name, without_copies
 from gsbench.scene.types import Scene, Twins, View
 from tests.helpers import refusal
+from tests.scene.captures import read_colmap, read_photos
 from tests.scene.conftest import smooth_image
 from tests.train.conftest import orbit_camera
 

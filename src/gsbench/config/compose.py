@@ -28,10 +28,11 @@ from gsbench.config.hydra_setup import (
     hydra_ready,
     installed_nodes,
 )
+from gsbench.config.interpolations import check_texts
 from gsbench.config.overrides import bare_key, is_sweep, key_of, parse_word, task_words
 from gsbench.config.schema import ROOT_SETTINGS, Config, check, checked_values, plain
-from gsbench.config.search_files import check_places
-from gsbench.config.search_path import check_search_path, searched_folders
+from gsbench.config.search_path import check_search_path, read_by_gsbench, searched_folders
+from gsbench.config.strange_files import check_choice, check_places, permitted_to_files
 from gsbench.config.trust import MADE_NODES, check_composed, check_permissions
 from gsbench.errors import InputError
 from gsbench.runs.trial_folder import TrialFolder
@@ -100,6 +101,7 @@ class Composer:
         single = [word for word in words if not is_sweep(word)]
         own = task_words(single)
         self.hydra_words = tuple(word for word in single if word not in own)
+        self._check_words(self.hydra_words)
         self._chosen: dict[tuple[str, ...], DictConfig] = {}
         self._times: dict[str, Any] = {}  # what ${now:…} stands for, the same in all trials
         self._own_choices = _choices(own)
@@ -110,13 +112,15 @@ class Composer:
         with explained(words):
             is_sent = self.config.tracking.get("uri")
         if is_sent:
-            self.allowed += typed_address(self.typed)
+            with permitted_to_files(self.allowed):
+                self.allowed += typed_address(self.typed)
             self.config[PERMISSIONS] = list(self.allowed)
         with open_dict(self.config):
             self.config.hydra = self._choose(values).hydra
 
     def settings(self, words: Sequence[str]) -> DictConfig:
         """The configuration of ``words`` without Hydra's node; what it may run is checked."""
+        self._check_words(words)
         chosen = self._choose(words)
         config = OmegaConf.masked_copy(chosen, [str(key) for key in chosen if key != "hydra"])
         OmegaConf.set_struct(config, True)
@@ -180,9 +184,7 @@ class Composer:
     def _trial_of_hydra(self, words: Sequence[str], number: int | None = None) -> Trial:
         """The trial of ``words`` as Hydra composes its job, with its number and its node."""
         with hydra_ready(), explained(words):
-            config = hydra.compose(
-                CONFIG_NAME, [*self.hydra_words, *words], return_hydra_config=True
-            )
+            config = self._composed(words)
             with open_dict(config):
                 config[PERMISSIONS] = list(self.allowed)
                 config.hydra.mode = self.config.hydra.mode
@@ -217,7 +219,9 @@ class Composer:
         return self._chosen[key]
 
     def _compose(self, choices: Sequence[str], words: Sequence[str]) -> DictConfig:
-        folders = [word for word in self.hydra_words if key_of(word) == "hydra.searchpath"]
+        folders = read_by_gsbench(
+            [word for word in self.hydra_words if key_of(word) == "hydra.searchpath"]
+        )
         for key in map(key_of, choices):
             group = key.partition("@")[0]
             if group not in GROUPS and not config_loader().get_group_options(
@@ -225,15 +229,30 @@ class Composer:
             ):
                 raise InputError(not_a_setting(key, self._choose([]), words))
         with explained([*self.hydra_words, *words]):
-            config = hydra.compose(
-                CONFIG_NAME, [*self.hydra_words, *choices], return_hydra_config=True
-            )
-        # Without words for Hydra all files are gsbench's own, unless a choice leaves its folder.
-        if self.hydra_words or any(".." in choice for choice in choices):
+            config = self._composed(choices)
+        if self.hydra_words:  # else all files are gsbench's own
             # for the check, which tells what is in a word from what a file sets
             config.hydra.overrides.task = list(map(key_of, words))
             check_permitted(config, self.allowed)
         return config
+
+    def _composed(self, words: Sequence[str]) -> DictConfig:
+        """Hydra's composition, for which gsbench reads the files of the user's folders."""
+        with permitted_to_files(self.allowed):
+            return hydra.compose(
+                CONFIG_NAME,
+                [*read_by_gsbench(self.hydra_words), *words],
+                return_hydra_config=True,
+            )
+
+    def _check_words(self, words: Sequence[str]) -> None:
+        """Refuse words that would resolve what is not allowed, or leave the folder of a group."""
+        for word in words:
+            override = parse_word(word)
+            if "${" in word:
+                check_texts({override.key_or_group: override.value()}, self.allowed)
+            if not _is_value(word):
+                check_choice(word, str(override.value()))
 
     def _are_own(self, choices: Mapping[str, str]) -> bool:
         """Return whether ``choices`` give the files of the command's own composition."""
@@ -312,7 +331,7 @@ def typed_address(typed: Sequence[str]) -> tuple[str, ...]:
     about_tracking = ("tracking", "hydra.searchpath")
     words = [word for word in typed if key_of(word).startswith(about_tracking)]
     with hydra_ready(), explained(words):
-        config = hydra.compose(CONFIG_NAME, words)
+        config = hydra.compose(CONFIG_NAME, read_by_gsbench(words))
         return (str(config.tracking.uri),) if config.tracking.get("uri") else ()
 
 

@@ -8,6 +8,9 @@ from gsbench.config.overrides import key_of, parse_word
 from gsbench.config.permissions import PACKAGE, is_allowed, permission_advice
 from gsbench.errors import InputError
 
+SEARCH_PATH = "hydra.searchpath"
+SCHEME = "gsbench"  # of places whose files gsbench reads first (`gsbench.config.strange_files`)
+
 
 def search_path(folders: Sequence[Path], overrides: Sequence[str]) -> list[str]:
     """The word ``hydra.searchpath=…`` for ``--config-dir``, in a list; empty without folders."""
@@ -22,8 +25,27 @@ def search_path(folders: Sequence[Path], overrides: Sequence[str]) -> list[str]:
         raise InputError("--config-dir needs a folder")
     if not folders[0].is_dir():
         raise InputError(f"--config-dir {folders[0]}: no such folder")
-    escaped = str(folders[0].resolve()).replace("'", "\\'")
-    return [f"hydra.searchpath=['file://{escaped}']"]
+    return [_search_word([f"file://{folders[0].resolve()}"])]
+
+
+def _search_word(places: Sequence[str]) -> str:
+    quoted = ("'" + place.replace("'", "\\'") + "'" for place in places)
+    return f"hydra.searchpath=[{','.join(quoted)}]"
+
+
+def read_by_gsbench(words: Sequence[str]) -> list[str]:
+    """The ``words``, in which gsbench's source reads the folders of the search path."""
+    if not (places := search_places(words)):
+        return list(words)
+    checked = [
+        place if place.startswith("pkg://") else f"{SCHEME}://{place.removeprefix('file://')}"
+        for place in places
+    ]
+    return [*(word for word in words if not _is_search(word)), _search_word(checked)]
+
+
+def _is_search(word: str) -> bool:
+    return key_of(word).replace("[", ".").replace("]", "") == SEARCH_PATH
 
 
 def search_places(words: Sequence[str]) -> list[str]:
@@ -34,8 +56,7 @@ def search_places(words: Sequence[str]) -> list[str]:
     places: list[str] = []
     for word in words:
         override = parse_word(word)
-        key = key_of(word).replace("[", ".").replace("]", "")
-        if key == "hydra.searchpath" and not override.is_sweep_override():
+        if _is_search(word) and not override.is_sweep_override():
             value: Any = override.value()
             places += map(str, value if isinstance(value, list) else getattr(value, "values", ()))
     return places

@@ -7,13 +7,12 @@ made. `docs/security.md` says what this protects from. Loads no Hydra by itself.
 
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import GrammarParseError
-from omegaconf.grammar_parser import parse
 
+from gsbench.config.interpolations import check_texts
 from gsbench.config.permissions import (
     PACKAGE,
     check_target,
@@ -27,8 +26,6 @@ from gsbench.config.programs import (
     check_launch,
     check_program,
     is_external,
-    is_readable,
-    reading,
 )
 from gsbench.errors import InputError
 from gsbench.runs.nested import TARGET, entries_of, targets_in
@@ -79,13 +76,6 @@ LOGGING_TEXTS = ("level", "format", "datefmt", "style", "handlers", "formatter")
 FREE_TEXTS = ("ext://sys.stdout", "ext://sys.stderr", "auto", "local")
 # parts of a sweeper that are words of its jobs, checked as such
 SWEPT_TEXTS = ("params", "grids", "search_space")
-# Resolvers that make only texts and numbers. Resolvers that turn texts into mappings (oc.create,
-# oc.decode, oc.dict) could create a `_target_` after the check; resolvers of plug-ins could do
-# anything.
-RESOLVERS = ("hydra", "now", "oc.env", "oc.select", "python_version")
-# Hydra 1.4's own values, whose resolvers join the words of a job. With arguments they would call
-# other resolvers.
-HYDRAS_VALUES = ("${hydra_override_dirname:}", "${hydra_deprecated_override_dirname:}")
 # Classes of this form are not imported for the check, since an import may take seconds.
 PUBLIC_CLASS = re.compile(rf"{PACKAGE}\.\w+\.[A-Z]\w*")
 # Settings that a sweep in a file may not vary: its jobs are composed after the check of the whole
@@ -142,9 +132,8 @@ def check_composed(
         foreign = {name: _differing(raw["hydra"][name], installed.get(name)) for name in MADE_NODES}
         raw["hydra"] = raw["hydra"] | foreign
         _check_hydra(raw["hydra"], allowed)
-    for place, key, value in entries_of(raw):
-        if isinstance(value, str) and "${" in value:
-            _check_interpolation(place, key, value, allowed)
+    check_texts(raw, allowed)
+    for place, key, _ in entries_of(raw):
         if key in SPECIAL_KEYS:  # `_partial_` makes a function of anything, to be called later
             raise InputError(
                 f"{'.'.join((*place, key))}: gsbench makes no objects this way: leave it out"
@@ -184,49 +173,6 @@ def _differing(given: Any, installed: Any) -> Any:
         if key not in installed or value != installed[key]
     }
     return {key: _differing(value, installed.get(key)) for key, value in differing.items()}
-
-
-def _check_interpolation(
-    place: tuple[str, ...], key: str, value: str, allowed: Sequence[str]
-) -> None:
-    where = ".".join((*place, key))
-    if place == ("hydra", "job") and value in HYDRAS_VALUES:
-        return
-    if key.startswith("_") and key.endswith("_"):  # the checked name would not be the imported one
-        raise InputError(
-            f"{where}={value}: write the name itself here, since ${{…}} may become another"
-        )
-    try:
-        calls = list(_calls(parse(value)))
-    # OmegaConf cannot resolve it either, and says so when the value is read
-    except GrammarParseError:
-        return
-    for name, first in calls:
-        if name not in RESOLVERS:
-            raise InputError(
-                f"{where}={value}: ${{{name}:…}} is not resolved here, only {', '.join(RESOLVERS)}"
-            )
-        # Its value would stand in results, archives and trackers, where others read it.
-        if name == "oc.env" and not is_readable(first, allowed):
-            advice = permission_advice([reading(first)], allowed)
-            raise InputError(
-                f"{where}={value} reads the variable {first}, which may be secret; if you want "
-                f"its value in results, {advice}"
-            )
-
-
-def _calls(tree: Any) -> Iterator[tuple[str, str]]:
-    """The resolvers in a parsed text, each with its first argument.
-
-    What is itself an interpolation is yielded as written.
-    """
-    parts = list(getattr(tree, "children", None) or [])
-    for name, *rest in (parts[k:] for k in range(len(parts))):
-        if type(name).__name__ == "ResolverNameContext":
-            listed = [part for part in rest if type(part).__name__ == "SequenceContext"]
-            first = listed[0].getChild(0).getText() if listed else ""
-            yield name.getText(), first.strip().strip("'\"")
-        yield from _calls(name)
 
 
 def _check_place(place: tuple[str, ...], target: Any, allowed: Sequence[str]) -> None:

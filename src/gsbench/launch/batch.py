@@ -99,7 +99,7 @@ def _why_not_done(trial: Trial) -> Change | None:
 def missing_folders(trials: Sequence[Trial]) -> list[str]:
     """A line for each missing folder of photographs, model or weights, and where to get them."""
     from gsbench.datasets.catalog import how_to_get
-    from gsbench.scene.model_folders import missing_model
+    from gsbench.scene.colmap_files import missing_model
     from gsbench.scene.readers import missing_folder
 
     missing: list[tuple[str, Path]] = []

@@ -26,7 +26,7 @@ from gsbench.runs.experiments import metric_and_question
 from gsbench.runs.nested import GSBENCH, TARGET, targets_in
 from gsbench.runs.user_code import UserCode, user_modules
 from gsbench.scene.options import SceneConfig
-from gsbench.scene.own_reader import SceneReader
+from gsbench.scene.record import SceneReader
 from gsbench.system.device import select_device
 from gsbench.system.resources import available_threads
 from gsbench.train.options import TrainConfig

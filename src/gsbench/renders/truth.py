@@ -16,7 +16,7 @@ from gsbench.runs.layout import GROUND_TRUTH, MASKS, RENDERS, RESULTS, STORE
 from gsbench.runs.store import Store
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.scene.images import image_size, list_images, png_name
-from gsbench.scene.readers import fingerprint
+from gsbench.scene.pipe import fingerprint
 from gsbench.view.trials import find_trial
 from gsbench.words import did_you_mean
 

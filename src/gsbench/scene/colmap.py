@@ -2,7 +2,7 @@
 
 import codecs
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 from gsbench.errors import InputError
 from gsbench.normalization import IDENTITY, Normalization
 from gsbench.parsing import without_byte_order_mark
+from gsbench.scene.colmap_checks import PARAMETERS as PARAMETERS
 from gsbench.scene.colmap_files import check_model, model_files, text_names
 from gsbench.scene.distortion import without_distortion
-from gsbench.scene.images import check_size, image_size, match_names
+from gsbench.scene.images import check_size, image_size
+from gsbench.scene.names import match_anywhere
 from gsbench.scene.types import Array, Camera, CameraModel, Capture, to_pinhole
 
 Cloud = tuple[Array, NDArray[np.uint8]]  # positions [P, 3] in world units, colours [P, 3]
@@ -74,9 +76,23 @@ def _normalize_quaternions(model: pycolmap.Reconstruction) -> None:
             frame.rig_from_world.rotation.normalize()
 
 
-def registered_names(model: pycolmap.Reconstruction) -> list[str]:
-    """The sorted names of the images that have a pose."""
-    return sorted(image.name for image in model.images.values() if image.has_pose)
+def posed_by_name(
+    model: pycolmap.Reconstruction,
+) -> dict[str, tuple[CameraModel, Array, Array]]:
+    """Camera, rotation [3, 3] and translation [3] of the images that have a pose, by name."""
+    cameras = {
+        number: CameraModel(
+            camera.model_name, camera.width, camera.height, tuple(map(float, camera.params))
+        )
+        for number, camera in model.cameras.items()
+    }
+    found = {}
+    for image in model.images.values():
+        if image.has_pose:
+            pose = image.cam_from_world()
+            rotation, translation = pose.rotation.matrix(), np.array(pose.translation)
+            found[image.name] = cameras[image.camera_id], rotation, translation
+    return found
 
 
 def camera_centers(model: pycolmap.Reconstruction) -> Array:
@@ -137,7 +153,8 @@ def read_reference(capture: Capture) -> pycolmap.Reconstruction:
             "init.poses=own"
         )
     model = read_model(capture.model)
-    names = match_names(registered_names(model), capture.image_names, other_folders=True)
+    posed = sorted(image.name for image in model.images.values() if image.has_pose)
+    names = match_anywhere(posed, capture.image_names)
     fitted = pycolmap.Reconstruction()
     # The files of one camera may have several sizes, for example if some were shrunk. Then each
     # size gets a camera, and the first one keeps the id.
@@ -220,23 +237,6 @@ def pinhole_camera(camera: pycolmap.Camera, cam_from_world: pycolmap.Rigid3d) ->
         )
     rotation, translation = cam_from_world.rotation.matrix(), np.array(cam_from_world.translation)
     return replace(to_pinhole(plain), rotation=rotation, translation=translation)
-
-
-def reference_cameras(model: pycolmap.Reconstruction, names: Iterable[str]) -> list[Camera]:
-    """Cameras with the poses of the images ``names``, without distortion or principal points.
-
-    They tell where cameras are and in which direction they look. They are not for rendering.
-    """
-    cameras = []
-    for name in names:
-        image = model.find_image_with_name(name)
-        camera, pose = model.cameras[image.camera_id], image.cam_from_world()
-        size, focal = (camera.width, camera.height), camera.mean_focal_length()
-        intrinsics = (focal, focal, camera.width / 2, camera.height / 2)
-        cameras.append(
-            Camera(*size, *intrinsics, pose.rotation.matrix(), np.array(pose.translation))
-        )
-    return cameras
 
 
 def model_points(model: pycolmap.Reconstruction) -> Cloud:

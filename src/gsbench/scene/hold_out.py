@@ -12,7 +12,7 @@ import numpy as np
 
 from gsbench.errors import InputError
 from gsbench.scene.options import MIN_IMAGES, TEST_EVERY, SplitRule
-from gsbench.scene.types import Array, Camera
+from gsbench.scene.types import Array, Camera, CameraModel
 from gsbench.words import counted, some_of
 
 # degrees: cameras with a wider gap between azimuths are on one side of the scene
@@ -23,6 +23,12 @@ FACING = 0.9  # share of the cameras that must look towards the centre
 PARALLEL = 1e-3
 # decimals of a degree to which azimuths are rounded, so that all processors agree on ties
 AZIMUTH_DECIMALS = 6
+
+
+def reference_camera(camera: CameraModel, rotation: Array, translation: Array) -> Camera:
+    """A camera that tells where it is and in which direction it looks; not for rendering."""
+    width, height = camera.width, camera.height
+    return Camera(width, height, width, width, width / 2, height / 2, rotation, translation)
 
 
 @dataclass(frozen=True)

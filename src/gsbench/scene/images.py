@@ -7,10 +7,9 @@ the stored pixels.
 import logging
 import os
 import sys
-import unicodedata
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Iterable
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -19,6 +18,7 @@ from PIL import Image, UnidentifiedImageError
 
 from gsbench.errors import InputError
 from gsbench.files import MAX_NAME_BYTES, require_regular
+from gsbench.scene.names import IMAGE_SUFFIXES
 from gsbench.scene.options import Backdrop
 from gsbench.words import counted, is_one_line, some_of
 
@@ -26,7 +26,6 @@ log = logging.getLogger(__name__)
 
 Resample = Literal["lanczos", "area", "bicubic"]
 
-IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"})
 # photographs and videos that are not read, and how they are called
 NOT_READ = dict.fromkeys((".heic", ".heif"), "HEIC") | {".avif": "AVIF", ".jxl": "JPEG XL"}
 NOT_READ |= dict.fromkeys((".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"), "raw")
@@ -43,7 +42,6 @@ _FILTERS = {
 }
 _SIXTEEN_BIT_MODES = ("I;16", "I;16L", "I;16B", "I;16N")
 _WIDE_MODES = ("I", "F")  # 32-bit integers and floats, which have no agreed value for white
-WHOLE = 0  # all parts of a path
 
 
 def list_images(folder: Path) -> list[str]:
@@ -99,85 +97,6 @@ def _entries(folder: Path) -> list[os.DirEntry[str]]:
             return list(entries)
     except PermissionError:  # treated as an empty folder
         return []
-
-
-def match_names(
-    wanted: Iterable[str], files: Iterable[str], other_folders: bool = False
-) -> dict[str, str]:
-    """Map each wanted image name to its file; names without a file are left out.
-
-    A file of the same name comes first, then the only file whose path differs in the extension
-    alone (``a.png`` for ``a.JPG``), then the only one that differs in capitals too (``IMG_1.JPG``
-    for ``img_1.jpg``). Names that Unicode counts as equal are equal. With ``other_folders``, if no
-    file fits any name, names and files are compared by the last parts of their paths, as many as
-    give a match (``b/a.jpg`` for ``C:\\data\\b\\a.jpg``). Raises `InputError` if several such files
-    fit a name, or if several names fit such a file.
-    """
-    names, found = list(dict.fromkeys(wanted)), set(files)
-    matches = _matched(names, found, WHOLE)
-    longest = max((len(_parts(name)) for name in names), default=0)
-    for count in range(longest if other_folders else 0, 0, -1):
-        if not matches:
-            matches = _matched(names, found, count)
-    return matches
-
-
-def _parts(path: str) -> list[str]:
-    return path.replace("\\", "/").split("/")
-
-
-def _matched(wanted: Iterable[str], files: Iterable[str], count: int) -> dict[str, str]:
-    """`match_names` by the last ``count`` parts of each path."""
-
-    def tail(path: str) -> str:
-        # macOS writes é as two characters (NFD) where most programs write one (NFC)
-        path = unicodedata.normalize("NFC", path)
-        return path if count == WHOLE else "/".join(_parts(path)[-count:])
-
-    unmatched, free = dict.fromkeys(wanted), set(files)
-    matches = {name: name for name in unmatched if name in free}
-    for key_of in (
-        tail,
-        lambda path: stem_of(tail(path)),
-        lambda path: tail(path).casefold(),
-        lambda path: stem_of(tail(path)).casefold(),
-    ):
-        # Better matches come first and take their files, so that no name is matched to the file of
-        # another name.
-        free -= set(matches.values())
-        by_key: dict[str, list[str]] = defaultdict(list)
-        for file in free:
-            by_key[key_of(file)].append(file)
-        names_by_key: dict[str, list[str]] = defaultdict(list)
-        for name in unmatched:
-            if name not in matches and key_of(name) in by_key:
-                names_by_key[key_of(name)].append(name)
-        for key, names in names_by_key.items():
-            found = sorted(by_key[key])
-            if len(found) > 1:
-                raise InputError(
-                    f"{names[0]} may be {' or '.join(found)}: keep one of these files, or name "
-                    "one exactly"
-                )
-            if len(names) > 1:
-                raise InputError(
-                    f"{found[0]} may be {' or '.join(sorted(names))}: give each image a file of "
-                    "its own"
-                )
-            matches[names[0]] = found[0]
-    return matches
-
-
-def same_folder(one: str, other: str) -> bool:
-    """Return whether two names have the same folder, up to capitals."""
-    one, other = (unicodedata.normalize("NFC", name) for name in (one, other))
-    return _parts(one)[:-1] == _parts(other)[:-1] or one.casefold() == other.casefold()
-
-
-def stem_of(name: str) -> str:
-    """The path of an image without its extension."""
-    path = PurePosixPath(name)
-    return (path.with_suffix("") if path.suffix.lower() in IMAGE_SUFFIXES else path).as_posix()
 
 
 def check_picture_names(names: Iterable[str], folder: Path) -> None:

@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from gsbench.errors import InputError
-from gsbench.scene.images import image_size, open_image, read_image, write_png
+from gsbench.scene.images import image_size, list_images, open_image, read_image, write_png
+from gsbench.scene.names import match
 from gsbench.scene.options import Backdrop
+from gsbench.scene.record import Photograph
 from gsbench.words import some_of
 
 Mask = NDArray[np.bool_]  # [H, W], True where a pixel counts
@@ -29,27 +31,30 @@ MAX_GREY_SHARE = 0.05
 NEARLY_ONE = 1 - 1e-6  # a mean of ones in float32 may round to less than 1
 
 
-def find_masks(folder: Path, images: Path, names: Sequence[str]) -> dict[str, Path]:
-    """The mask file in ``folder`` of each image, as COLMAP names it: ``b.jpg.png`` for ``b.jpg``.
+def find_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
+    """The mask file in ``folder`` of each image: ``b.jpg.png`` (COLMAP's) or ``b.png``.
 
-    ``names`` are paths below ``images``, the folder of the images. Raises InputError naming the
-    images without a mask, or for a mask that is not an image or differs in size from its
-    photograph.
+    Raises InputError naming the images without a mask.
     """
-    masks = {name: folder / f"{name}{SUFFIX}" for name in names}
-    if missing := [name for name, mask in masks.items() if not mask.is_file()]:
+    found = {name: f"{name}{SUFFIX}" for name in names if (folder / f"{name}{SUFFIX}").is_file()}
+    if missing := [name for name in names if name not in found]:
+        found |= match(missing, list_images(folder))
+    if missing := [name for name in names if name not in found]:
         raise InputError(
             f"scene.masks: no mask of {some_of(missing)} in {folder}: add {missing[0]}{SUFFIX} "
             "(all white where every pixel counts)"
         )
-    for name, mask in masks.items():
-        size, wanted = image_size(mask), image_size(images / name)
-        if size != wanted:
+    return {name: folder / found[name] for name in names}
+
+
+def check_masks(rows: Sequence[Photograph]) -> None:
+    """Raise InputError for a mask that is no image, or not of its photograph's size."""
+    for row in rows:
+        if row.mask is not None and (size := image_size(row.mask)) != row.size:
             raise InputError(
-                f"{mask}: the mask is {size[0]}x{size[1]} px and its image {name} "
-                f"{wanted[0]}x{wanted[1]}: give masks of the images' size"
+                f"{row.mask}: the mask is {size[0]}x{size[1]} px and its image {row.name} "
+                f"{row.size[0]}x{row.size[1]}: give masks of the images' size"
             )
-    return masks
 
 
 def read_mask(path: Path) -> Mask:

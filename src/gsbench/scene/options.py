@@ -17,6 +17,7 @@ from gsbench.settings import (
     check_settings,
     is_folder_name,
 )
+from gsbench.words import counted
 
 MAX_IMAGES = 200  # the paper's limit per scene
 MIN_IMAGES = 3  # with two views, no third one can reveal a wrong geometry
@@ -62,6 +63,15 @@ def check_final_size(
         raise InputError(
             f"scene.downscale={downscale}{limit} leaves {width}x{height} px of {what} "
             f"({size[0]}x{size[1]} px): at least {MIN_SIZE} px are needed"
+        )
+
+
+def require_enough(count: int, folder: Path, which: str, remedy: str = "") -> None:
+    """Raise InputError for fewer than three photographs."""
+    if count < MIN_IMAGES:
+        raise InputError(
+            f"{folder}: {counted(count, 'image')} {which}, but at least {MIN_IMAGES} are needed"
+            + (f": {remedy}" if remedy else "")
         )
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Collection
-from dataclasses import dataclass, fields
+from dataclasses import fields, replace
 from functools import cached_property
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
@@ -28,12 +28,13 @@ from gsbench.parsing import (
     resolved,
     text_of,
 )
-from gsbench.scene.images import IMAGE_SUFFIXES, list_images, match_names, stem_of
-from gsbench.scene.options import Backdrop
+from gsbench.scene.images import list_images
+from gsbench.scene.names import IMAGE_SUFFIXES, match, stem_of
+from gsbench.scene.options import Backdrop, require_enough
+from gsbench.scene.record import Photograph, PointsFile, RawCapture, Role
 from gsbench.scene.transforms_cameras import (
     AppliedTransform,
     FrameRecord,
-    PosedCamera,
     TransformsRecord,
     applied_transform_of,
     camera_of,
@@ -51,31 +52,7 @@ SPLIT_FILES = {
     "test": "transforms_test.json",
     "val": "transforms_val.json",
 }
-
-
-@dataclass(frozen=True)
-class Transforms:
-    """Converted content of a folder's files: cameras by image name, their split, and their points.
-
-    ``split`` are the names for training and for testing, or None if one file holds all images.
-    ``points`` is a PLY file; ``applied_to_points.undo`` converts its coordinates to those of the
-    cameras. ``has_mask_paths`` says that at least one image names a mask. ``missing`` are the
-    images without a file, and ``remedy`` says where files with such names lie.
-    """
-
-    files: tuple[Path, ...]
-    images: dict[str, PosedCamera]
-    split: tuple[list[str], list[str]] | None
-    points: Path | None
-    applied_to_points: AppliedTransform
-    has_mask_paths: bool
-    missing: tuple[str, ...] = ()
-    remedy: str = ""
-
-    @property
-    def sources(self) -> tuple[Path, ...]:
-        """The files that cameras and points are read from."""
-        return (*self.files, *(() if self.points is None else (self.points,)))
+SPLIT_ROLES: dict[str, Role] = {"": "", "train": "train", "test": "test", "val": "test"}
 
 
 def find_files(folder: Path) -> dict[str, Path]:
@@ -104,7 +81,7 @@ def find_files(folder: Path) -> dict[str, Path]:
 
 def read_transforms(
     folder: Path, backdrop: Backdrop = "black", image_folder: str | None = None
-) -> Transforms:
+) -> RawCapture:
     """Read the cameras in ``folder``; raises InputError for a file that cannot be understood.
 
     ``backdrop`` is the colour under transparent pixels. ``image_folder`` replaces the folder that
@@ -114,9 +91,8 @@ def read_transforms(
     files = find_files(folder)
     records = {split: _read_record(path, backdrop) for split, path in files.items()}
     find = _FileFinder(folder, image_folder)
-    images: dict[str, PosedCamera] = {}
-    names: dict[str, list[str]] = {split: [] for split in files}
-    points, applied_to_points = None, AppliedTransform()
+    rows: dict[str, Photograph] = {}
+    points: PointsFile | None = None
     all_missing: list[str] = []
     for split, record in records.items():
         path, missing = files[split], []
@@ -126,42 +102,63 @@ def read_transforms(
             if name is None:
                 missing.append(frame.file_path)
                 continue
-            if name in images:
+            if name in rows:
                 raise InputError(f"{path}: {name} is there twice: name each image once")
             camera = camera_of(folder / name, path, record, frame)
-            if not names[split]:
+            if not any(row.role == SPLIT_ROLES[split] for row in rows.values()):
                 report_contradictions(path, record, camera)
-            images[name] = camera, *pose_of(path, frame, applied)
-            names[split].append(name)
+            rows[name] = Photograph(
+                name,
+                folder / name,
+                camera,
+                *pose_of(path, frame, applied),
+                mask=_beside(path, frame.mask_path),
+                depth=_beside(path, frame.depth_file_path),
+                role=SPLIT_ROLES[split],
+            )
         if missing:
             share = f"{len(missing)} of {len(record.frames)}"
             log.warning("%s: %s images have no file: %s", path, share, some_of(missing))
             all_missing += missing
-        if record.ply_file_path is not None:
-            named = folder / _relative_path(path, record.ply_file_path)
-            if points not in (None, named):
-                raise InputError(f"{path} names other points than another file: keep one of them")
-            # They lie in one place, so only one of two transforms can be theirs.
-            if points is not None and not applied.equals(applied_to_points):
-                raise InputError(
-                    f"{path} names the same points as another file, whose applied_transform or "
-                    "applied_scale differs: keep ply_file_path in the file that they belong to"
-                )
-            points, applied_to_points = named, applied
-            if not points.is_file():
-                raise InputError(f"{path} names {record.ply_file_path}, which is not there")
-    own_lists = _named_split(files[""], records[""], images, find) if "" in files else None
-    held_out = next((sorted(names[split]) for split in ("test", "val") if split in files), None)
-    return Transforms(
-        tuple(files.values()),
-        dict(sorted(images.items())),
-        own_lists if held_out is None else (sorted(names["train"]), held_out),
-        points,
-        applied_to_points,
-        any(frame.mask_path for record in records.values() for frame in record.frames),
-        tuple(all_missing),
+        points = _points(path, record, applied, points)
+    lacking = f", while {some_of(all_missing)} have no file" if all_missing else ""
+    first = next(iter(files.values()))
+    require_enough(
+        len(rows),
+        folder,
+        f"with a file and a camera in {first.name}{lacking}",
         find.remedy(all_missing),
     )
+    if "" in files:
+        roles = _named_split(files[""], records[""], rows, find)
+        rows = {name: replace(row, role=roles.get(name, row.role)) for name, row in rows.items()}
+    elif len(files) == 1:
+        rows = {name: replace(row, role="") for name, row in rows.items()}
+    read_from = (*files.values(), *(() if points is None else (points.path,)))
+    return RawCapture(folder, tuple(rows[name] for name in sorted(rows)), points, read_from)
+
+
+def _beside(path: Path, written: str | None) -> Path | None:
+    """The file that a frame names beside its photograph."""
+    return None if written is None else path.parent / _relative_path(path, written)
+
+
+def _points(
+    path: Path, record: TransformsRecord, applied: AppliedTransform, known: PointsFile | None
+) -> PointsFile | None:
+    """The points that the file ``path`` names, or those ``known`` from an earlier one."""
+    if record.ply_file_path is None:
+        return known
+    found = PointsFile(path.parent / _relative_path(path, record.ply_file_path), applied)
+    # Points lie in one place, so only one of two transforms can be theirs.
+    if known is not None and not (known.path == found.path and known.applied.equals(applied)):
+        raise InputError(
+            f"{path} names other points than another file, or the same points with another "
+            "applied_transform or applied_scale: keep ply_file_path in the file that they belong to"
+        )
+    if not found.path.is_file():
+        raise InputError(f"{path} names {record.ply_file_path}, which is not there")
+    return found
 
 
 def _relative_path(path: Path, written: str) -> PurePosixPath:
@@ -193,7 +190,7 @@ def names_of(kind: Any) -> frozenset[str]:
 
 
 class _FileFinder:
-    """Finds the image that ``file_path`` names, as for COLMAP models (`match_names`)."""
+    """Finds the image that ``file_path`` names, as for COLMAP models (`match`)."""
 
     def __init__(self, folder: Path, image_folder: str | None = None) -> None:
         self.folder, self.image_folder = folder, image_folder
@@ -215,7 +212,7 @@ class _FileFinder:
         if relative.suffix.lower() in IMAGE_SUFFIXES and (self.folder / relative).is_file():
             return relative.as_posix()
         try:
-            return match_names([relative.as_posix()], self._files).get(relative.as_posix())
+            return match([relative.as_posix()], self._files).get(relative.as_posix())
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
 
@@ -235,17 +232,15 @@ class _FileFinder:
 
 def _named_split(
     path: Path, record: TransformsRecord, images: Collection[str], find: _FileFinder
-) -> tuple[list[str], list[str]] | None:
-    """nerfstudio's lists: names to train on, and to test on or, without these, to validate on."""
-    train, val, test = record.train_filenames, record.val_filenames, record.test_filenames
-    held_out = test or val
+) -> dict[str, Role]:
+    """The roles by nerfstudio's lists: names to train on, and to test or else to validate on."""
+    train, held_out = record.train_filenames, record.test_filenames or record.val_filenames
     if not held_out:
-        return None
-    written = {"train": train or [], "held-out": held_out}
-    chosen = {}
-    for which, listed in written.items():
+        return {}
+    chosen: dict[str, set[str]] = {}
+    for which, listed in (("train", train or []), ("held-out", held_out)):
         wanted = [find.place(path, name).as_posix() for name in listed]
-        matches = match_names(wanted, images)
+        matches = match(wanted, images)
         if missing := [name for name in wanted if name not in matches]:
             raise InputError(
                 f"{path}: its {which} filenames name {some_of(missing)}, which is no frame with a "
@@ -257,5 +252,8 @@ def _named_split(
             f"{path}: {some_of(both)} would be trained and tested on: correct its lists of "
             "filenames"
         )
-    kept = chosen["train"] if train is not None else set(images) - chosen["held-out"]
-    return sorted(kept), sorted(chosen["held-out"])
+    others: Role = "train" if train is None else "unused"
+    roles = dict.fromkeys(images, others)
+    roles.update((name, "train") for name in chosen["train"])
+    roles.update((name, "test") for name in chosen["held-out"])
+    return roles

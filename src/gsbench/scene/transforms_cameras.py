@@ -15,7 +15,7 @@ from annotated_types import Len
 from gsbench.errors import InputError
 from gsbench.parsing import Number, Record, Text
 from gsbench.scene.images import image_size
-from gsbench.scene.types import Array, CameraModel
+from gsbench.scene.types import ROTATION_TOLERANCE, Array, CameraModel, nearest_rotation
 
 log = logging.getLogger(__name__)
 Row = Annotated[list[Number], Len(4, 4)]
@@ -23,9 +23,6 @@ Optional = Number | None
 Matrix = Annotated[list[Row], Len(3, 4)]  # a fourth row must be `LAST_ROW`
 LAST_ROW = [0.0, 0.0, 0.0, 1.0]
 OPENGL = np.diag([1.0, -1.0, -1.0])  # from OpenCV's camera axes to OpenGL's, and back
-# camera model, world-to-camera rotation [3, 3] and translation [3]
-PosedCamera = tuple[CameraModel, Array, Array]
-ROTATION_TOLERANCE = 1e-3  # largest error of an entry, for matrices written with few digits
 PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 FISHEYE = "OPENCV_FISHEYE"
 FOCAL_KEYS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov")
@@ -69,6 +66,7 @@ class FrameRecord(Intrinsics):
     file_path: Text
     transform_matrix: Matrix
     mask_path: Text | None = None
+    depth_file_path: Text | None = None
 
 
 class TransformsRecord(Intrinsics):
@@ -122,16 +120,6 @@ def _three_rows(matrix: Matrix, what: str) -> Array:
         raise InputError(f"{what} must end with the row 0, 0, 0, 1: transpose it if it has columns")
     rows: Array = np.array(matrix[:3])
     return rows
-
-
-def nearest_rotation(matrix: Array, what: str) -> Array:
-    """The rotation nearest to ``matrix`` [3, 3]; raises InputError if that is far from it."""
-    # U V^T of the singular value decomposition is the nearest orthogonal matrix (Schönemann 1966).
-    left, _, right = np.linalg.svd(matrix)
-    nearest: Array = left @ right
-    if np.abs(nearest - matrix).max() > ROTATION_TOLERANCE or np.linalg.det(matrix) < 0.0:
-        raise InputError(f"{what} must only rotate and move, but it scales, shears or mirrors")
-    return nearest
 
 
 def pose_of(path: Path, frame: FrameRecord, applied: AppliedTransform) -> tuple[Array, Array]:

@@ -25,7 +25,6 @@ BOX = ("aabb", "aabb_scale", "render_aabb", "near", "far")
 AXES = ("scale", "offset", "up", "from_na", "orientation_override")
 # Data besides photographs, which gsbench does not train on.
 DEPTH = (
-    "depth_file_path",
     "depth_path",
     "integer_depth_scale",
     "enable_depth_loading",

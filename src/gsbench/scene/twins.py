@@ -16,8 +16,8 @@ from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.files import file_sha256
-from gsbench.scene.images import stem_of
 from gsbench.scene.masks import resize_mask
+from gsbench.scene.names import stem_of
 from gsbench.scene.types import Scene, Twins, View
 from gsbench.words import counted, some_of
 

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from gsbench.errors import InputError
 from gsbench.normalization import IDENTITY, Normalization
 
 Array = NDArray[np.float64]
@@ -130,7 +131,8 @@ class Capture:
     ``test_names`` are the held-out ones. ``held_out`` describes in words how they were chosen.
     ``model`` is a COLMAP sparse folder with reference cameras, or None for bare photographs;
     ``exact_poses`` says that its poses are the truth (a procedural scene), not an estimate.
-    ``masks`` are mask files by image name; it is empty if every pixel counts. ``fingerprint`` is a
+    ``masks`` are mask files by image name; it is empty if every pixel counts. ``depths`` are depth
+    maps and ``more`` other files of a photograph by kind, by image name. ``fingerprint`` is a
     sha256 over names and contents of the selected images, their masks and the model. ``read_from``
     are further files of the user that the cameras were read from. ``advised_normalization`` maps
     the given coordinates to those in which the scene should be trained
@@ -148,6 +150,8 @@ class Capture:
     fingerprint: str
     held_out: str = ""
     masks: Mapping[str, Path] = field(default_factory=dict)
+    depths: Mapping[str, Path] = field(default_factory=dict)
+    more: Mapping[str, Mapping[str, Path]] = field(default_factory=dict)
     read_from: tuple[Path, ...] = ()
     advised_normalization: Normalization = IDENTITY
     normalization: Normalization = IDENTITY
@@ -191,6 +195,19 @@ class Scene:
     def extent(self) -> float:
         """3DGS's ``cameras_extent`` of the training cameras, in world units."""
         return extent_of_centers(np.stack([view.camera.center for view in self.train]))
+
+
+ROTATION_TOLERANCE = 1e-3  # largest error of an entry, for matrices written with few digits
+
+
+def nearest_rotation(matrix: Array, what: str) -> Array:
+    """The rotation nearest to ``matrix`` [3, 3]; raises InputError if that is far from it."""
+    # U V^T of the singular value decomposition is the nearest orthogonal matrix (Schönemann 1966).
+    left, _, right = np.linalg.svd(matrix)
+    nearest: Array = left @ right
+    if np.abs(nearest - matrix).max() > ROTATION_TOLERANCE or np.linalg.det(matrix) < 0.0:
+        raise InputError(f"{what} must only rotate and move, but it scales, shears or mirrors")
+    return nearest
 
 
 def extent_of_centers(centers: NDArray[np.float64]) -> float:

@@ -9,7 +9,7 @@ from gsbench.app.hydra_main import run_main
 from gsbench.config.command_words import check_single, typed_permissions
 from gsbench.config.compose import Composer
 from gsbench.config.overrides import parse_word
-from gsbench.config.search_path import check_search_path, search_path
+from gsbench.config.search_path import check_search_path, search_path, search_places
 from gsbench.errors import InputError
 from gsbench.verbs.arguments import ArgumentParser
 
@@ -60,13 +60,15 @@ def ask_hydra(argv: list[str]) -> int:
 
 
 def _check_typed(line: str) -> None:
-    """Refuse to complete a line that makes Hydra import a package which the line does not allow."""
+    """Refuse to complete a line that makes Hydra read what the line does not allow."""
     words = []
     for word in line.split():
         with suppress(InputError):  # a half-typed word
             parse_word(word)
             words.append(word)
     check_search_path(words, typed_permissions(words))
+    if search_places(words):
+        Composer([word for word in words if word != line.split()[-1]])
 
 
 def _parser() -> ArgumentParser:

@@ -24,9 +24,9 @@ from gsbench.runs.keys import INIT, Step
 from gsbench.runs.store import Store
 from gsbench.scene.masks import read_mask
 from gsbench.scene.options import SceneConfig
-from gsbench.scene.readers import read_photos
 from gsbench.scene.types import Capture
 from tests.helpers import refusal
+from tests.scene.captures import read_photos
 
 
 @pytest.fixture

@@ -1,6 +1,7 @@
 """The procedural courtyard: repeatable, consistent between views, and not blank."""
 
 import filecmp
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,9 +16,9 @@ from gsbench.scene.courtyard.render import (
     ring_camera,
 )
 from gsbench.scene.load import load_scene
-from gsbench.scene.readers import read_colmap
 from tests.helpers import refusal
 from tests.scene.cameras import cameras_of
+from tests.scene.captures import read_colmap
 from tests.scene.courtyard.surfaces import fingerprint, surface_distance
 
 
@@ -50,7 +51,7 @@ def test_the_colmap_model_has_the_exact_cameras(capture_dir, tmp_path):
         assert_allclose(written[name].rotation, camera.rotation, atol=1e-12)
         assert_allclose(written[name].translation, camera.translation, atol=1e-12)
         assert (written[name].fx, written[name].cx, written[name].cy) == (camera.fx, 80, 60)
-    capture = read_colmap("courtyard", capture_dir, exact_poses=True)
+    capture = replace(read_colmap("courtyard", capture_dir), exact_poses=True)
     assert len(load_scene(capture, capture.model, tmp_path).train) == 3
 
 

@@ -24,24 +24,16 @@ from gsbench.runs.nested import sha256_of
 from gsbench.runs.package_code import edited, states_of
 from gsbench.runs.store import Store
 from gsbench.runs.user_code import NO_USER_CODE, UserCode
-from gsbench.scene.colmap import normalize_capture, write_frames
+from gsbench.scene.colmap import Cloud, normalize_capture, write_frames
+from gsbench.scene.colmap_files import SPARSE_FOLDERS
 from gsbench.scene.courtyard.render import render_courtyard
-from gsbench.scene.images import image_size, png_name, read_image
+from gsbench.scene.images import png_name, read_image
 from gsbench.scene.load import load_scene
 from gsbench.scene.masks import IMAGES, prepare_photograph, prepared_mask, write_mask
-from gsbench.scene.model_folders import SPARSE_FOLDERS, require_subfolder
-from gsbench.scene.options import Backdrop, SceneConfig, check_final_size
-from gsbench.scene.own_reader import PosedImages, SceneReader, read_posed_images
-from gsbench.scene.readers import (
-    existing_folder,
-    fingerprint,
-    read_colmap,
-    read_photos,
-    read_posed,
-    read_transforms,
-)
-from gsbench.scene.transforms import Transforms
-from gsbench.scene.transforms import read_transforms as read_transforms_files
+from gsbench.scene.options import Backdrop, SceneConfig
+from gsbench.scene.pipe import fingerprint, prepare
+from gsbench.scene.readers import existing_folder, read_raw
+from gsbench.scene.record import PointsFile, RawCapture, SceneReader
 from gsbench.scene.twins import without_copies
 from gsbench.scene.types import Capture, Scene, View
 from gsbench.system.install import version_of
@@ -57,62 +49,39 @@ class CaptureSource:
         reader: SceneReader | None = None,
         user: UserCode = NO_USER_CODE,
     ) -> None:
-        self.options, self.name = options, str(options.name)
-        self._reader, self._user = reader, user
+        self.options, self._reader, self._user = options, reader, user
 
     @cached_property
     def step(self) -> Step | None:
-        """The step that makes the photographs, or a COLMAP model of cameras from other files.
+        """The step that makes the photographs, or a COLMAP model of their cameras.
 
-        None for a scene whose folder can be read directly.
+        None for photographs without cameras, or whose model can be used as it is.
         """
-        if self.options.kind == "transforms":
-            return _transforms_step(self._transforms)
+        if self.options.kind == "courtyard":
+            return _courtyard_step(self.options)
+        if self._raw.model is not None or not self._raw.has_cameras:
+            return None
+        reader = None
         if self._reader is not None:
-            return _reader_step(self._posed, options_of("scene", self._reader, self._user))
-        return _courtyard_step(self.options) if self.options.kind == "courtyard" else None
+            reader = options_of("scene", self._reader, self._user)
+        return _cameras_step(self._raw, reader)
 
     def read(self, made: Path | None) -> Capture:
         """The photographs, selected and split; ``made`` is the folder that ``step`` filled."""
-        options = self.options
-        selection: dict[str, Any] = {"max_images": options.max_images, "split": options.split_rule}
-        if options.kind == "courtyard":
+        if self.options.kind == "courtyard":
             assert made is not None
-            return read_colmap(self.name, made, exact_poses=True, **selection)
-        path, selection["masks"] = str(options.path), options.masks
-        if made is not None:
-            model = made / SPARSE_FOLDERS[0]
-            if options.kind == "transforms":
-                capture = read_transforms(self.name, path, self._transforms, model, **selection)
-            else:
-                capture = read_posed(self.name, self._folder, self._posed, model, **selection)
-        elif options.kind == "photos":
-            capture = read_photos(self.name, path, images=options.images, **selection)
-        else:
-            capture = read_colmap(
-                self.name, path, images=options.images, sparse=options.sparse, **selection
-            )
-        for name in capture.image_names:
-            file = capture.images / name
-            check_final_size(image_size(file), options.downscale, options.max_size, str(file))
-        return capture
+            raw = read_raw(made, self.options)
+            return prepare(raw, self.options, made, raw.model)
+        model = self._raw.model if made is None else made / SPARSE_FOLDERS[0]
+        return prepare(self._raw, self.options, self._root, model)
 
     @property
-    def _folder(self) -> Path:
-        return existing_folder(self.name, str(self.options.path))
+    def _root(self) -> Path:
+        return existing_folder(str(self.options.name), self.options.path)
 
     @cached_property
-    def _posed(self) -> PosedImages:
-        assert self._reader is not None
-        return read_posed_images(self._reader, self._folder)
-
-    @cached_property
-    def _transforms(self) -> Transforms:
-        folder = self._folder
-        images = self.options.images
-        if images is not None:
-            require_subfolder(folder, images, "scene.images")
-        return read_transforms_files(folder, self.options.transparent, images)
+    def _raw(self) -> RawCapture:
+        return read_raw(self._root, self.options, self._reader)
 
 
 def _courtyard_step(options: SceneConfig) -> Step:
@@ -125,37 +94,36 @@ def _courtyard_step(options: SceneConfig) -> Step:
     return step_of(CAPTURE, inputs, build)
 
 
-def _transforms_step(transforms: Transforms) -> Step:
-    """The step that writes the cameras and points of ``transforms.json`` as a COLMAP model."""
-    sizes = {
-        name: [camera.width, camera.height] for name, (camera, *_) in transforms.images.items()
-    }
-    inputs = {"transforms": [file_sha256(file) for file in transforms.sources], "sizes": sizes}
+def _cameras_step(raw: RawCapture, reader: dict[str, Any] | None) -> Step:
+    """The step that writes the cameras and points of a capture as a COLMAP model.
 
-    def build(target: Path) -> None:
-        cloud = None
-        if transforms.points is not None:
-            points, colors = read_points(transforms.points)
-            grey = np.full(points.shape, GREY, dtype=np.uint8)
-            cloud = transforms.applied_to_points.undo(points), grey if colors is None else colors
-        write_frames(target / SPARSE_FOLDERS[0], transforms.images, cloud=cloud)
-
-    return step_of(CAPTURE, inputs, build)
-
-
-def _reader_step(posed: PosedImages, reader: dict[str, Any]) -> Step:
-    """The step that writes what a user's ``reader`` (class, code, options) read as a model."""
+    ``reader`` has the class, options and code of a user's reader.
+    """
+    frames = {row.name: row.posed for row in raw.photographs}
     cameras = {
         name: [asdict(camera), rotation.tolist(), translation.tolist()]
-        for name, (camera, rotation, translation) in posed.images.items()
+        for name, (camera, rotation, translation) in frames.items()
     }
-    points = None if posed.points is None else [values.tolist() for values in posed.points]
-    inputs = {"reader": reader, "cameras": sha256_of(cameras), "points": sha256_of(points)}
+    inputs: dict[str, Any] = {
+        "reader": reader,
+        "files": [file_sha256(file) for file in raw.files],
+        "cameras": sha256_of(cameras),
+    }
+    if isinstance(raw.points, tuple):
+        inputs["points"] = sha256_of([values.tolist() for values in raw.points])
 
     def build(target: Path) -> None:
-        write_frames(target / SPARSE_FOLDERS[0], posed.images, cloud=posed.points)
+        write_frames(target / SPARSE_FOLDERS[0], frames, cloud=_cloud(raw))
 
     return step_of(CAPTURE, inputs, build)
+
+
+def _cloud(raw: RawCapture) -> Cloud | None:
+    if not isinstance(raw.points, PointsFile):
+        return raw.points
+    points, colors = read_points(raw.points.path)
+    grey = np.full(points.shape, GREY, dtype=np.uint8)
+    return raw.points.applied.undo(points), grey if colors is None else colors
 
 
 def masking_step(capture: Capture, backdrop: Backdrop) -> Step | None:

@@ -1,29 +1,30 @@
-"""Picture files beside photographs that are no photographs: masks, thumbnails, smaller copies.
+"""Picture files beside photographs that are no photographs: masks, thumbnails, depth maps.
 
-A capture of bare photographs has no list of its files, so names and folders decide; of series with
-other names, the pixels (`side_series`).
+A capture of bare photographs has no list of its files, so the names of files and folders decide.
 """
 
 import logging
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 from gsbench.errors import InputError
-from gsbench.scene.images import IMAGE_SUFFIXES, stem_of
-from gsbench.scene.side_series import side_series
+from gsbench.scene.names import IMAGE_SUFFIXES, match_anywhere, stem_of
+from gsbench.scene.record import RawCapture
 from gsbench.words import counted
 
 log = logging.getLogger(__name__)
 
+DEPTH = ("depth", "depthmap", "monodepth", "disparity")
 # words in the names of folders and files that hold something else than photographs
 WORDS = frozenset(
     word + ending
     for word in (
-        *("mask", "thumb", "thumbnail", "preview", "depth", "depthmap", "monodepth", "disparity"),
+        *("mask", "thumb", "thumbnail", "preview", *DEPTH),
         *("normal", "normalmap", "segmentation", "seg", "semantic", "instance", "label", "matte"),
-        *("annotation", "overlay", "flow", "heatmap", "render", "undistorted"),
+        *("annotation", "overlay", "flow", "heatmap", "render", "undistorted", "lowres"),
     )
     for ending in ("", "s")
 )
@@ -37,6 +38,7 @@ PART = re.compile(r"[^\W\d_]+|\d+")  # of a file's name
 # words in the names of photographs where those of their companions have another word
 PHOTOGRAPH = frozenset({"rgb", "color", "colour", "image", "img", "photo", "frame"})
 FORMATS = frozenset(suffix[1:] for suffix in IMAGE_SUFFIXES)
+SMALLER = re.compile(r"(.+?)[_-]([248])")  # images_4: copies a quarter as wide
 WORKSPACES = ("store", "stereo")  # sub-folders of gsbench's runs and of COLMAP's dense workspace
 
 
@@ -58,13 +60,42 @@ def photographs_among(folder: Path, names: Sequence[str], report: bool = True) -
             "scene.images=FOLDER reads a folder"
         )
     log.warning(
-        "%s: %s left out, no photographs or smaller copies of them: %s; "
-        "scene.images=FOLDER reads one folder alone",
+        "%s: %s left out, no photographs: %s; scene.images=FOLDER reads one folder alone",
         folder,
         files,
         listed,
     )
     return [name for name in names if name not in reasons]
+
+
+def companions_beside(raw: RawCapture, root: Path) -> RawCapture:
+    """Give photographs the files of their names in folders beside theirs, such as ``depth``.
+
+    A file of a folder of depth maps is the photograph's ``depth``, others are ``more`` by the
+    folder's name. Folders of masks are read by ``scene.masks`` alone.
+    """
+    rows = {row.name: row for row in raw.photographs}
+    stems = {stem_of(name): name for name in rows}
+    for folder in sorted(root.iterdir()):
+        words = {word.rstrip("s") for word in _words(folder.name) if word in FOLDER_WORDS}
+        if not words or "mask" in words or not folder.is_dir() or folder == raw.folder:
+            continue
+        files = {
+            path.relative_to(folder).with_suffix("").as_posix(): path
+            for path in folder.rglob("*")
+            if path.is_file()
+        }
+        try:
+            found = match_anywhere(stems, files)
+        except InputError:  # several files may be a photograph's
+            continue
+        for stem, file in found.items():
+            row = rows[stems[stem]]
+            if words.isdisjoint(DEPTH) or row.depth is not None:
+                rows[row.name] = replace(row, more={**row.more, folder.name: files[file]})
+            else:
+                rows[row.name] = replace(row, depth=files[file])
+    return replace(raw, photographs=tuple(rows.values()))
 
 
 def _reasons(folder: Path, names: Sequence[str]) -> dict[str, str]:
@@ -78,9 +109,7 @@ def _reasons(folder: Path, names: Sequence[str]) -> dict[str, str]:
             if verdicts[parent]:
                 reasons[name] = f"{parent}/"
                 break
-    left = [name for name in names if name not in reasons]
-    reasons |= _companions(left)
-    return reasons | side_series(folder, [name for name in left if name not in reasons])
+    return reasons | _companions([name for name in names if name not in reasons])
 
 
 def _parents(name: str) -> Iterator[str]:
@@ -92,6 +121,12 @@ def _parents(name: str) -> Iterator[str]:
 def _is_side_folder(folder: Path) -> bool:
     if folder.name.casefold() in SYSTEM or FOLDER_WORDS.intersection(_words(folder.name)):
         return True
+    if found := SMALLER.fullmatch(folder.name):
+        larger = [""]
+        if {word.rstrip("s") for word in _words(found[1])} <= PHOTOGRAPH:  # else another camera
+            larger += [f"{mark}{size}" for mark in "_-" for size in "248" if size < found[2]]
+        if any((folder.parent / f"{found[1]}{ending}").is_dir() for ending in larger):
+            return True
     return any((folder / name).is_dir() for name in WORKSPACES)
 
 

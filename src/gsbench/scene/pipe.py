@@ -1,0 +1,233 @@
+"""The one place that changes a capture: steps from what was read to what a trial uses."""
+
+import hashlib
+import logging
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+
+from gsbench.errors import InputError
+from gsbench.files import require_regular
+from gsbench.normalization import IDENTITY, find_normalization
+from gsbench.parsing import text_of
+from gsbench.scene.colmap_files import model_files, require_subfolder
+from gsbench.scene.hold_out import hold_out, reference_camera, select_images
+from gsbench.scene.images import check_picture_names
+from gsbench.scene.masks import check_masks, find_masks
+from gsbench.scene.names import match
+from gsbench.scene.options import (
+    TEST_LIST,
+    TRAIN_LIST,
+    SceneConfig,
+    check_final_size,
+    require_enough,
+)
+from gsbench.scene.readers import existing_folder, read_raw
+from gsbench.scene.record import RawCapture, Role
+from gsbench.scene.twins import copies_by_name, copies_of_test_views, report_left_out
+from gsbench.scene.types import Capture
+from gsbench.words import some_of
+
+log = logging.getLogger(__name__)
+
+Lists = tuple[Sequence[str] | None, Sequence[str] | None]  # for training, for testing
+
+
+@dataclass(frozen=True)
+class Wish:
+    """The settings of a scene, the folder that its paths start from, and its split lists."""
+
+    options: SceneConfig
+    root: Path
+    lists: Lists
+
+
+def drop_copies(raw: RawCapture, wish: Wish) -> RawCapture:
+    """Drop photographs of one name that differ in the extension; listed ones are kept."""
+    wanted = set(chain.from_iterable(filter(None, wish.lists)))
+    return _without(raw, copies_by_name(raw.names, wanted), "of the same name")
+
+
+def hold_out_views(raw: RawCapture, wish: Wish) -> RawCapture:
+    """Choose the photographs that are used, and give each its role."""
+    options, rule = wish.options, wish.options.split_rule
+    names, by_name = raw.names, {row.name: row for row in raw.photographs}
+    train, test = (_resolve(wanted, names, raw.folder) for wanted in wish.lists)
+    if train is not None and test is not None:
+        names = sorted({*train, *test})
+    cameras = (
+        (lambda chosen: [reference_camera(*by_name[name].posed) for name in chosen])
+        if raw.has_cameras
+        else None
+    )
+    split = hold_out(select_images(names, options.max_images), rule, (train, test), cameras)
+    roles: dict[str, Role] = dict.fromkeys(split.train, "train")
+    roles.update((name, "test") for name in split.test)
+    kept = [replace(by_name[name], role=roles[name]) for name in sorted(roles)]
+    return replace(raw, photographs=tuple(kept), held_out=split.description)
+
+
+def drop_copies_of_test_views(raw: RawCapture, wish: Wish) -> RawCapture:
+    """Drop training photographs with the content of a test view, which would measure memory."""
+    copies = copies_of_test_views(raw.folder, raw.named("train"), raw.named("test"))
+    raw = _without(raw, copies, "with the content of a test view")
+    which = "in the split lists" if wish.options.split_rule.by_lists else "left by the split"
+    require_enough(len(raw.photographs), raw.folder, which)
+    return raw
+
+
+def match_masks(raw: RawCapture, wish: Wish) -> RawCapture:
+    """Give each photograph its mask from the folder ``scene.masks``, and check all masks."""
+    rows = raw.photographs
+    if wish.options.masks is not None:
+        folder = require_subfolder(wish.root, wish.options.masks, "scene.masks")
+        masks = find_masks(folder, raw.names)
+        rows = tuple(replace(row, mask=masks[row.name]) for row in rows)
+    check_masks(rows)
+    return replace(raw, photographs=rows)
+
+
+def check_names_and_sizes(raw: RawCapture, wish: Wish) -> RawCapture:
+    """Raise InputError for a name or a size that no view can have."""
+    options = wish.options
+    check_picture_names(raw.named("test"), raw.folder)
+    for row in raw.photographs:
+        check_final_size(row.size, options.downscale, options.max_size, str(row.file))
+    return raw
+
+
+PIPE: tuple[Callable[[RawCapture, Wish], RawCapture], ...] = (
+    drop_copies,
+    hold_out_views,
+    drop_copies_of_test_views,
+    match_masks,
+    check_names_and_sizes,
+)
+
+
+def read_capture(options: SceneConfig) -> Capture:
+    """The capture in the folder ``scene.path``, of a kind that needs no cameras written."""
+    root = existing_folder(str(options.name), options.path)
+    raw = read_raw(root, options)
+    return prepare(raw, options, root, raw.model)
+
+
+def prepare(raw: RawCapture, options: SceneConfig, root: Path, model: Path | None) -> Capture:
+    """The capture that a trial uses, with its cameras in the COLMAP ``model``, if it has any.
+
+    Paths of ``options`` start from ``root``. Raises InputError if fewer than three photographs are
+    left, or a file, a list or a mask cannot be used.
+    """
+    has_own = any(row.role for row in raw.photographs)
+    rule = options.split_rule
+    if has_own and rule.asks_the_capture:
+        lists: Lists = raw.named("train"), raw.named("test")
+    else:
+        if has_own and not rule.by_lists:
+            log.warning("%s has its own split: scene.split=list uses it", [*raw.files, root][0])
+        lists = _read_lists(root, options)
+    centers = raw.centers
+    if centers is None and raw.has_cameras:
+        centers = np.array([row.center for row in raw.photographs])
+    for step in PIPE:
+        raw = step(raw, Wish(options, root, lists))
+    # Only the courtyard has exact poses, and its units fit the paper's threshold.
+    exact = options.kind == "courtyard"
+    rows = raw.photographs
+    masks = {row.name: row.mask for row in rows if row.mask is not None}
+    return Capture(
+        name=str(options.name),
+        images=raw.folder,
+        image_names=tuple(raw.names),
+        test_names=tuple(raw.named("test")),
+        model=model,
+        exact_poses=exact,
+        fingerprint=fingerprint(
+            raw.folder, raw.names, [] if model is None else model_files(model), masks
+        ),
+        held_out=raw.held_out,
+        masks=masks,
+        depths={row.name: row.depth for row in rows if row.depth is not None},
+        more={row.name: row.more for row in rows if row.more},
+        read_from=raw.files,
+        left_out=raw.left_out,
+        advised_normalization=(
+            IDENTITY if exact or centers is None else find_normalization(centers)
+        ),
+    )
+
+
+def fingerprint(
+    folder: Path,
+    names: Iterable[str],
+    model_files: Iterable[Path] = (),
+    masks: Mapping[str, Path] = MappingProxyType({}),
+) -> str:
+    """sha256 over names and contents of images, model files and masks, wherever they lie."""
+    digest = hashlib.sha256()
+    entries = [(f"image/{name}", folder / name) for name in sorted(names)]
+    entries += [(f"model/{file.name}", file) for file in sorted(model_files)]
+    entries += [(f"mask/{name}", file) for name, file in sorted(masks.items())]
+    for label, file in entries:
+        require_regular(file)
+        try:
+            with file.open("rb") as stream:
+                content = hashlib.file_digest(stream, "sha256").hexdigest()
+        except OSError as error:
+            raise InputError(f"{file}: cannot be read ({error.strerror})") from error
+        digest.update(f"{label}\0{content}\n".encode())
+    return digest.hexdigest()
+
+
+def _without(raw: RawCapture, copies: Mapping[str, str], why: str) -> RawCapture:
+    """The capture without ``copies``, each mapped to the photograph that is used instead."""
+    report_left_out(raw.folder, copies, why)
+    kept = tuple(row for row in raw.photographs if row.name not in copies)
+    return replace(raw, photographs=kept, left_out={**raw.left_out, **copies})
+
+
+def _resolve(wanted: Sequence[str] | None, names: Sequence[str], folder: Path) -> list[str] | None:
+    """The image files that a split list names; extensions may be missing or differ."""
+    if wanted is None:
+        return None
+    matches = match(wanted, names)
+    if unknown := [name for name in wanted if name not in matches]:
+        raise InputError(
+            f"the split lists name {some_of(unknown)}, not among the usable images of {folder}: "
+            "correct the lists"
+        )
+    return sorted(matches.values())
+
+
+def _read_lists(root: Path, options: SceneConfig) -> Lists:
+    """The training and the test list; ``split=list`` without files reads those of nerfbaselines."""
+    train, test = options.train_list, options.test_list
+    if options.split == "list" and train is None and test is None:
+        train = TRAIN_LIST if (root / TRAIN_LIST).is_file() else None
+        test = TEST_LIST if (root / TEST_LIST).is_file() else None
+        if train is None and test is None:
+            raise InputError(
+                f"scene.split=list: neither {TRAIN_LIST} nor {TEST_LIST} is in {root}: name the "
+                "files with scene.train_list and scene.test_list"
+            )
+    return _read_list(root, train, "scene.train_list"), _read_list(root, test, "scene.test_list")
+
+
+def _read_list(root: Path, file: str | None, key: str) -> list[str] | None:
+    if file is None:
+        return None
+    path = root / file  # an absolute path stays as it is
+    require_regular(path)
+    try:
+        lines = text_of(path.read_bytes()).splitlines()
+    except InputError as error:
+        raise InputError(f"{key}: {path}: {error}") from error
+    except OSError as error:
+        raise InputError(
+            f"{key}: {path} cannot be read ({error.strerror}): name a text file of image names"
+        ) from error
+    return [line.strip() for line in lines if line.strip() and not line.startswith("#")]
