@@ -18,15 +18,23 @@ from contextlib import contextmanager
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, TypeVar, dataclass_transform
+from typing import Annotated, Any, ClassVar, TypeVar, cast, dataclass_transform
 
 import yaml
 from annotated_types import MinLen
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
-from pydantic_core import ErrorDetails, from_json
+from pydantic import (
+    AfterValidator,
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    TypeAdapter,
+    ValidationError,
+)
+from pydantic_core import CoreSchema, ErrorDetails, core_schema, from_json
 
 from gsbench.errors import InputError
 from gsbench.files import open_plain
+from gsbench.words import as_line
 
 log = logging.getLogger(__name__)
 
@@ -284,6 +292,17 @@ Amount = Annotated[float, Field(ge=0, le=MAX_NUMBER)]
 Count = Annotated[int, Field(ge=0, lt=2**63)]
 Whole = Annotated[int, Field(gt=-(2**63), lt=2**63)]
 Text = Annotated[str, MinLen(1)]
+RAW = {"raw": True}
+
+
+class _AsWritten:
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.str_schema(metadata=RAW)
+
+
+# a text of a record as it was written: a path that is opened, or words that are given again
+Raw = Annotated[str, _AsWritten]
 STRICT = ConfigDict(strict=True, allow_inf_nan=False, extra="ignore")
 
 
@@ -291,10 +310,15 @@ STRICT = ConfigDict(strict=True, allow_inf_nan=False, extra="ignore")
 class Record:
     """Base of records: a subclass is a frozen dataclass of keywords, without a decorator.
 
-    Types are strict and numbers finite; unknown keys are ignored.
+    Types are strict and numbers finite; unknown keys are ignored. Every text that is read becomes
+    one line (`as_line`), except `Raw` ones: a stranger may have written the file.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return _in_lines(handler(source))
 
     def __init_subclass__(cls) -> None:
         dataclass(frozen=True, kw_only=True)(cls)
@@ -310,6 +334,30 @@ class Record:
     def _has_default(self, field: Any) -> bool:
         default = field.default if field.default_factory is MISSING else field.default_factory()
         return default is not MISSING and getattr(self, field.name) == default
+
+
+def _in_lines(schema: Any) -> Any:
+    """pydantic's schema of a record, in which each text that is not `Raw` becomes one line."""
+    if isinstance(schema, list):
+        return [_in_lines(item) for item in schema]
+    if not isinstance(schema, dict):
+        return schema
+    if schema.get("type") == "str" and schema.get("metadata") != RAW:
+        return core_schema.no_info_after_validator_function(as_line, cast(CoreSchema, schema))
+    return {key: _in_lines(value) for key, value in schema.items()}
+
+
+def lines_in(value: Any) -> Any:
+    """A plain value with every text in it, also of keys, as one line."""
+    if isinstance(value, dict):
+        return {lines_in(key): lines_in(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [lines_in(item) for item in value]
+    return as_line(value) if isinstance(value, str) else value
+
+
+# nested plain values of any shape, with texts of one line
+Facts = Annotated[dict[str, Any], AfterValidator(lines_in)]
 
 
 def read_typed(path: Path, kind: type[T]) -> T:

@@ -144,9 +144,49 @@ def printable(text: str) -> str:
         >>> printable("red \\x1b[31m")
         'red \\\\x1b[31m'
     """
-    return CONTROL_CHARACTERS.sub(
-        lambda found: found[0].encode("unicode_escape").decode("ascii"), text.replace("\r\n", "\n")
-    )
+    return CONTROL_CHARACTERS.sub(_escaped, text.replace("\r\n", "\n"))
+
+
+# Characters that end a line or move the cursor; none of them is in a name that gsbench accepts.
+NOT_IN_A_LINE = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029]")
+# in Markdown: a tag, the middle of a link or picture, a code span, and a mark of escapes
+MARKUP = re.compile(r"<(?=[a-zA-Z/!?])|(?<=\])\(|[`\\]")
+
+
+def as_line(text: str) -> str:
+    """``text`` in one line: line breaks, tabs and control characters are escaped.
+
+    Every text of a record passes through it when it is read (`gsbench.parsing.Record`), so that a
+    stranger's name cannot begin a line of its own.
+
+    Examples:
+        >>> as_line("psnr\\nVerdict: better")
+        'psnr\\\\nVerdict: better'
+    """
+    if text.isprintable():  # nearly always, and fast
+        return text
+    return NOT_IN_A_LINE.sub(_escaped, text)
+
+
+def _escaped(found: re.Match[str]) -> str:
+    return found[0].encode("unicode_escape").decode("ascii")
+
+
+def markdown_text(text: str) -> str:
+    """``text`` in one line of Markdown, without HTML, links, pictures and code of its own."""
+    return MARKUP.sub(r"\\\g<0>", printable(" ".join(text.split())))
+
+
+def markdown_code(text: str) -> str:
+    """``text`` as code in a line of Markdown: a fence longer than any in it.
+
+    Examples:
+        >>> markdown_code("a`b")
+        '`` a`b ``'
+    """
+    text = printable(as_line(text))
+    fence = "`" * (1 + max(map(len, re.findall("`+", text)), default=0))
+    return f"{fence}{text}{fence}" if len(fence) == 1 else f"{fence} {text} {fence}"
 
 
 def command(*words: str) -> str:

@@ -246,7 +246,7 @@ def results(trial, shown):
 
 
 def files_of_a_trial(trial, shown):
-    for name in ("config.yaml", "per_view.csv", "point_cloud.ply"):
+    for name in ("config.yaml", "per_view.csv", "point_cloud.ply", "lineage.npz"):
         kept = shutil.copy2(trial / name, trial.parents[4] / "kept")
         edit(trial / name)
         for verb, text in shown().items():
@@ -308,7 +308,7 @@ ELSEWHERE = {
 }
 HERE = {
     "`results.json`": results,
-    "`config.yaml`, `per_view.csv`, `point_cloud.ply` of a trial": files_of_a_trial,
+    "`config.yaml`, `per_view.csv`, `point_cloud.ply`, `lineage.npz` of a trial": files_of_a_trial,
     "`metrics.jsonl`, `events.jsonl`, `volume_histograms.jsonl`": curves,
     "pictures of a trial": pictures,
     "`store/`: results of stages and prepared views": store,

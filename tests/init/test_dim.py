@@ -391,6 +391,20 @@ def test_mutual_nearest_matches_equal_those_of_brute_force():
 
 @pytest.mark.shared
 @pytest.mark.slow
+@pytest.mark.parametrize("extractor", ["aliked", "disk"])
+def test_lightglue_with_real_weights_finds_points_on_the_surfaces(
+    few, trained_weights, tmp_path, extractor
+):
+    own = {"max_keypoints": 500, "threads": 1, "pairs": "sequential", "overlap": 2}
+    init = Dim(extractor=extractor, weights=trained_weights, download=False, **own)
+    report = init.run(few, tmp_path)
+    assert len(report.settings["weights_sha256"]) == 2
+    assert report.num_points > 100
+    assert np.median(surface_distance(read_cloud(tmp_path / MODEL_FOLDER).points)) < 0.05  # m
+
+
+@pytest.mark.shared
+@pytest.mark.slow
 def test_aliked_with_real_weights_finds_points_on_the_surfaces(courtyard, shared_weights, tmp_path):
     init = Dim(extractor="aliked", matcher="mutual_nearest", weights=shared_weights, download=False)
     report = init.run(courtyard, tmp_path)

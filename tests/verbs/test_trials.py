@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import time
 from pathlib import Path
 from shlex import split
@@ -21,7 +22,7 @@ from gsbench.tracking.tracker_run import MirrorError
 from gsbench.verbs import trials
 from tests.composed import composed
 from tests.helpers import refusal, write
-from tests.trials import write_results
+from tests.trials import record_of, write_results
 
 pytestmark = pytest.mark.usefixtures("runs")
 
@@ -51,6 +52,21 @@ def ran(monkeypatch):
 
 
 # ---- status
+
+
+def test_verify_finds_a_large_file_that_changed_and_kept_its_time(capsys):
+    (trial,) = composed(split("name=x densify=adc seed=0"))
+    folder = begin(trial)
+    model = write(folder / "point_cloud.ply", b"0" * 2_000_000)
+    trial.files.write_finished(trial.values, record_of(trial.values), published=[model])
+    assert trials.status(["x", "--verify"], trial.files.runs) == 0
+    before = model.stat()
+    write(model, b"0" * 1_999_999 + b"1")
+    os.utime(model, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert trials.status(["x"], trial.files.runs) == 0
+    capsys.readouterr()
+    assert trials.status(["x", "--verify"], trial.files.runs) == 1
+    assert "point_cloud.ply was changed after results.json was written" in capsys.readouterr().out
 
 
 def test_status_lists_unfinished_trials(folders, runs, capsys, said, refused):

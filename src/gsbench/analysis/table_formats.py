@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
 from gsbench.analysis.cells import Cell
-from gsbench.words import printable
+from gsbench.words import markdown_text, printable
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -98,13 +98,6 @@ def _digest(script: str) -> str:
 
 # Text that a spreadsheet would compute, or start, and is no number such as +0.3 ± 0.1
 FORMULA = re.compile(r"[=@]|[+-](?![\d.,\s±%()]*$)")
-# a tag, or the middle of a link or picture
-MARKUP = re.compile(r"<(?=[a-zA-Z/!?])|(?<=\])\(")
-
-
-def _markdown_text(text: str) -> str:
-    """A text from a trial, which may be a stranger's, in one line without HTML and links."""
-    return MARKUP.sub(r"\\\g<0>", printable(" ".join(text.split())))
 
 
 def csv_of(frame: pd.DataFrame) -> str:
@@ -130,11 +123,11 @@ def to_markdown(table: Table) -> str:
         for row in table.rows
     ]
     lines = [
-        " | ".join(_markdown_text(text).replace("|", "\\|") for text in row)
+        " | ".join(markdown_text(text).replace("|", "\\|") for text in row)
         for row in (heads, rule, *rows)
     ]
-    notes = [f"- {_markdown_text(note)}" for note in table.notes]
-    title = f"### {_markdown_text(table.title)}"
+    notes = [f"- {markdown_text(note)}" for note in table.notes]
+    title = f"### {markdown_text(table.title)}"
     return "\n".join([title, "", *(f"| {line} |" for line in lines), "", *notes]).rstrip() + "\n"
 
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
-from gsbench.parsing import DamagedError
+from gsbench.parsing import DamagedError, lines_in
 from gsbench.runs.config_hash import is_hashed
 from gsbench.runs.layout import CONFIG
 from gsbench.runs.nested import flatten
@@ -64,7 +64,8 @@ def load_flat_config(folder: Path) -> dict[str, Any]:
         raise DamagedError(
             folder / CONFIG, f"is damaged: it lacks one of the groups {', '.join(GROUPS)}"
         )
-    return flatten(values)
+    settings: dict[str, Any] = lines_in(flatten(values))
+    return settings
 
 
 def config_if_readable(folder: Path) -> Mapping[str, Any]:

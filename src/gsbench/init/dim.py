@@ -45,6 +45,7 @@ EXTRACTOR_WEIGHTS = {
     "disk": WeightsFile(  # Apache-2.0
         ("depth-save.pth",),
         "https://raw.githubusercontent.com/cvlab-epfl/disk/master/depth-save.pth",
+        "9c2ee4ded238892dfa51569941372601e35e4a74aa6f84ea80053d2ab1c07abe",
     ),
 }
 ALIKED_WEIGHTS = {  # BSD-3-Clause
@@ -55,7 +56,7 @@ ALIKED_WEIGHTS = {  # BSD-3-Clause
     )
     for model, sha256 in {
         "n16": "5be8704840ed662d9d8c561bf7279c222092674e7eb05fd0feab94899e9d82f2",
-        "n16rot": None,
+        "n16rot": "ddf3abbf38e86f6a74540d214e1a9712c54b2d8551abc864542199f2347d7332",
         "n32": "055283fd1624d3ab46a05c3b617b1a79a3f28d1f551737eef2d653e8c8232890",
         "t16": "56782336919db220144a884e710e2b6af13b3b8f8da15b915a239078ab471085",
     }.items()
@@ -65,8 +66,13 @@ LIGHTGLUE_WEIGHTS = {  # Apache-2.0
         # kornia and cvg/LightGlue use the first name, with "-pth", in the torch hub cache
         (f"{extractor}_lightglue_v0-1_arxiv-pth", f"{extractor}_lightglue.pth"),
         f"https://github.com/cvg/LightGlue/releases/download/v0.1_arxiv/{extractor}_lightglue.pth",
+        sha256,
     )
-    for extractor in ("superpoint", "disk", "aliked")
+    for extractor, sha256 in {
+        "superpoint": None,
+        "disk": "b5b21d47ea24f2c5e501aec9c91b9716e4c8c3429a4dc1e615c133c4c9378335",
+        "aliked": "d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503",
+    }.items()
 }
 
 Extractor = Literal["superpoint", "aliked", "disk"]

@@ -23,6 +23,7 @@ from gsbench.runs.plan import PlannedTrial, read_plan
 from gsbench.runs.trial_folder import State, TrialFolder
 from gsbench.system.locks import read_holder
 from gsbench.system.programs import answer_of
+from gsbench.words import as_line
 
 
 @dataclass(frozen=True)
@@ -268,5 +269,5 @@ def label_of(folder: Path, names: Mapping[Path, tuple[str, str]]) -> str:
 
 def _settings_of(overrides: Iterable[str]) -> set[str]:
     """The settings in a command by their last names, without a trial's place."""
-    given = (word.lstrip("+~").partition("=") for word in overrides)
+    given = (as_line(word).lstrip("+~").partition("=") for word in overrides)
     return {f"{key.rpartition('.')[2]}={value}" for key, _, value in given if key not in OF_A_PLACE}

@@ -295,7 +295,7 @@ def _publish(
 # ---- the content of results.json
 
 # packages on whose versions a result depends
-PACKAGES = ("torch", "numpy", "numba", "pycolmap", "kornia", "gsplat")
+PACKAGES = ("torch", "numpy", "numba", "pycolmap", "kornia", "gsplat", "piq")
 # fields that results.json copies from the training and from the evaluation without changes
 OF_TRAINING = (
     "iterations",

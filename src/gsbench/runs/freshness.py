@@ -26,6 +26,7 @@ from gsbench.runs.trial_files import MadeOf, Stamp
 from gsbench.runs.trial_record import Code, TrialRecord
 from gsbench.runs.user_code import module_digest
 from gsbench.system.install import version_of
+from gsbench.words import as_line
 
 SENTENCES = {
     "unfinished": "{name} is not there, or not complete",
@@ -54,7 +55,8 @@ class Change:
     now: str = ""
 
     def __str__(self) -> str:
-        return SENTENCES[self.kind].format(name=self.name, made=self.made, now=self.now)
+        facts = {"name": self.name, "made": self.made, "now": self.now}
+        return as_line(SENTENCES[self.kind].format(**facts))
 
 
 # ---- code
@@ -113,7 +115,7 @@ def code_changes(
 # files that tables and reports read
 READ_LATER = (layout.PER_VIEW, layout.CURVES, layout.EVENTS, layout.HISTOGRAMS)
 # files by which a trial is judged, exported or run again: after an edit it counts nowhere
-JUDGED = (layout.PER_VIEW, layout.CONFIG, layout.POINT_CLOUD)
+JUDGED = (layout.PER_VIEW, layout.CONFIG, layout.POINT_CLOUD, layout.LINEAGE)
 RECORDED = {*READ_LATER, *JUDGED}
 # Files up to so many bytes are compared by content, since a flipped bit changes neither size nor
 # time.
@@ -187,6 +189,19 @@ def changes(
     for name, entry in made.entries.items():
         try:
             read_manifest(Path(entry))
+        except ValueError as error:
+            yield Change("stored", name, now=str(error))
+
+
+def changes_of_content(folder: Path, made: MadeOf) -> Iterator[Change]:
+    """The files of a trial, and the results of its stages in the store, with another content."""
+    for name, digest in made.digests.items():
+        path = folder / name
+        if path.is_file() and file_sha256(path) != digest:
+            yield Change("written", name)
+    for name, entry in made.entries.items():
+        try:
+            read_manifest(Path(entry), thorough=True)
         except ValueError as error:
             yield Change("stored", name, now=str(error))
 

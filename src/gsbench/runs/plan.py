@@ -12,7 +12,7 @@ from typing import Annotated
 from pydantic import AfterValidator
 
 from gsbench.files import write_json
-from gsbench.parsing import Amount, DamagedError, Record, read_typed
+from gsbench.parsing import Amount, DamagedError, Raw, Record, read_typed
 from gsbench.runs.experiments import make_home
 from gsbench.runs.layout import PLAN
 from gsbench.settings import ARM_BYTES, is_folder_name
@@ -26,8 +26,8 @@ LEVELS = 3  # folders of scene, arm and trial
 class PlannedTrial(Record):
     """A planned trial: its overrides, the folder of the command, and the Unix time."""
 
-    overrides: tuple[str, ...]
-    cwd: str
+    overrides: tuple[Raw, ...]
+    cwd: Raw
     time: Amount
 
 

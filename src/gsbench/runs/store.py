@@ -28,7 +28,7 @@ from gsbench.files import (
     sync_to_disk,
     write_json,
 )
-from gsbench.parsing import Amount, Count, DamagedError, Record, fault_of, read_typed
+from gsbench.parsing import Amount, Count, DamagedError, Raw, Record, fault_of, read_typed
 from gsbench.runs.keys import Stage, Step
 from gsbench.runs.layout import MANIFEST, VIEWS
 from gsbench.system.locks import BusyError, hold
@@ -54,7 +54,7 @@ class Manifest(Record):
     version: int
     key: str
     inputs: dict[str, Any]
-    outputs: dict[str, Output]
+    outputs: dict[Raw, Output]
     seconds: Amount
     gsbench: str
     created: str

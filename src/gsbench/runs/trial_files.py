@@ -3,7 +3,7 @@
 from dataclasses import field
 from typing import Any
 
-from gsbench.parsing import Amount, Count, Record, fault_of, one_line
+from gsbench.parsing import Amount, Count, Raw, Record, fault_of, one_line
 from gsbench.settings import FolderName
 
 Stamp = tuple[int, ...]  # size in bytes, times of change in ns
@@ -41,7 +41,7 @@ class Failure(Record):
 
     error: str = ""
     message: str = ""
-    traceback: str = field(default="", repr=False)
+    traceback: Raw = field(default="", repr=False)
     time: Amount = 0.0
     seed: Count = 0
     bad_input: bool = False  # the user's files or settings are the cause
@@ -57,7 +57,7 @@ class Building(Record):
     """``building.json``: the present stage of an unfinished trial, and where it is built."""
 
     stage: str = ""
-    folder: str = ""
+    folder: Raw = ""
 
 
 class MadeOf(Record):
@@ -75,11 +75,11 @@ class MadeOf(Record):
     config: str
     stages: dict[str, int]
     pycolmap: str | None
-    sources: dict[str, Stamp]
-    folders: dict[str, int | None]
-    entries: dict[str, str]
-    published: dict[str, Stamp]
-    digests: dict[str, str]
+    sources: dict[Raw, Stamp]
+    folders: dict[Raw, int | None]
+    entries: dict[str, Raw]
+    published: dict[Raw, Stamp]
+    digests: dict[Raw, str]
     settings: dict[str, Any]
     finished: Amount = 0.0
 

@@ -35,7 +35,13 @@ from gsbench.parsing import (
 )
 from gsbench.runs import layout
 from gsbench.runs.config_hash import config_hash
-from gsbench.runs.freshness import Change, change_of_files, changes, origin_of
+from gsbench.runs.freshness import (
+    Change,
+    change_of_files,
+    changes,
+    changes_of_content,
+    origin_of,
+)
 from gsbench.runs.nested import sha256_of
 from gsbench.runs.rows import Row, read_rows
 from gsbench.runs.seen import remember
@@ -43,7 +49,7 @@ from gsbench.runs.trial_files import Building, Configuration, Failure, MadeOf, R
 from gsbench.runs.trial_record import TrialRecord, UnfinishedError, record_from
 from gsbench.runs.user_code import PERMISSIONS
 from gsbench.system.locks import is_held
-from gsbench.words import command
+from gsbench.words import as_line, command
 
 MADE_OF = "made_of"  # the key in results.json
 State = Literal["done", "running", "failed", "partial", "damaged", "missing"]
@@ -192,6 +198,16 @@ class TrialFolder:
             return None
         return change_of_files(self.path, origin.digests, origin.published, thorough)
 
+    def fault_when_read(self) -> Change | None:
+        """A change in the files of a finished trial, or in its results in the store; None if none.
+
+        All are read: `change` and `why_not_done` trust the size and time of large ones.
+        """
+        made = self.made_of()
+        if made is None:
+            return Change("unrecorded", layout.RESULTS)
+        return next(changes_of_content(self.path, made), None)
+
     def _known_origin(self) -> MadeOf | None:
         """The origin of the results, read if it was not yet; None if unrecorded or unsound."""
         if self._origin is None:
@@ -237,7 +253,9 @@ class TrialFolder:
         in this folder. Returns True if it already had equal results: then only ``made_of`` is
         renewed, and the trial keeps its time.
         """
-        path, content = self.path / layout.RESULTS, record.to_json()
+        path = self.path / layout.RESULTS
+        # as it will be read: texts of libraries become one line
+        content = record_from(json.dumps(record.to_json()).encode(), path).to_json()
         present = self.sound_record()
         before = path.stat() if present is not None and present.to_json() == content else None
         # Verdicts count results from before their declaration by this time, so equal results
@@ -304,7 +322,7 @@ class TrialFolder:
         try:
             views = {}
             for row in csv.DictReader(io.StringIO(content.decode("utf-8"), newline="")):
-                name = row.pop("view")
+                name = as_line(row.pop("view"))
                 views[name] = {key: _number(value) for key, value in row.items() if value != ""}
             return views
         except (UnicodeDecodeError, KeyError, TypeError, ValueError, csv.Error) as error:

@@ -18,6 +18,7 @@ from gsbench.parsing import (
     Amount,
     Count,
     DamagedError,
+    Facts,
     Number,
     Record,
     Text,
@@ -190,7 +191,7 @@ class TrialRecord(Record):
     held_out: str = ""  # the same as a sentence
     resolution: tuple[Count, Count] | None = None
     events: dict[str, Count] = field(default_factory=dict)  # totals of the refinements, by cause
-    init_report: dict[str, Any] = field(default_factory=dict)
+    init_report: Facts = field(default_factory=dict)
     renders: dict[str, str] = field(default_factory=dict)  # origin of another program's renders
     code: Code = field(default_factory=Code)
     machine: dict[str, str] | None = None

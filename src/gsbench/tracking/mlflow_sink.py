@@ -28,6 +28,8 @@ from gsbench.tracking.trial import NOTE, Picture, Scalar, TrackedTrial
 if TYPE_CHECKING:
     from mlflow import MlflowClient
 
+# bytes of a database's path: SQLite opens 512, with "-journal" after it
+MAX_PATH = 500
 VARIABLE = "MLFLOW_TRACKING_URI"
 LOCK = ".mlflow.lock"  # in the runs folder: one process at a time makes tables and experiments
 # Without this tag, the experiment's page opens in the view for chat models.
@@ -47,6 +49,7 @@ SETTINGS = {
 
 
 def default_uri(runs: Path) -> str:
+    """The address of the runs folder's own database."""
     return f"sqlite:///{runs}/{DATABASE}"
 
 
@@ -78,6 +81,8 @@ def connect(uri: str | None, runs: Path) -> MlflowClient:
     for name in (DATABASE, ARTIFACTS):
         require_no_links(runs, runs / name)
     with FileLock(runs / LOCK):
+        if address == default_uri(runs):
+            _require_plain(runs / DATABASE)
         _create_sqlite(address)
         client = mlflow.MlflowClient(tracking_uri=address)  # the first client creates the tables
         client.search_experiments(max_results=1)
@@ -137,16 +142,39 @@ def require_own_journal(uri: str) -> Path | None:
     SQLite would delete that file when it opens the database, and the runs folder may be a
     stranger's. Neither MLflow nor gsbench writes such journals; others are rolled back.
     """
-    import sqlalchemy
-
-    name = sqlalchemy.engine.make_url(uri).database if uri.startswith("sqlite:") else None
-    if not name or name == ":memory:":
+    database = _file_of(uri)
+    if database is None:
         return None
+    name = str(database)
     journal = Path(f"{name}-journal")
     with suppress(FileNotFoundError):
         if read_tail(journal, len(JOURNAL_END)) == JOURNAL_END:
             raise InputError(f"{journal} would delete another file: remove it")
-    return Path(name)
+    return database
+
+
+def _file_of(uri: str) -> Path | None:
+    """The file of a SQLite address; None for other addresses."""
+    import sqlalchemy
+
+    name = sqlalchemy.engine.make_url(uri).database if uri.startswith("sqlite:") else None
+    return Path(name) if name and name != ":memory:" else None
+
+
+def _require_plain(database: Path) -> None:
+    """Raise InputError if MLflow would open another file, or none.
+
+    In an address, ``%41`` is an A and ``?`` begins a query, but MLflow also uses it as a path. A
+    path that SQLite cannot open would cost minutes of tries.
+    """
+    odd = "a % or ?" if set("%?") & set(str(database)) else ""
+    if not odd and len(os.fsencode(database)) > MAX_PATH:
+        odd = f"more than {MAX_PATH} bytes"
+    if odd:
+        raise InputError(
+            f"MLflow has no database in the runs folder, whose path has {odd}: give tracking.uri, "
+            "or another runs folder"
+        )
 
 
 def _create_sqlite(uri: str) -> None:

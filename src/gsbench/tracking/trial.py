@@ -1,7 +1,6 @@
 """A trial in a tracker's terms: names, curves, results and pictures, read from its files."""
 
 import re
-import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +19,7 @@ from gsbench.runs.plan import PlanFile
 from gsbench.runs.rows import read_rows
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import TrialRecord
+from gsbench.words import command, markdown_code, markdown_text
 
 NOTE = "note"  # the tag that describes a finished trial, in Markdown
 # characters that MLflow refuses in a picture's name
@@ -217,13 +217,13 @@ class TrackedTrial:
         if results.num_gaussians is not None:
             texts.append(f"{results.num_gaussians:,} Gaussians")
         lines = [
-            f"{', '.join(texts)} after {results.iterations:,} iterations.",
-            f"Folder: `{self.path}`",
+            markdown_text(f"{', '.join(texts)} after {results.iterations:,} iterations."),
+            f"Folder: {markdown_code(self.path)}",
         ]
         plan = read_if_sound(self.folder.home / layout.PLAN, PlanFile)
         place = self.folder.path.relative_to(self.folder.home).as_posix()
         if plan and (planned := plan.trials.get(place)):
-            lines.append(f"Again: `{shlex.join(['gsbench', *planned.overrides])}`")
+            lines.append(f"Again: {markdown_code(command(*planned.overrides))}")
         return "\n\n".join(lines)
 
     def _pictures(self, count: int) -> dict[str, Array]:

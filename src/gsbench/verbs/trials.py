@@ -51,6 +51,11 @@ def status(argv: Sequence[str], runs: Path) -> int:
     )
     parser.flag("--all", "list the finished trials too")
     parser.flag("--watch", "a table of arms and scenes, renewed until all have ended")
+    parser.flag(
+        "--verify",
+        "also compare by content what a look leaves to size and time: large files, and the results "
+        "of stages in the store",
+    )
     parser.flag("--json", "print a JSON list instead of lines")
     parser.flag("--forget", "remove trials from the plan that never started")
     parser.flag(
@@ -67,6 +72,8 @@ def status(argv: Sequence[str], runs: Path) -> int:
     if options.watch:
         _watch(home)
     trials = progress_with_superseded(home)
+    if options.verify:
+        trials = [_verified(trial) for trial in trials]
     if options.forget_superseded:
         superseded = [trial for trial in trials if trial.state == "superseded"]
         remove(home, [trial.folder for trial in superseded])
@@ -87,6 +94,14 @@ def status(argv: Sequence[str], runs: Path) -> int:
     else:
         print("\n".join(lines_of(trials, options.all)))
     return int(any(trial.state in RETRIED for trial in trials))
+
+
+def _verified(trial: TrialState) -> TrialState:
+    """The state after all files of a finished trial were read; damaged if one has changed."""
+    if trial.state not in ("done", "superseded"):
+        return trial
+    fault = TrialFolder(trial.folder).fault_when_read()
+    return trial if fault is None else replace(trial, state="damaged", note=str(fault))
 
 
 def _watch(home: Path) -> None:
