@@ -27,7 +27,7 @@ from gsbench.files import (
 )
 from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.init import Sfm
-from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER, PICTURE_FILE, REPORT_FILE
+from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER, REPORT_FILE
 from gsbench.logs import log_to
 from gsbench.normalization import Normalization
 from gsbench.parsing import read_json, read_typed
@@ -267,8 +267,8 @@ def _publish(
 
     The model gets the coordinates in which the scene was given.
     """
-    stages = keys.INIT, keys.TRAIN, keys.EVALUATE, keys.GROUND_TRUTH
-    init, trained, evaluated, truth = (entries[stage.name].path for stage in stages)
+    stages = keys.TRAIN, keys.EVALUATE, keys.GROUND_TRUTH
+    trained, evaluated, truth = (entries[stage.name].path for stage in stages)
     links = {
         folder / name: trained / name for name in PUBLISHED_TRAINING if (trained / name).exists()
     }
@@ -281,8 +281,6 @@ def _publish(
     }
     for name, source in pictures.items():
         links |= {folder / name / file.name: file for file in sorted(source.glob("*.png"))}
-    if (init / PICTURE_FILE).exists():
-        links[folder / layout.FIGURES / layout.INITIAL_CLOUD] = init / PICTURE_FILE
     for link, file in links.items():
         link.parent.mkdir(exist_ok=True)
         if file.name == layout.POINT_CLOUD and not normalization.is_identity:
@@ -325,7 +323,7 @@ def results_of(
     entries by stage. ``code`` maps the parts of gsbench's source that the steps used to their
     states.
     """
-    stages = keys.INIT, keys.TRAIN, keys.EVALUATE
+    stages = keys.TRAIN, keys.EVALUATE
     init, trained, evaluated = (entries[stage.name] for stage in stages)
     training = read_typed(trained.path / layout.TRAINING, Training)
     evaluation = read_typed(evaluated.path / layout.METRICS, Evaluation)
