@@ -172,6 +172,10 @@ class Config:
     runs: PathName = MISSING
     # names of what may run beside gsbench; only the command line sets them
     allow_targets: list[str] = field(default_factory=list)
+    # other questions than each idea against eval.baseline (docs/verdict.md)
+    questions: list[Any] = field(default_factory=list)
+    # of a command's questions: each idea has 5 %, or all share it
+    error_rate: Literal["each", "shared"] = "each"
     scene: SceneConfig = field(default_factory=SceneConfig)
     init: Any = MISSING
     densify: Any = MISSING
