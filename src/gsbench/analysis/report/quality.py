@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Sequence
 from statistics import fmean
 
-from gsbench.analysis.curves import FEWEST_POINTS, CountRatio, Curve, count_ratio, count_saving
+from gsbench.analysis.curves import FEWEST_POINTS, Curve, count_ratio, count_saving
 from gsbench.analysis.pairs import BASELINE
 from gsbench.analysis.quantities import Quantity
 from gsbench.analysis.report.charts import line_chart
@@ -36,7 +36,10 @@ def _chart(scene: str, quantity: Quantity, name: str, baseline: Trials, arm: Tri
     seeds = sorted(sides[0].keys() & sides[1].keys())
     if not seeds:
         return ""
-    ratios = [_ratio(*(side[seed] for side in sides), quantity) for seed in seeds]
+    curves = [
+        [_curve(side[seed], quantity.direction) for side in reversed(sides)] for seed in seeds
+    ]
+    ratios = [count_ratio(ours, theirs) for ours, theirs in curves]
     lines = []
     for label, side in zip((BASELINE, name), sides, strict=True):
         limits = sorted(set.intersection(*(set(side[seed]) for seed in seeds)))
@@ -60,18 +63,12 @@ def _by_seed(trials: Trials, quantity: Quantity) -> dict[int, dict[int, tuple[fl
     found: dict[int, dict[int, tuple[float, float]]] = {}
     for trial in trials:
         limit, value = trial.config.get(LIMIT), quantity.read(trial)
-        if isinstance(limit, int) and value is not None:
-            found.setdefault(trial.seed, {})[limit] = float(trial.record.num_gaussians), value
+        count = trial.record.num_gaussians
+        if isinstance(limit, int) and value is not None and count:
+            found.setdefault(trial.seed, {})[limit] = float(count), value
     return {seed: points for seed, points in found.items() if len(points) >= FEWEST_POINTS}
 
 
-def _ratio(
-    baseline: dict[int, tuple[float, float]],
-    arm: dict[int, tuple[float, float]],
-    quantity: Quantity,
-) -> CountRatio:
-    curves = [
-        Curve.of(*zip(*points.values(), strict=True), quantity.direction)
-        for points in (arm, baseline)
-    ]
-    return count_ratio(*curves)
+def _curve(points: dict[int, tuple[float, float]], direction: int) -> Curve:
+    counts, values = zip(*points.values(), strict=True)
+    return Curve.of(counts, values, direction)
