@@ -15,7 +15,6 @@ from gsbench.analysis.designs import seeds_needed
 from gsbench.analysis.differences import between_scenes_notes
 from gsbench.analysis.fairness import caveats, counts_notes, fairness_table, limit_notes
 from gsbench.analysis.images import choose_views, png_uri
-from gsbench.analysis.judge import Verdict
 from gsbench.analysis.ledger_table import describe_ledger, ledger_tables
 from gsbench.analysis.notes import texts
 from gsbench.analysis.pairs import pair_trials
@@ -29,6 +28,7 @@ from gsbench.analysis.report.volumes import volume_charts
 from gsbench.analysis.results import Experiment, TrialResult, group_by, trials_of
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry, fill
 from gsbench.analysis.tables import build_table, with_agreement
+from gsbench.analysis.verdicts import Verdict
 from gsbench.errors import InputError
 from gsbench.eval.facts import find_metric
 from gsbench.parsing import read_if_sound
