@@ -23,6 +23,7 @@ from gsbench.analysis.quantities import COSTS, choose_quantities, relative_chang
 from gsbench.analysis.ranks import rank_all
 from gsbench.analysis.report.charts import ForestRow, forest_plot, line_chart, rank_plot
 from gsbench.analysis.report.curves import event_charts, event_table, training_charts
+from gsbench.analysis.report.quality import quality_charts
 from gsbench.analysis.report.sweeps import sweep_charts
 from gsbench.analysis.report.volumes import volume_charts
 from gsbench.analysis.results import Experiment, TrialResult, group_by, trials_of
@@ -91,7 +92,10 @@ def build_report(
         say=sentences,
         seeds_to_resolve=seeds_to_resolve,
         signed=lambda value, decimals: "–" if value is None else signed(value, f".{decimals}f"),
-        training=training_charts(trials, arms),
+        training=[
+            *quality_charts(trials, dict.fromkeys(one.verdict.quantity for one in judged)),
+            *training_charts(trials, arms),
+        ],
         event_table=event_table(trials, arms),
         events=event_charts(trials, arms),
         volumes=volumes,
