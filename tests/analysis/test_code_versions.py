@@ -71,45 +71,31 @@ def test_choices_by_earlier_code_are_counted(tmp_path):
     assert said in page
 
 
-def test_older_trials_with_other_settings_still_count(tmp_path):
-    write_trial(tmp_path, 0, "aaaaaaaa", MINE | {"densify.views": 5}, psnr=27.0, _code=code(OLD))
-    write_trial(tmp_path, 0, "bbbbbbbb", MINE | {"densify.views": 8}, psnr=28.0, _code=code(NEW))
-    experiment = loaded(tmp_path)
-    assert (len(experiment.trials), experiment.older, experiment.warnings) == (2, (), ())
-
-
-@pytest.mark.parametrize(
-    "old, new, part",
-    [
-        ({"_code": code()}, {"_code": code(train=2)}, "stage train"),
-        (
-            {"_code": {**code(), "packages": {"train": "released"}}},
-            {"_code": {**code(), "packages": {"train": "c" * 16}}},
-            "gsbench's train",
-        ),
-    ],
-)
-def test_older_trials_of_gsbench_are_left_out(tmp_path, old, new, part):
-    finished_at(write_trial(tmp_path, psnr=27.0, **old), 1000)
-    finished_at(write_trial(tmp_path, 1, psnr=27.0, **new), 2000)
+def test_trials_of_an_edited_gsbench_are_versions_and_an_update_is_none(tmp_path):
+    released, edited = ({**code(), "packages": {"train": v}} for v in ("released", "c" * 16))
+    finished_at(write_trial(tmp_path, psnr=27.0, _code=released), 1000)
+    finished_at(write_trial(tmp_path, 1, psnr=27.0, _code=edited), 2000)
     experiment = loaded(tmp_path)
     assert [trial.seed for trial in experiment.trials] == [1]
-    assert f"made by earlier versions of {part}: " in experiment.warnings[0]
+    assert "made by earlier versions of gsbench's train: " in experiment.warnings[0]
+    finished_at(write_trial(tmp_path / "b", psnr=27.0, _code=code()), 1000)
+    finished_at(write_trial(tmp_path / "b", 1, psnr=27.0, _code=code(train=2)), 2000)
+    assert len(loaded(tmp_path / "b").trials) == 2
 
 
-def test_the_code_that_is_here_now_counts_before_what_was_finished_last(tmp_path, monkeypatch):
+def test_the_code_of_the_newest_question_counts_wherever_one_stands(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "patient.py").write_text("x = 1\n")
     here = module_digest("patient", str(tmp_path))
-    made = {"sources": {"patient": here}, "stages": STAGES}
-    finished_at(write_trial(tmp_path, 0, "aaaaaaaa", MINE, psnr=27.0, _code=made), 1000)
-    other = {"sources": {"patient": NEW}, "stages": STAGES}
-    finished_at(write_trial(tmp_path, 0, "bbbbbbbb", MINE, psnr=28.0, _code=other), 2000)
-    assert trials_of(tmp_path)[0].metrics["psnr"] == 27.0
-    (tmp_path / "patient.py").write_text("# a comment\nx  =  1\n")
-    table = table_of(tmp_path)
-    assert table.rows[0].entries[0].text == "27.00"
-    assert not any("edited since" in note for note in table.notes)
+    for number, (name, digest) in enumerate((("aaaaaaaa", here), ("bbbbbbbb", NEW))):
+        made = {"sources": {"patient": digest}, "stages": STAGES}
+        path = write_trial(tmp_path, 0, name, MINE, psnr=27.0 + number, _code=made)
+        finished_at(path, 1000 + number)
+    assert trials_of(tmp_path)[0].metrics["psnr"] == 28.0  # without a question, what ended last
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert trials_of(tmp_path)[0].metrics["psnr"] == 28.0
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "patient.py").write_text("x = 2\n")
     table = table_of(tmp_path)
     assert table.rows[0].entries[0].text == "28.00"
@@ -143,9 +129,8 @@ def test_arms_are_compared_unless_they_share_code_in_two_versions(tmp_path, firs
     write_trial(tmp_path, 0, "aaaaaaaa", psnr=27.0, **first)
     write_trial(tmp_path, 0, "bbbbbbbb", psnr=28.0, densify="other", **second)
     table = table_of(tmp_path)
-    assert [entry.bold for row in table.rows for entry in row.entries] == [False, best]
-    said = "garden: not compared, no best marked: the arms differ in code of mine."
-    assert (said in table.notes) == (not best)
+    said = "the arms differ in code of mine, so they are not compared"
+    assert (said in table.verdicts[0]) == (not best)
 
 
 def test_explain_names_the_commit_and_the_edited_packages(tmp_path):

@@ -30,7 +30,7 @@ from tests.tracking.helpers import (
     run_of,
     write_trial,
 )
-from tests.trials import trial_values, write_runs
+from tests.trials import ask_about, trial_values, write_runs
 from tests.view.browser import Browser
 
 NOTE, VIEW = "mlflow.note.content", "mlflow.sharedViewState.gsbench"
@@ -104,20 +104,13 @@ def test_only_new_tags_are_sent_and_too_long_ones_are_left_out():
     assert sent == {VIEW: "new"}
 
 
-def test_a_description_begins_with_the_verdict_also_without_a_declared_metric(tmp_path):
-    write_sweep(tmp_path)
-    text = description(read_experiment(tmp_path / "swept"))
-    (first, *_) = text.splitlines()
-    assert first.startswith(
-        "**a_init-volumetric against a_init-adc, on these scenes: better in PSNR"
-    )
-    assert "Exploratory: no metric was declared (eval.primary)" in text
-
-
-def test_the_first_line_hides_no_metric_that_got_worse(tmp_path):
-    write_runs(tmp_path, effect={"psnr": 1.0, "ssim": -0.05}, trial_noise=0.05)
-    first = description(read_experiment(tmp_path / "exp")).splitlines()[0]
-    assert "better in PSNR; worse in SSIM;" in first
+def test_a_description_begins_with_the_verdict(tmp_path):
+    write_runs(tmp_path, effect={"psnr": 1.0}, trial_noise=0.05)
+    ask_about(tmp_path)
+    text = description(read_experiment(tmp_path / "exp"))
+    assert text.startswith("**sfm-volumetric against sfm-adc: BETTER, PSNR (dB) +1.0")
+    assert text.count("BETTER") == 2  # the first line, and that of the table
+    assert "- BETTER: sfm-volumetric against sfm-adc: better in PSNR (dB) on these scenes" in text
 
 
 def test_a_long_description_is_cut_at_a_line(tmp_path):
