@@ -27,7 +27,7 @@ from gsbench.files import (
 )
 from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.init import Sfm
-from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER, PICTURE_FILE, REPORT_FILE
+from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER, REPORT_FILE
 from gsbench.logs import log_to
 from gsbench.normalization import Normalization
 from gsbench.parsing import read_json, read_typed
@@ -62,6 +62,7 @@ from gsbench.runs.trial_record import (
     Code,
     Declared,
     Evaluation,
+    Oddity,
     Training,
     TrialRecord,
     TwinViews,
@@ -69,6 +70,7 @@ from gsbench.runs.trial_record import (
 )
 from gsbench.runs.user_code import user_modules
 from gsbench.scene.colmap_files import model_files
+from gsbench.scene.rules import settle
 from gsbench.scene.types import Capture, Scene
 from gsbench.system.install import version_of
 from gsbench.system.locks import hold
@@ -267,8 +269,8 @@ def _publish(
 
     The model gets the coordinates in which the scene was given.
     """
-    stages = keys.INIT, keys.TRAIN, keys.EVALUATE, keys.GROUND_TRUTH
-    init, trained, evaluated, truth = (entries[stage.name].path for stage in stages)
+    stages = keys.TRAIN, keys.EVALUATE, keys.GROUND_TRUTH
+    trained, evaluated, truth = (entries[stage.name].path for stage in stages)
     links = {
         folder / name: trained / name for name in PUBLISHED_TRAINING if (trained / name).exists()
     }
@@ -281,8 +283,6 @@ def _publish(
     }
     for name, source in pictures.items():
         links |= {folder / name / file.name: file for file in sorted(source.glob("*.png"))}
-    if (init / PICTURE_FILE).exists():
-        links[folder / layout.FIGURES / layout.INITIAL_CLOUD] = init / PICTURE_FILE
     for link, file in links.items():
         link.parent.mkdir(exist_ok=True)
         if file.name == layout.POINT_CLOUD and not normalization.is_identity:
@@ -325,11 +325,17 @@ def results_of(
     entries by stage. ``code`` maps the parts of gsbench's source that the steps used to their
     states.
     """
-    stages = keys.INIT, keys.TRAIN, keys.EVALUATE
+    stages = keys.TRAIN, keys.EVALUATE
     init, trained, evaluated = (entries[stage.name] for stage in stages)
     training = read_typed(trained.path / layout.TRAINING, Training)
     evaluation = read_typed(evaluated.path / layout.METRICS, Evaluation)
     manifest = read_manifest(evaluated.path)
+    init_report = read_json(init.path / REPORT_FILE)
+    of_model = [Oddity(**odd) for odd in init_report.get("oddities", ())]
+    oddities = [*capture.oddities, *scene.oddities, *of_model, *training.oddities]
+    # A stage of the store may have been made with a rule accepted that is not accepted here.
+    refused = [odd for odd in oddities if odd.refused]
+    settle(refused, f"scene {capture.name}", capture.accept)
     is_ready_made = training.trained_by is None and not training.iterations
     seconds = {"init": init.seconds, "train": training.seconds, "evaluate": evaluated.seconds}
     if is_ready_made:
@@ -354,6 +360,7 @@ def results_of(
         declared=_declared_sweep(values),
         metric_facts=evaluation.facts,
         metrics_at=evaluation.at,
+        oddities=oddities,
         twins=TwinViews(
             left_out={**capture.left_out, **scene.twins.left_out}, near=dict(scene.twins.near)
         ),
@@ -370,7 +377,7 @@ def results_of(
         held_out=capture.held_out,
         resolution=max((view.camera.width, view.camera.height) for view in views),
         events=sum_events(read_rows(trained.path / layout.EVENTS)),
-        init_report=read_json(init.path / REPORT_FILE),
+        init_report=init_report,
         hashes={
             "config": config_hash(values),
             "arm": arm_hash(values),

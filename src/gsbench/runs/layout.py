@@ -49,5 +49,4 @@ LINEAGE = "lineage.npz"  # each Gaussian's parent, and the rule that made it
 RENDERS, GROUND_TRUTH = "renders", "ground_truth"  # a picture per test view
 MASKS = "masks"  # masks of test views: ignored pixels are black
 FIGURES = "figures"  # pictures for the report
-INITIAL_CLOUD = "initial_cloud.png"  # in FIGURES
 ELLIPSOIDS = "ellipsoids.png"  # in FIGURES

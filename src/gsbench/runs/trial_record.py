@@ -287,6 +287,7 @@ class Training(Record):
     # gsbench's commit, and whether files were edited
     checkout: dict[str, Any] = field(default_factory=dict)
     initial_cloud: InitialCloud | None = None
+    oddities: list[Oddity] = field(default_factory=list)  # of the initial points
     # compiling kernels for it, in no other time; None if another program trained
     compile_seconds: Amount | None = None
     evaluated_from: Literal["model", "renders"] | None = None

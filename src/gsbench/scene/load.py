@@ -44,8 +44,8 @@ from gsbench.scene.images import (
     write_png,
 )
 from gsbench.scene.masks import WHITE, Mask, read_mask, resize_mask, write_mask
-from gsbench.scene.options import MIN_IMAGES, downscaled_size
-from gsbench.scene.rules import inspect, settle
+from gsbench.scene.options import downscaled_size
+from gsbench.scene.rules import MIN_IMAGES, inspect, settle
 from gsbench.scene.types import Camera, CameraModel, Capture, Scene, View, to_pinhole
 from gsbench.scene.undistortion import lens_findings, undistort
 from gsbench.system.isolate import CrashError, run_isolated
@@ -143,7 +143,10 @@ def load_scene(
             shutil.rmtree(folder)
         _prepare_views(folder, capture, Path(model_dir), downscaling, progress)
         prepared = _read_prepared(folder)
-    entries, oddities = prepared.views, settle(prepared.oddities, capture.accept)
+    entries, oddities = (
+        prepared.views,
+        settle(prepared.oddities, f"scene {capture.name}", capture.accept),
+    )
     oddities += _inspect_views(capture, entries)
 
     def mask_of(name: str) -> Mask | None:

@@ -208,7 +208,7 @@ class SceneConfig:
         if self.split == "sector" and self.kind == "photos":
             raise InputError(
                 "scene.split=sector needs the cameras, and these photographs came without: give a "
-                "COLMAP model (scene=colmap)"
+                "COLMAP model (scene=colmap; gsbench export writes that of a trial)"
             )
         if self.kind == "courtyard":
             check_final_size(

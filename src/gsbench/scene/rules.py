@@ -69,9 +69,13 @@ class Rule:
     mend: str
     fixed: bool = False
 
-    def judge(self, subject: Any, where: str) -> Oddity | None:
-        """The oddity of a subject, of which the worst finding is told; None if all is fine."""
-        odd = [found for found in self.measure(subject) if not _within(found.value, self.fine)]
+    def judge(self, subject: Any) -> Oddity | None:
+        """The oddity of a subject, told by its worst finding; None if all is fine."""
+        return self.tell(self.measure(subject))
+
+    def tell(self, measured: Iterable[Finding]) -> Oddity | None:
+        """The oddity among findings."""
+        odd = [found for found in measured if not _within(found.value, self.fine)]
         if not odd:
             return None
         worst = max(odd, key=lambda found: _beyond(found.value, self.fine))
@@ -80,7 +84,7 @@ class Rule:
         value = min(max(worst.value, -MAX_NUMBER), MAX_NUMBER) if worst.value == worst.value else -1
         return Oddity(
             rule=self.id,
-            line=f"{where}: {FORM.format(f'{self.say}: {self.mend}', **facts)}",
+            line=FORM.format(f"{self.say}: {self.mend}", **facts),
             value=value,
             refused=not all(_within(found.value, self.usable) for found in odd),
         )
@@ -101,21 +105,21 @@ def inspect(
 
     Raises InputError for what is not usable, unless its rule is in ``accept``.
     """
-    judged = (rule.judge(subject, where) for rule in RULES if rule.stage == stage)
-    return settle([found for found in judged if found is not None], accept)
+    judged = (rule.judge(subject) for rule in RULES if rule.stage == stage)
+    return settle([found for found in judged if found is not None], where, accept)
 
 
-def settle(found: Sequence[Oddity], accept: Sequence[str]) -> tuple[Oddity, ...]:
+def settle(found: Sequence[Oddity], where: str, accept: Sequence[str] = ()) -> tuple[Oddity, ...]:
     """Log oddities, here or earlier found, and refuse those that are not usable nor accepted."""
     # Lines come first, because they may explain an error.
     for odd in sorted(found, key=lambda odd: odd.refused):
         if not odd.refused:
-            log.warning("%s", odd.line)
+            log.warning("%s: %s", where, odd.line)
         elif odd.rule in accept:
-            log.warning("%s (accepted: %s)", odd.line, odd.rule)
+            log.warning("%s: %s (accepted: %s)", where, odd.line, odd.rule)
         else:
             way = "" if BY_ID[odd.rule].fixed else f" (or scene.accept=[{odd.rule}])"
-            raise InputError(f"{odd.line}{way}")
+            raise InputError(f"{where}: {odd.line}{way}")
     return tuple(found)
 
 
@@ -210,15 +214,10 @@ def _names(name: str) -> Callable[[Any], Iterable[Finding]]:
     return lambda subject: [Finding(len(getattr(subject, name)), getattr(subject, name))]
 
 
-def _given(subject: Any) -> Iterable[Finding]:
-    """The measure of rules whose values the caller has (`given`)."""
-    return [subject]
-
-
 def given(rule: str, value: float, where: str, **facts: Any) -> None:
     """Judge a value that the caller measured by one rule that cannot be accepted."""
-    found = BY_ID[rule].judge(Finding(value, (), facts), where)
-    settle([] if found is None else [found], ())
+    found = BY_ID[rule].tell([Finding(value, (), facts)])
+    settle([] if found is None else [found], where)
 
 
 def _panoramas(raw: Any) -> Iterable[Finding]:
@@ -232,7 +231,7 @@ RULES = (
     Rule(
         "too-few-images",
         "file",
-        _given,
+        _fact("value"),
         at_least(MIN_IMAGES),
         at_least(MIN_IMAGES),
         "{value:n image} {which}, but at least 3 are needed",
@@ -242,7 +241,7 @@ RULES = (
     Rule(
         "view-size",
         "file",
-        _given,
+        _fact("value"),
         at_least(MIN_SIZE),
         at_least(MIN_SIZE),
         "scene.downscale={downscale}{limit} leaves {size} px of {full}",
@@ -252,7 +251,7 @@ RULES = (
     Rule(
         "principal-point-of-other-size",
         "file",
-        _given,
+        _fact("value"),
         (1 / 1.5, 1.5),  # copies are halved; other points are off by few percent
         (1 / 1.5, 1.5),
         "its principal point ({cx:g}, {cy:g}) is the centre of a photograph of another size than "
@@ -263,7 +262,7 @@ RULES = (
     Rule(
         "mask-of-other-size",
         "file",
-        _given,
+        _fact("value"),
         at_most(0),
         at_most(0),
         "the mask is {size} px and its image {name} {full}",
@@ -273,7 +272,7 @@ RULES = (
     Rule(
         "black-mask",
         "file",
-        _given,
+        _fact("value"),
         ABOVE_ZERO,
         ABOVE_ZERO,
         "the mask is black all over, so no pixel counts",
@@ -283,7 +282,7 @@ RULES = (
     Rule(
         "grey-mask",
         "file",
-        _given,
+        _fact("value"),
         at_most(0.05),  # a photograph has far more
         at_most(0.05),
         "{value:.0%} of its pixels are grey, so it is not a mask",
@@ -292,21 +291,12 @@ RULES = (
     ),
     # ---- a folder with photographs
     Rule(
-        "panorama",
-        "capture",
-        _panoramas,
-        at_most(0),
-        at_most(0),
-        "{count:n photograph} are panoramas, as their XMP says (equirectangular): {names:few}",
-        "split them into pinhole views first, for example with COLMAP's panorama_sfm",
-    ),
-    Rule(
         "no-pose",
         "read",
         _findings("no-pose"),
         at_most(0),
         ANY,
-        "{count:n photograph} have no pose in the model: {names:few}",
+        "{count:n photograph} without a pose in the model: {names:few}",
         "they are not used",
     ),
     Rule(
@@ -315,7 +305,7 @@ RULES = (
         _findings("no-file"),
         at_most(0),
         ANY,
-        "{count:n image} of the cameras have no file: {names:few}",
+        "{count:n image} with a camera but without a file: {names:few}",
         "they are not used",
     ),
     Rule(
@@ -337,6 +327,15 @@ RULES = (
         "the focal length is used",
     ),
     # ---- a capture as it is used
+    Rule(
+        "panorama",
+        "capture",
+        _panoramas,
+        at_most(0),
+        at_most(0),
+        "{count:n photograph} declared as panoramas by XMP (equirectangular): {names:few}",
+        "split them into pinhole views first, for example with COLMAP's panorama_sfm",
+    ),
     Rule(
         "copies",
         "capture",
@@ -374,7 +373,7 @@ RULES = (
         _kept("train"),
         at_least(1),
         at_least(1),
-        "no training view has a pose, or all are copies of test views",
+        "no training view has a pose, or all of them are copies of test views",
         "change the split or the init",
         fixed=True,
     ),
@@ -394,7 +393,7 @@ RULES = (
         _names("unplaced"),
         at_most(0),
         ANY,
-        "{count:n view} have no pose and are left out: {names:few}",
+        "{count:n view} without a pose left out: {names:few}",
         "take photographs with more overlap, or another init",
     ),
     Rule(
@@ -412,7 +411,7 @@ RULES = (
         _near_twins,
         at_most(0),
         ANY,
-        "{count} of {tested:n test view} have a near twin in training: {names:few}",
+        "{count} of {tested:n test view} with a near twin in training: {names:few}",
         "such views measure memory; scene.split=sector holds out whole parts",
     ),
     Rule(

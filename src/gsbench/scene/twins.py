@@ -16,6 +16,7 @@ from PIL import Image
 from gsbench.files import file_sha256
 from gsbench.scene.masks import resize_mask
 from gsbench.scene.names import stem_of
+from gsbench.scene.rules import given
 from gsbench.scene.types import Scene, Twins, View
 
 # Formats in the order of preference between equally frequent ones: a JPEG usually has a focal
@@ -84,7 +85,7 @@ def without_copies(scene: Scene) -> Scene:
     """Leave out training views that have the pixels of a test view, and record near twins.
 
     Pixels are compared at their final size, where both masks count. ``twins`` of the returned scene
-    holds both.
+    holds both. Raises InputError if no training view is left.
     """
     small = {view.name: small_picture(view) for view in (*scene.train, *scene.test)}
     equal: dict[str, str] = {}
@@ -104,6 +105,7 @@ def without_copies(scene: Scene) -> Scene:
         if trained_on := [twin for twin in found if twin[1] not in equal]:
             near[name] = max(trained_on)[1]
     train = tuple(view for view in scene.train if view.name not in equal)
+    given("no-training-view", len(train), f"scene {scene.name}")
     return replace(scene, train=train, twins=Twins(left_out=equal, near=near))
 
 
