@@ -71,7 +71,7 @@ def test_what_is_swept_on_a_scene_or_belongs_to_the_scene_is_not_stated(tmp_path
     [
         ("protocol", ("paper-1", "standard-1")),
         ("iterations", (2000, 7000)),
-        ("raster", ("cpu", "gsplat")),
+        ("raster", ("cpu", "triton")),
         ("split", ("every 8th", "sector 90 deg")),
     ],
 )

@@ -26,7 +26,7 @@ DEFAULT_METRIC = "psnr"
 # the errors of Hydra for a user's words and files
 HYDRA_ERRORS = (HydraException, OmegaConfBaseException, OSError)
 
-Run = Callable[[Sequence[Trial]], None]  # runs trials to their ends
+Run = Callable[[Sequence[Trial]], object]  # runs trials to their ends
 
 
 @dataclass

@@ -25,7 +25,7 @@ LITTLE_SPACE = 5_000_000_000  # bytes
 REQUIRED = ("pycolmap", "kornia", "numba", "mlflow")
 OPTIONAL = {  # module -> what needs it, and the extra that brings it
     "transformers": ("init=dim", "dim"),
-    "gsplat": ("raster=gsplat", "gsplat"),
+    "gsplat": ("benchmarks.gsplat_raster", "gsplat"),
     "piq": ("MS-SSIM, IW-SSIM, FSIM and GMSD (eval.more)", "piq"),
     "optuna": ("searches (hydra.sweeper.tune)", "search"),
     "tensorboard": ("tracking=tensorboard", "tensorboard"),

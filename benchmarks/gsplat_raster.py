@@ -1,10 +1,14 @@
-"""gsplat's CUDA kernels (Ye et al., arXiv 2409.06765) under the contract, to compare.
+"""gsplat's CUDA kernels (Ye et al., arXiv 2409.06765) behind gsbench's contract, to compare speeds.
 
-The contract is that of ``raster.base``. This module calls gsplat's functions one by one, so that
-the conventions of 3DGS hold, which gsplat's ``rasterization`` does not follow: the near plane is
-0.2, and a Gaussian reaches the tiles of a square of 3 sigma along its larger axis at any opacity.
-It works with gsplat 1.5.3 and with 1.6, whose harmonics take other arguments. Some differences are
-inside gsplat's kernels and remain:
+    pip install -e '.[gsplat]'
+    gsbench bench --raster triton,benchmarks.gsplat_raster.GsplatRasterizer
+    gsbench ... raster._target_=benchmarks.gsplat_raster.GsplatRasterizer raster.name=gsplat
+
+The contract is that of ``gsbench.raster.base``. This module calls gsplat's functions one by one, so
+that the conventions of 3DGS hold, which gsplat's ``rasterization`` does not follow: the near plane
+is 0.2, and a Gaussian reaches the tiles of a square of 3 sigma along its larger axis at any
+opacity. It works with gsplat 1.5.3 and with 1.6, whose harmonics take other arguments. Some
+differences are inside gsplat's kernels and remain:
 
 - ``image`` and ``alpha``: gsplat 1.5 clamps alpha to 0.999 (1.6 to 0.99, as the contract), and the
   clamp blocks the gradient. A tile at the edge of the square is included if any part of it is
@@ -35,9 +39,9 @@ from torch.autograd.function import once_differentiable
 from gsbench.errors import InputError
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import CONSTANTS, RenderOutput
-from gsbench.raster.executors import find_executor
 from gsbench.raster.staged import Readback, bad_values, check_settings, raise_for_values
 from gsbench.scene.types import Camera
+from gsbench.system.install import install_command
 
 MAX_RADIUS = 2**24  # px; keeps the tile numbers of a huge Gaussian within int32
 COEFFICIENTS = {0: 1, 1: 4, 2: 9, 3: 16}  # number of harmonics up to each degree
@@ -56,9 +60,7 @@ class GsplatRasterizer:
             try:
                 library = importlib.import_module("gsplat")
             except ImportError as error:
-                raise InputError(
-                    f"raster=gsplat needs gsplat: {find_executor('gsplat').install}"
-                ) from error
+                raise InputError(f"needs gsplat: {install_command('gsplat')}") from error
         self.library = library
         # gsplat 1.5 takes directions, 1.6 means and poses.
         self._takes_directions = "dirs" in inspect.signature(library.spherical_harmonics).parameters

@@ -9,8 +9,8 @@ import weakref
 import pytest
 import torch
 
+from benchmarks.gsplat_raster import GsplatRasterizer, _reaches_image, _square_radii
 from gsbench.raster.contract import Case, departures, render_with_gradients
-from gsbench.raster.gsplat import GsplatRasterizer, _reaches_image, _square_radii
 from gsbench.raster.reference import ReferenceRasterizer, project, tile_rectangles
 from tests.gaussians.helpers import front_camera, random_gaussians
 from tests.gaussians.helpers import leaves as of_gaussians
@@ -24,7 +24,7 @@ PLAIN = FAINT.gaussians().map(torch.Tensor.float)
 @pytest.fixture
 def library():
     pytest.importorskip("gsplat", reason="the stand-in is made of gsplat's torch definitions")
-    from tests.raster import stand_in_gsplat
+    from tests.bench import stand_in_gsplat
 
     stand_in_gsplat.calls.clear()
     stand_in_gsplat.graphs.clear()
