@@ -12,14 +12,7 @@ WITHOUT_EFFECT = ("threads", "weights", "download", "time_limit_minutes")
 # Settings that only declare what is accepted, how results are read or what may be turned off.
 # train.steps_scaler has been applied to the steps.
 DECLARED = {
-<<<<<<< HEAD
     "scene": ("accept",),
-    "eval": ("primary", "controls"),
-    "densify": ("switches",),
-    "train": ("steps_scaler",),
-}
-NOT_HASHED = ("name", "seed", "device", "threads", "runs", PERMISSIONS, "tracking", "launch")
-=======
     "eval": ("primary", "baseline", "controls"),
     "densify": ("switches",),
     "train": ("steps_scaler",),
@@ -36,7 +29,6 @@ NOT_HASHED = (
     "tracking",
     "launch",
 )
->>>>>>> main
 # Settings in which trials of one cell may differ: they do not change what is computed.
 # "x" stands for x and all below it (x.y).
 IGNORED_SETTINGS = (
