@@ -21,7 +21,7 @@ from gsbench.app.hydra_app import (
     words_without_sweeper,
 )
 from gsbench.errors import GsbenchError, InputError
-from gsbench.launch.jobs import Outcome
+from gsbench.launch.outcomes import Outcome
 from tests.app.stand_ins import done, trial
 from tests.helpers import refusal
 from tests.trials import write_results

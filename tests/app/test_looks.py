@@ -10,7 +10,7 @@ from gsbench import cli
 from gsbench.analysis.comparison import compare
 from gsbench.analysis.judgement import judge
 from gsbench.analysis.results import read_experiment
-from gsbench.launch.jobs import Outcome, outcome_of_results
+from gsbench.launch.outcomes import Outcome, outcome_of_results
 from gsbench.launch.record import add_to_plan, declare
 from gsbench.runs.experiments import read_declarations
 from gsbench.runs.layout import RESULTS

@@ -15,7 +15,7 @@ from gsbench.launch.batch import (
     need_no_check,
     run_batch,
 )
-from gsbench.launch.jobs import Outcome
+from gsbench.launch.outcomes import Outcome
 from gsbench.runs.experiments import read_declarations
 from gsbench.runs.plan import read_plan
 from tests.helpers import refusal

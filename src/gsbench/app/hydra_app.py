@@ -40,7 +40,8 @@ from gsbench.config.trust import HYDRAS_CALLBACKS, load_callbacks
 from gsbench.errors import GsbenchError, InputError
 from gsbench.files import checked_runs_folder
 from gsbench.launch.batch import begin_for_another_launcher
-from gsbench.launch.jobs import Outcome, check_job_links, outcome_of_error
+from gsbench.launch.jobs import check_job_links
+from gsbench.launch.outcomes import Outcome, outcome_of_error
 from gsbench.logs import set_up_logging
 from gsbench.runs.experiments import metric_and_question
 from gsbench.runs.nested import targets_in

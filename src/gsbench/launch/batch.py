@@ -11,7 +11,8 @@ from gsbench.config.schema import COMPONENTS
 from gsbench.errors import InputError
 from gsbench.files import FORBIDDEN, checked_runs_folder, make_runs_folder, storage_errors
 from gsbench.launch.dry_run import unavailable_now
-from gsbench.launch.jobs import Outcome, outcome_of_results, run_local, run_serial
+from gsbench.launch.jobs import run_local, run_serial
+from gsbench.launch.outcomes import Outcome, outcome_of_results
 from gsbench.launch.record import add_to_plan, declare, declared_metrics
 from gsbench.launch.slurm import run_slurm
 from gsbench.runs.freshness import Change
