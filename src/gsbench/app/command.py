@@ -131,9 +131,12 @@ def require_waiting(verb: str, trials: Sequence[Trial]) -> None:
         raise InputError(f"{verb} waits for its trials: leave out launch.wait=false")
 
 
-def run_trials(trials: Sequence[Trial]) -> int:
-    """Run the ``trials`` that are not done, by their launcher; returns the exit code."""
-    return summarize(run_batch(trials), trials)
+def run_trials(trials: Sequence[Trial], asks: bool = True) -> int:
+    """Run the ``trials`` that are not done, by their launcher; returns the exit code.
+
+    With ``asks``, their questions are written down first.
+    """
+    return summarize(run_batch(trials, asks), trials)
 
 
 def list_trials(trials: Sequence[Trial]) -> None:

@@ -19,9 +19,10 @@ from gsbench.analysis.cells import swept_settings
 from gsbench.analysis.comparison import VERDICT, compare
 from gsbench.analysis.quantities import metric_keys
 from gsbench.analysis.results import Experiment, TrialResult, newest_code, read_experiment
+from gsbench.analysis.sentences import headline
+from gsbench.analysis.statistics import UNDECIDED
 from gsbench.analysis.table_formats import to_markdown
 from gsbench.analysis.tables import build_table
-from gsbench.analysis.verdict_words import headline
 from gsbench.errors import InputError
 from gsbench.tracking.mlflow_sink import DESCRIPTION, connect, ensure_experiment
 from gsbench.tracking.trial import EVAL, arm_name, eval_name
@@ -91,10 +92,9 @@ def description(experiment: Experiment) -> str:
     except InputError as error:  # cells would average unlike trials
         lines = [f"No table: {error}"]
     rest = [line for line in lines if not line.startswith((f"- {VERDICT}", "#"))]
-    # The page shows only the first line until it is clicked: decided pairs of arms come first
-    # there.
-    ordered = sorted(comparison.answers, key=lambda one: one.undecided)
-    answer = "; ".join(map(headline, ordered)) or NO_VERDICT
+    # The page shows only the first line until it is clicked: decided ideas come first there.
+    ordered = sorted(comparison.answers, key=lambda one: one.verdict.outcome == UNDECIDED)
+    answer = "; ".join(headline(one.verdict) for one in ordered) or NO_VERDICT
     end = f"\n\n{OWN_NOTE} {experiment.name}` shows more."
     text = "\n".join([f"**{answer}**", "", *verdicts, "", *rest]).strip()
     if len(text) + len(end) > MAX_TAG:
