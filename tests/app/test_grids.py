@@ -8,8 +8,8 @@ from gsbench import cli
 from gsbench.app.command import compose_trials
 from gsbench.app.grids import checked_grids, words_of_grids
 from gsbench.config.compose import compose_one
-from gsbench.launch.record import add_to_plan
-from gsbench.runs.plan import read_plan
+from gsbench.launch.record import record
+from gsbench.runs.commands import read_history
 from gsbench.runs.trial_folder import TrialFolder
 from tests.helpers import refusal, write
 from tests.trials import write_results
@@ -114,9 +114,9 @@ def test_plan_dry_run_and_retry_see_one_experiment(runs, monkeypatch, capsys, sa
     words = split("+experiment=threshold densify.volume_threshold=0.5 seed=0")
     assert "2 trials: 2 missing" in said(*words, "--dry-run")
     trials = compose_trials(words)
-    add_to_plan(trials)
+    record(trials, asks=False)
     first, second = (TrialFolder.of(trial.values).path for trial in trials)
-    assert list(read_plan(runs / "threshold")) == [first, second]
+    assert list(read_history(runs / "threshold").planned) == [first, second]
     write(first / "config.yaml", trials[0].yaml)
     write_results(first, trials[0].values)
     ran = []

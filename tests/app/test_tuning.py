@@ -20,7 +20,7 @@ from gsbench.runs.experiments import Arm, TuningRecord
 from gsbench.runs.layout import RESULTS, TUNING
 from gsbench.runs.trial_record import record_from
 from tests.helpers import read_json, write
-from tests.launch.test_declare import TINY
+from tests.launch.test_record import TINY
 from tests.trials import write_as
 
 optuna = pytest.importorskip("optuna", reason="needs Optuna (extra search)")

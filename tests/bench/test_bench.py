@@ -196,15 +196,15 @@ def test_a_gpu_is_for_rasterizers_that_need_one_and_for_a_users_own(monkeypatch)
         monkeypatch.setattr(torch.cuda, "is_available", lambda: is_there)  # noqa: B023
         assert device_of("mine.Rasterizer").type == own
         assert device_of("cpu").type == "cpu"
-    with refusal("gsplat runs on a CUDA device, and torch finds none"):
-        device_of("gsplat")
+    with refusal("triton runs on a CUDA device, and torch finds none"):
+        device_of("triton")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    assert device_of("gsplat").type == "cuda"
+    assert device_of("triton").type == "cuda"
     disabled = []
     monkeypatch.setattr(measure, "disable_tf32", lambda: disabled.append(1))
     monkeypatch.setattr(measure, "make_scene", lambda *_: disabled[0] / 0)
     with pytest.raises(ZeroDivisionError):  # not an IndexError: it was called before
-        Stepper("gsplat", Setting("trained", 40, 30, 50))
+        Stepper("triton", Setting("trained", 40, 30, 50))
     assert isinstance(make_rasterizer("reference", torch.device("cpu"), 1), ReferenceRasterizer)
 
 

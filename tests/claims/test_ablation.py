@@ -23,7 +23,7 @@ from gsbench.runs.config_hash import config_hash
 from gsbench.settings import Switch
 from tests.analysis.helpers import trials_of
 from tests.helpers import refusal
-from tests.launch.test_declare import TINY
+from tests.launch.test_record import TINY
 from tests.trials import write_trial
 
 NESTED = {
@@ -140,14 +140,14 @@ def write_ablation(runs, gains, seeds=3):
 def test_each_combination_is_judged_against_the_run_with_all_parts(tmp_path):
     keys = write_ablation(tmp_path, {"rule": 1.0, "shrink": 0.4, "once": 0.0})
     verdicts = judge_runs(trials_of(tmp_path), keys, "psnr")
-    found = {str(one.question.arm): (round(one.mean or 0.0, 2), one.outcome) for one in verdicts}
+    found = {str(one.question.idea): (round(one.mean or 0.0, 2), one.outcome) for one in verdicts}
     assert found == {
         "without shrink": (-0.4, "refuted"),
         "without once": (0.0, "too small to matter"),
         "without once and shrink": (-0.4, "refuted"),
         "without once, rule and shrink": (-1.4, "refuted"),
     }
-    assert verdicts[0].family == 4
+    assert verdicts[0].level == 0.05 / 4
     lines = markdown_table(verdicts)
     assert lines[0] == "| run | difference in PSNR (dB) from all parts | interval | verdict |"
     assert lines[2].startswith("| without once | ") or lines[2].startswith(
@@ -161,8 +161,8 @@ def test_a_combination_whose_trials_are_missing_has_no_verdict(tmp_path):
     for path in (tmp_path / "exp").glob(f"{keys[last]['courtyard']}-seed*/results.json"):
         path.unlink()
     verdicts = judge_runs(trials_of(tmp_path), keys, "psnr")
-    assert verdicts[-1].answer is None
-    assert markdown_table(verdicts)[-1].endswith("| – | – | courtyard: seed 0 has no partner |")
+    assert verdicts[-1].mean is None
+    assert "| – | – | 3 of 6 trials" in markdown_table(verdicts)[-1]
     assert len(markdown_table(verdicts[-1:])) == 3
 
 

@@ -20,10 +20,9 @@ from gsbench.analysis.table_formats import to_markdown
 from gsbench.claims.archive import unpack_archive
 from gsbench.claims.export import write_archive
 from gsbench.errors import InputError
-from gsbench.runs.experiments import Declaration, Question
-from tests.analysis.helpers import ADC, VOLUMETRIC, loaded, write_declared
+from tests.analysis.helpers import ADC, VOLUMETRIC, loaded
 from tests.helpers import read_json, refusal, write
-from tests.trials import search_record, write_runs
+from tests.trials import ask_about, search_record, write_runs
 
 # as many trials as Table 1 has
 UNSIGNED = ("archive.json", "ro-crate-metadata.json")
@@ -31,8 +30,7 @@ MANY = {"scenes": [f"scene{k}" for k in range(9)], "seeds": range(3), "views": 2
 
 
 def declare(runs, metric="psnr"):
-    asked = Question(metric=metric, sign=0)
-    write_declared(runs, Declaration(time="2026-01-01T00:00:00Z", questions=(asked,)))
+    ask_about(runs, metric=metric)
 
 
 def export(tmp_path, **plan):
@@ -75,9 +73,8 @@ def test_results_settings_and_views_are_read_back(tmp_path):
         assert other.measured == int(one.measured)
         assert other.config == one.config
         assert read_views(other) == read_views(one)
-    assert (back.folder / "declared.jsonl").read_text() == (
-        there.folder / "declared.jsonl"
-    ).read_text()
+    assert back.history.questions == there.history.questions
+    assert (back.history.faults, back.history.commands[0].cwd) == ((), "")
 
 
 def test_an_archive_is_small_and_equal_results_give_equal_archives(tmp_path):
@@ -292,7 +289,7 @@ def test_a_trial_that_failed_forbids_the_same_verdict_in_the_archive(tmp_path, c
     back = unpack_archive(tmp_path / "exp.zip", tmp_path / "other")
     assert compare(back).sentences == compare(there).sentences
     assert "1 trial of one arm alone failed, stopped" in compare(back).sentences[0]
-    assert "unfinished" in back.warnings[0]
+    assert "failed" in back.warnings[0]
     assert b"/home/me" not in b"".join(members(tmp_path / "exp.zip").values())
 
 
@@ -342,14 +339,3 @@ def test_a_search_stays_a_search_and_a_tuned_arm_stays_tuned(runs, tmp_path, sai
     for one in (load_experiment(runs, "vth"), opened["vth"]):
         sheet = to_markdown(fairness_table(one.trials, ADC, VOLUMETRIC))
         assert "the best of 1 point by psnr" in sheet
-
-
-def test_a_time_that_only_a_file_knew_stays_the_time_of_measuring(tmp_path):
-    """Results that were there before their declaration are not declared by the journey."""
-    file = export(tmp_path)
-    for path in (tmp_path / "runs").glob("exp/*/*/*/results.json"):
-        os.utime(path, (1e9, 1e9))
-    write_archive(loaded(tmp_path / "runs"), file)
-    back = unpack_archive(file, tmp_path / "other")
-    assert {trial.measured for trial in back.trials} == {1e9}
-    assert compare(back).sentences == compare(loaded(tmp_path / "runs")).sentences

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from gsbench.files import file_sha256
-from gsbench.init import Dim, Sfm, SiftKornia
+from gsbench.init import Dim, Sfm
 from gsbench.init.base import MODEL_FOLDER
 from gsbench.scene.colmap import read_model
 from gsbench.scene.courtyard.render import render_courtyard
@@ -70,7 +70,6 @@ def bits(folder):
     "words",
     [
         SIFT,
-        ["init=sift_kornia"],
         [*SIFT, "scene.max_size=96"],
         split("init=random densify=taming init.count=3000 densify.max_gaussians=6000"),
         ["init=random", "densify=fastgs"],
@@ -130,7 +129,7 @@ def test_an_edited_mask_makes_a_new_trial_and_the_old_mask_finds_the_old_one(
     assert read_json(folder / "results.json")["hashes"] == first["hashes"]
 
 
-@pytest.mark.parametrize("make", [Sfm, SiftKornia, Dim])
+@pytest.mark.parametrize("make", [Sfm, Dim])
 def test_no_keypoint_lies_on_an_ignored_pixel(captures, tmp_path, make, request):
     """Without `prepare`, there are features below the masks that could be found."""
     options = {"init": {"first_octave": 0, "max_num_features": 1500}, "net": {"max_keypoints": 500}}

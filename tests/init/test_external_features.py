@@ -7,6 +7,7 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
+from kornia.feature import SIFTFeatureScaleSpace, laf_is_filled
 from numpy.testing import assert_allclose, assert_array_equal
 
 from gsbench.init import Sfm
@@ -22,12 +23,12 @@ from gsbench.init.colmap.features import extract_sift
 from gsbench.init.colmap.geometry import verification_options, verify_pairs
 from gsbench.init.colmap.mapping import map_images
 from gsbench.init.colmap.matches import match_sift
-from gsbench.init.networks.extractors import EXTRACTORS, extract_features
+from gsbench.init.networks.extractors import extract_features
 from gsbench.init.networks.features import Features, FeatureSettings
 from gsbench.logs import no_progress
 
 SIFT = FeatureSettings(
-    extractor="sift_kornia", matcher="mutual_nearest", max_image_size=1600, max_keypoints=2000
+    extractor="sift", matcher="mutual_nearest", max_image_size=1600, max_keypoints=2000
 )
 
 
@@ -82,9 +83,15 @@ def test_sift_through_the_external_path_gives_the_same_model(own_path, bare_phot
 
 def extract(path, max_image_size):
     """The features that kornia's SIFT finds."""
-    cpu = torch.device("cpu")
+    sift = SIFTFeatureScaleSpace(2000, descriptor_backend="pyramid").eval()
+
+    def found(image):
+        frames, responses, descriptors = sift(image.mean(dim=1, keepdim=True))
+        filled = laf_is_filled(frames)[0]
+        return frames[0, filled, :, 2], descriptors[0, filled], responses[0, filled]
+
     settings = replace(SIFT, max_image_size=max_image_size)
-    return extract_features(path, EXTRACTORS[SIFT.extractor](SIFT, None, cpu), settings, cpu)
+    return extract_features(path, found, settings, torch.device("cpu"))
 
 
 @pytest.mark.parametrize("max_image_size", [320, 213])

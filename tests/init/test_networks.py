@@ -8,11 +8,11 @@ from PIL import Image
 
 from gsbench.errors import GsbenchError
 from gsbench.files import file_sha256
-from gsbench.init import SiftKornia
+from gsbench.init import Dim
 from gsbench.init.networks import extract_and_match
 from gsbench.init.networks.extract_and_match import NetworkJob, open_store
 from gsbench.init.networks.features import Features
-from tests.helpers import refusal
+from tests.helpers import refusal, write
 
 NAMES = ("a.png", "b.png", "c.png")
 
@@ -50,7 +50,7 @@ class Networks:
 @pytest.fixture
 def networks(monkeypatch):
     made = Networks()
-    monkeypatch.setitem(extract_and_match.EXTRACTORS, "sift_kornia", made.build("extractor"))
+    monkeypatch.setitem(extract_and_match.EXTRACTORS, "superpoint", made.build("extractor"))
     monkeypatch.setattr(extract_and_match, "build_matcher", made.build("matcher"))
     monkeypatch.setattr(extract_and_match, "extract_features", made.extract)
     return made
@@ -63,9 +63,11 @@ def job(bare_photos, tmp_path):
     for number, name in enumerate(NAMES):
         Image.new("L", (8, 8), number).save(images / name)
     capture = replace(bare_photos, images=images, image_names=NAMES, test_names=())
-    options = SiftKornia(threads=1)
+    options = Dim(threads=1)
     work = tmp_path / "work"
-    return NetworkJob(options, options.feature_settings(), capture, None, work, None, None)
+    weights = [write(tmp_path / name, name) for name in ("extractor.pth", "matcher.pth")]
+    settings = options.feature_settings()
+    return NetworkJob(options, settings, "cpu", capture, None, work, *weights)
 
 
 def run(job, progress=lambda *at: None):
@@ -98,10 +100,10 @@ def test_images_without_keypoints_and_pairs_without_matches_are_counted(networks
 
 def test_nothing_to_match_is_refused(networks, job):
     networks.without = {(2, 3), (2, 4), (3, 4)}
-    with refusal("sift_kornia: no pair of images has a match"):
+    with refusal("dim: no pair of images has a match"):
         run(job)
     networks.keypoints = dict.fromkeys(NAMES, 0)
-    with refusal("sift_kornia: no keypoint in any image"):
+    with refusal("dim: no keypoint in any image"):
         run(replace(job, work_dir=job.work_dir / "other"))
 
 
@@ -126,7 +128,7 @@ def test_pairs_that_the_preview_leaves_out_are_counted(networks, job, monkeypatc
 
     monkeypatch.setattr(extract_and_match, "proposed_pairs", proposed)
     monkeypatch.setattr(extract_and_match, "STRONGEST", 2)
-    found = run(replace(job, options=SiftKornia(threads=1, pairs="auto")))
+    found = run(replace(job, options=Dim(threads=1, pairs="auto")))
     assert seen == [[[2.0]] * 2, [[3.0]] * 2, [[4.0]] * 2]
     assert networks.matched == [(2, 4)]
     assert (found.counts["pairs_selected"], found.counts["pairs_left_out"]) == (1, 2)
@@ -139,7 +141,9 @@ def test_the_weights_are_named_by_their_digests_and_tell_stored_files_apart(
     weights = tmp_path / "w.pth"
     weights.write_bytes(b"weights")
     found = run(replace(job, matcher_weights=weights))
-    assert found.settings["weights_sha256"] == {"w.pth": file_sha256(weights)}
+    assert found.settings["weights_sha256"] == {
+        file.name: file_sha256(file) for file in (job.extractor_weights, weights)
+    }
     assert (len(networks.extracted), len(networks.matched)) == (3, 6)
     assert run(replace(job, extractor_weights=weights)).settings["weights_sha256"]
     assert (len(networks.extracted), len(networks.matched)) == (6, 9)

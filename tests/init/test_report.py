@@ -7,10 +7,9 @@ import numpy as np
 import pycolmap
 import pytest
 from numpy.testing import assert_allclose
-from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from gsbench.init import MODEL_FOLDER, Sfm, picture
+from gsbench.init import MODEL_FOLDER, Sfm
 from gsbench.init.base import OWN_GAUGE_FOLDER, PoseErrors, Preparation, Timer
 from gsbench.init.colmap.alignment import (
     compare_poses,
@@ -20,8 +19,7 @@ from gsbench.init.colmap.alignment import (
 )
 from gsbench.init.colmap.mapping import MappingResult
 from gsbench.init.colmap.reconstruct import poses_by_name
-from gsbench.init.colmap_initializer import ReconstructionJob, finish
-from gsbench.init.picture import draw_cloud, view_from_above
+from gsbench.init.reconstruction import Job, Matching, finish
 from gsbench.init.report import find_warnings, make_report
 from gsbench.scene.types import Capture
 from tests.init.models import add_point, camera_at, model_with
@@ -163,9 +161,10 @@ def test_a_similarity_leaves_no_pose_errors_and_a_tilt_does():
 
 def finished(capture, folder, model, reference):
     """The report on an estimated ``model``, which is written below ``folder``."""
-    work = ReconstructionJob(Sfm(), capture, folder / "out", folder / "work", None, Preparation())
+    job = Job(Sfm(), capture, folder / "out", folder / "work", None)
     mapped = MappingResult(model, 1, "incremental", ())
-    return finish(work, model, reference, mapped, Timer({}), {})
+    nothing = Matching(None), Preparation()
+    return finish(job, *nothing, model, reference, mapped, Timer({}), {}, None)
 
 
 def test_two_common_cameras_are_not_compared_and_give_a_warning(capture, tmp_path):
@@ -210,107 +209,3 @@ def assert_axes(axes, up):
     assert_allclose(axes[2], up, atol=1e-9)
     assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(axes) == pytest.approx(1.0)
-
-
-def test_up_is_the_normal_of_a_ring_of_cameras():
-    angles = np.linspace(0, 2 * np.pi, 12, endpoint=False)
-    ring = np.stack([np.cos(angles), np.sin(angles), 0.3 + 0 * angles], axis=1) * 4
-    up, rotations = np.array([0.0, 0.0, 1.0]), []
-    for center in ring:
-        forward = -center / np.linalg.norm(center)
-        right = np.cross(forward, up) / np.linalg.norm(np.cross(forward, up))
-        rotations.append([right, np.cross(forward, right), forward])
-    assert_axes(view_from_above(ring, np.array(rotations), np.zeros((1, 3))), up)
-
-
-@pytest.mark.parametrize("size", [0.01, 100.0])
-@pytest.mark.parametrize("flatness", [1.0, 0.6, 0.4])
-def test_up_is_that_of_the_images_unless_the_cameras_lie_in_a_plane(size, flatness):
-    """A plane may be half as thick as it is wide; the cameras are tilted by 20 degrees."""
-    grid = np.stack(np.meshgrid(*[np.arange(3.0)] * 3), -1).reshape(-1, 3)
-    turn = Rotation.from_euler("x", -70, degrees=True).as_matrix()
-    places = size * grid * [1, 1, flatness]
-    axes = view_from_above(places, np.tile(turn, (27, 1, 1)), np.zeros((1, 3)))
-    tilted = [0, math.sin(math.radians(20)), math.cos(math.radians(20))]
-    expected = tilted if flatness > 0.5 else [0, 0, 1]
-    assert_allclose(axes[2] * np.sign(axes[2, 2]), expected, atol=1e-9)
-
-
-def test_cameras_in_a_plane_across_their_right_have_a_right_hand_view():
-    """As in a scan of a facade that was turned on its side: up is the cameras' own right."""
-    centers = np.array([[0.0, y, z] for y in range(3) for z in range(4)])
-    looking_along_y = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-    axes = view_from_above(centers, np.tile(looking_along_y, (12, 1, 1)), np.zeros((0, 3)))
-    assert_axes(axes, [np.sign(axes[2, 0]), 0, 0])
-
-
-@pytest.mark.parametrize("points", [1, 5])
-@pytest.mark.parametrize("side", [1.0, -1.0])
-def test_up_points_from_the_points_to_cameras_that_look_down(points, side):
-    """The cameras are above the points."""
-    centers = np.array([[x, y, 10.0 * side] for x in range(4) for y in range(4)])
-    # world to camera: looks along -z or z, the image's top is +y
-    down = np.diag([side, -1.0, -side])
-    axes = view_from_above(centers, np.tile(down, (16, 1, 1)), np.zeros((points, 3)))
-    assert_allclose(axes[2], [0, 0, side], atol=1e-9)
-
-
-def drawn(model, folder):
-    """The pixels [H, W, 3] of the picture of a model."""
-    draw_cloud(model, folder / "cloud.png", "hand-made")
-    return np.asarray(Image.open(folder / "cloud.png").convert("RGB")).astype(int)
-
-
-def test_the_picture_shows_cameras_and_points_at_their_places(tmp_path):
-    """All cameras are in the plane z = 0 and look along +z: x is right, y is down.
-
-    Five units, and a twentieth of that on each side, fill 840 of 960 px. So a unit takes
-    840 / 5.5 px, and (0, 2.5) is in the middle.
-    """
-    pixels = drawn(model_of(CENTERS), tmp_path)
-    assert pixels.shape == (960, 960, 3)
-    scale = 840 / 5.5
-    for x, y, *_ in CENTERS:
-        column, row = 480 + x * scale, 480 + (y - 2.5) * scale
-        red = np.argwhere(np.abs(pixels - [214, 39, 40]).max(axis=-1) < 8)
-        near = red[np.abs(red - [row, column]).max(axis=1) < 8]
-        assert_allclose(near.mean(axis=0), [row, column], atol=1.1)
-        assert len(near) == pytest.approx(math.pi * 3.5**2, rel=0.3)
-    for x, y in ((0, 0), (0.5, 0.5)):
-        column, row = math.floor(480 + x * scale), math.floor(480 + (y - 2.5) * scale)
-        assert (pixels[row : row + 3, column : column + 3] == [10, 20, 30]).all()
-    assert (pixels == [10, 20, 30]).all(axis=-1).sum() == 2 * 9
-    bar = np.flatnonzero((pixels[960 - 24] == 0).all(axis=-1))
-    # the bar is one unit long
-    assert_allclose([bar.min(), bar.max()], [60, 60 + scale], atol=1.0)
-
-
-def test_a_line_shows_the_viewing_direction_of_a_camera(tmp_path):
-    """All cameras are in the plane z = 0 and look along +x, which is up in the picture."""
-    sideways = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
-    places = [(0, 0, 0), (4, 0, 0), (0, 4, 0), (4, 4, 0), (2, 2, 0)]
-    cameras = {f"{x} {y}": camera_at([x, y, z], sideways) for x, y, z in places}
-    pixels = drawn(model_with(cameras), tmp_path)
-    red = np.abs(pixels - [214, 39, 40]).max(axis=-1) < 8
-    assert red[480 - 40, 478:483].any()  # the line of the camera in the middle
-    assert not red[480 + 40, 478:483].any()
-
-
-@pytest.mark.parametrize("count, inked", [(2, 9), (5_000, 9), (5_001, 4), (50_000, 4), (50_001, 1)])
-def test_more_points_are_drawn_smaller(count, inked, tmp_path, monkeypatch):
-    """All points but one are at one place; the other one is measured."""
-    points, colors = np.tile([1.0, 1, 5], (count, 1)), np.zeros((count, 3), np.uint8)
-    points[0], colors[0] = (6, 4, 5), (30, 90, 30)
-    monkeypatch.setattr(picture, "model_points", lambda model: (points, colors))
-    model = model_with({"a": camera_at([0, 0, 0]), "b": camera_at([8, 5, 0])})
-    assert (drawn(model, tmp_path) == [30, 90, 30]).all(axis=-1).sum() == inked
-
-
-def test_a_camera_whose_right_is_up_gives_axes_at_right_angles():
-    """The first of two cameras lies on its side, so another direction becomes the right."""
-    up = np.array([1.0, 2, 2]) / 3
-    down = np.array([2.0, 1, -2]) / 3  # at a right angle to it
-    first, second = np.stack([up, down, np.cross(up, down)]), np.eye(3)
-    second[1] = -2 * up - down  # the mean of both downward directions is -up
-    centers, rotations = np.array([[0, 0, 0], [1.0, 0, 0]]), np.stack([first, second])
-    assert_axes(view_from_above(centers, rotations, np.empty((0, 3))), up)

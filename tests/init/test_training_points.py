@@ -8,7 +8,7 @@ import pytest
 from numpy.testing import assert_allclose
 from PIL import Image
 
-from gsbench.init import MODEL_FOLDER, Dataset, Sfm, SiftKornia
+from gsbench.init import MODEL_FOLDER, Dataset, Dim, Sfm
 from gsbench.init.base import REPORT_FILE
 from gsbench.runs.keys import options_of
 from gsbench.scene.colmap import read_model
@@ -87,6 +87,6 @@ def test_estimated_cameras_keep_all_views_and_points_of_training_views(bare_phot
 
 
 def test_the_key_of_an_initialiser_contains_points_from():
-    for made in (Sfm, SiftKornia, Dataset):
+    for made in (Sfm, Dim, Dataset):
         assert options_of("init", made())["points_from"] == "all"
         assert options_of("init", made(points_from="train"))["points_from"] == "train"

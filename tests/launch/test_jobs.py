@@ -30,6 +30,7 @@ from gsbench.launch.jobs import (
     run_one,
 )
 from gsbench.launch.states import QueuedJob, current_user, read_submission, record_submission
+from gsbench.runs.commands import digest_of
 from gsbench.runs.config_hash import config_hash
 from gsbench.system.locks import BusyError
 from gsbench.system.stopping import Stopped
@@ -256,7 +257,9 @@ def test_a_job_gets_the_search_path_and_the_gpus_of_its_sweep(tmp_path, monkeypa
     monkeypatch.setattr(jobs, "allowed_modules", lambda: {"mine": "/there"})
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3")
     one = trial(tmp_path)
-    assert jobs.job_of(one) == TrialJob(one.values, ["a", "b"], {"mine": "/there"}, "3")
+    assert jobs.job_of(one) == TrialJob(
+        one.values, ["a", "b"], {"mine": "/there"}, "3", digest_of(one.values)
+    )
 
 
 class Jobs:

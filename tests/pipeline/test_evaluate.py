@@ -70,8 +70,8 @@ def test_an_evaluation_without_newer_settings_keeps_its_key(monkeypatch):
     old = {"train": TRAINED.key, "protocol": "paper-1", "unavailable": FOUR_LPIPS, "maps": False}
     assert inputs() == old
     assert inputs([640, 480]) == old | {"fps": [640, 480]}
-    for more in (["gmsd", "fsim"], ["fsim", "gmsd"]):
-        assert inputs(more=more) == old | {"more": ["fsim", "gmsd"]}
+    for more in (["ssim_cc", "psnr_cc"], ["psnr_cc", "ssim_cc"]):
+        assert inputs(more=more) == old | {"more": ["psnr_cc", "ssim_cc"]}
 
 
 def test_speed_is_measured_at_the_given_size(monkeypatch):

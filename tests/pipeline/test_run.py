@@ -221,7 +221,6 @@ def test_files_of_the_steps_are_published_in_the_trials_folder(tmp_path, normali
         entries[stage.name] = SimpleNamespace(path=place)
     gaussians = random_gaussians(5, dtype=torch.float32)
     write_ply(gaussians, tmp_path / "train/point_cloud.ply")
-    (tmp_path / f"init/{trials.PICTURE_FILE}").write_text("init picture.png")
     folder = tmp_path / "trial"
     folder.mkdir()
     published = _publish(folder, entries, normalization)
@@ -230,7 +229,6 @@ def test_files_of_the_steps_are_published_in_the_trials_folder(tmp_path, normali
         **{name: f"evaluate {name}" for name in content[EVALUATE].split()[:4]},
         **{f"ground_truth/{name}": f"ground_truth {name}" for name in ("a.png", "b.png")},
         "masks/b.png": "ground_truth masks/b.png",
-        "figures/initial_cloud.png": "init picture.png",
     }
     found = {path.relative_to(folder).as_posix() for path in published}
     assert found == {*texts, "point_cloud.ply"}

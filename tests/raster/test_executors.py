@@ -2,7 +2,6 @@
 
 import dataclasses
 import inspect
-import re
 import sys
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from gsbench.raster import create_rasterizer, executors
 from gsbench.raster.contract import CASES, departures
 from gsbench.raster.executors import EXECUTORS, RasterConfig, find_executor, resolve
 from gsbench.raster.reference import ReferenceRasterizer
-from gsbench.system.install import conf_dir, install_command
+from gsbench.system.install import conf_dir
 from tests.helpers import refusal
 from tests.processes import completed
 
@@ -58,13 +57,13 @@ def test_the_table_does_not_import_torch():
 
 def test_auto_takes_the_best_installed_executor(monkeypatch, caplog):
     assert resolve("auto", "cpu").name == "cpu"
-    installed(monkeypatch, "gsplat")
-    assert resolve("auto", "cuda").name == "gsplat"
+    installed(monkeypatch, "triton")
+    assert resolve("auto", "cuda").name == "triton"
     assert caplog.text == ""
     installed(monkeypatch)
     assert resolve("auto", "cuda").name == "reference"
     assert "slow reference" in caplog.text
-    assert install_command("gsplat") in caplog.text
+    assert "pip install triton" in caplog.text
     assert resolve("auto", "mps").name == "reference"
 
 
@@ -73,15 +72,15 @@ def test_an_executor_that_cannot_run_is_refused_with_a_remedy(monkeypatch):
     assert isinstance(create_rasterizer("reference", CPU, threads=1), ReferenceRasterizer)
     for name, device, said in (
         ("opengl", "cpu", "opengl is not known; choose auto, reference, cpu, .*_target_"),
-        ("gsplat", "cpu", "gsplat runs on device=cuda, not on cpu; choose from reference, cpu"),
+        ("triton", "cpu", "triton runs on device=cuda, not on cpu; choose from reference, cpu"),
         ("cpu", "cuda", "cpu runs on device=cpu, not on cuda; choose from reference, "),
     ):
         with refusal(f"^raster={said}"):
             resolve(name, device)
     installed(monkeypatch)
-    with refusal(f"raster=gsplat needs gsplat: {re.escape(install_command('gsplat'))}"):
-        resolve("gsplat", "cuda")
-    assert find_executor("gsplat").obstacle("cuda") is not None
+    with refusal("raster=triton needs triton: pip install triton"):
+        resolve("triton", "cuda")
+    assert find_executor("triton").obstacle("cuda") is not None
 
 
 def test_departures_lists_errors_and_accepts_missing_options():

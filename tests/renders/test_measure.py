@@ -14,7 +14,7 @@ from PIL import Image
 from gsbench.analysis.results import load_experiment
 from gsbench.cli import run
 from gsbench.config.compose import compose_one
-from gsbench.eval.pictures import Matching
+from gsbench.eval.matching import Matching
 from gsbench.renders import truth as truths
 from gsbench.renders.imported import Destination, Measured, check_destination, find_destination
 from gsbench.renders.measure import _lines

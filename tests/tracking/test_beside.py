@@ -122,7 +122,7 @@ def test_a_slow_tracker_gets_its_patience_and_less_if_the_sweep_is_stopped(
 
 
 @pytest.mark.parametrize(
-    "code, said, words", [(1, "more\ngsbench: down\n", "down"), (-9, "", "was killed")]
+    "code, said, words", [(1, "more\ngsbench: down\n", "down"), (-9, "", "it crashed (SIGKILL")]
 )
 def test_a_failure_is_reported_once_in_one_line(
     processes, tmp_path, monkeypatch, caplog, code, said, words

@@ -76,7 +76,7 @@ def test_an_idea_is_a_run_with_its_trials_below(kind, tmp_path, request):
     assert_allclose(numbers["eval/psnr_dB"], 21.05)
     assert_allclose(numbers["eval/psnr_dB_sd"], 0.1 / 2**0.5, rtol=1e-6)
     assert numbers["trials"] == 4
-    assert "a_init-volumetric against a_init-adc" in ideas["volumetric"].data.tags["verdict"]
+    assert "a_init-volumetric against a_init-adc" in ideas["volumetric"].data.tags[NOTE]
     assert ideas["adc"].data.tags["verdict"] == "baseline"
     assert (
         "| courtyard | a_init | volumetric | " in client.get_experiment_by_name("swept").tags[NOTE]

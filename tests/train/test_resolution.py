@@ -1,15 +1,13 @@
-"""Training on small pictures: the schedule of sizes, the limit on the count, and resuming."""
+"""Training on small pictures: the schedule of sizes, and resuming."""
 
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from gsbench.analysis.differences import ingredients
-from gsbench.densify import EdgeAware, Refinement
-from gsbench.events import RefineEvent
+from gsbench.densify import EdgeAware
 from gsbench.runs.config_hash import config_hash
 from gsbench.scene.types import View
 from gsbench.train.options import TrainConfig
@@ -25,7 +23,6 @@ from tests.train.conftest import orbit_camera
 from tests.train.lab import CPU, EVENTS, METRICS, STATEFUL, StopError, options, same, small, stop_at
 
 SHORT = {"densify_start": 20, "densify_stop": 100, "densify_interval": 20}
-BOTH = "pictures_and_count"
 
 
 def soft_pictures(count, height, width, seed):
@@ -143,15 +140,8 @@ def test_a_picture_keeps_at_least_one_pixel():
     assert targets.get(0).tolist() == [[[7, 7, 7]]]
 
 
-def test_each_round_is_reported_to_the_resolution(lab):
-    training, told = lab.new(small(), resolution_schedule=BOTH, iterations=50, **SHORT), []
-    training.resolution.observe = told.append
-    training.run(lab.folder)
-    assert [event.step for event in told] == [40]
-
-
 def scheduled(scene):
-    return Resolution(options(resolution_schedule=BOTH, **SHORT), scene.train, 100)
+    return Resolution(options(resolution_schedule="pictures", **SHORT), scene.train)
 
 
 def test_sizes_change_after_rounds_and_position_rates_wait_for_full_size(tiny_scene):
@@ -171,35 +161,11 @@ def test_sizes_change_after_rounds_and_position_rates_wait_for_full_size(tiny_sc
     assert resolution.position_step(wait + 1) == wait
 
 
-def test_the_limit_on_the_count_and_the_momentum_follow_their_formulas(tiny_scene):
-    resolution = scheduled(tiny_scene)
-    resolution.scale = lambda step: 3
-
-    def limit(step, before, most=None):
-        event = RefineEvent(step=step, before=before)
-        return resolution.limit(Refinement(step, None, torch.Generator(), event), most)
-
-    assert limit(40, 10_000) == 100 + int(500 / 3 ** (2 - 0.4))
-    assert limit(60, 10_000, most=4100) == 100 + int(4000 / 3 ** (2 - 0.6))
-    assert limit(80, 10_000, most=4100) == 4100  # the last round
-    assert limit(80, 1000, most=4100) == 1200
-    resolution.observe(
-        RefineEvent(step=40, before=0, cloned=2, split_gradient=3, split_volume=4, blocked_by_cap=5)
-    )
-    assert resolution.momentum == int(0.98 * 500 + 14)
-    resolution.momentum = 50_000_000
-    resolution.observe(RefineEvent(step=40, before=0, cloned=5_000_000))
-    assert resolution.momentum == 50_000_000
-    resolution.momentum = 40_000_000
-    resolution.observe(RefineEvent(step=40, before=0, cloned=5_000_000))
-    assert resolution.momentum == int(0.98 * 40_000_000 + 1_000_000)
-
-
 @pytest.mark.parametrize("kind", [*STATEFUL, "edgeaware"])
 @pytest.mark.slow
 def test_an_interrupted_training_ends_with_the_same_bits(kind, lab):
     make = STATEFUL.get(kind, lambda: small(EdgeAware, max_gaussians=200, cap="root"))
-    settings = {"resolution_schedule": BOTH, "checkpoint_every": 30, **SHORT}
+    settings = {"resolution_schedule": "pictures", "checkpoint_every": 30, **SHORT}
     whole = lab.train(make(), "whole", **settings)
     with pytest.raises(StopError):
         lab.train(make(), "broken", stop_at(70), **settings)
@@ -232,18 +198,6 @@ def test_masks_are_as_small_as_their_pictures(lab):
     assert same(*trained)
 
 
-def test_a_schedule_of_pictures_alone_does_not_limit_the_count(lab):
-    counts = {}
-    for kind in ("none", "pictures", BOTH):
-        lab.train(small(), kind, resolution_schedule=kind, **SHORT)
-        counts[kind] = lab.records(EVENTS, kind)
-    assert any(event["blocked_by_cap"] for event in counts[BOTH])
-    assert not any(event["blocked_by_cap"] for event in counts["pictures"] + counts["none"])
-    for event in counts[BOTH]:
-        assert event["after"] <= 1.2 * event["before"]
-    assert "scale" not in lab.records(METRICS, "none")[0]
-
-
 def test_the_schedule_is_an_ingredient_and_part_of_the_hash():
     without, with_it = composed(), composed("train.resolution_schedule=pictures")
     assert config_hash(without) != config_hash(with_it)
@@ -256,7 +210,7 @@ def test_the_schedule_is_an_ingredient_and_part_of_the_hash():
 def test_an_unknown_schedule_is_refused():
     with pytest.raises(
         ValueError,
-        match=r"train\.resolution_schedule must be 'none', 'pictures' or 'pictures_and_count'",
+        match=r"train\.resolution_schedule must be 'none' or 'pictures'",
     ):
         TrainConfig(name="x", resolution_schedule="spectrum")
 

@@ -258,7 +258,6 @@ def test_the_context_of_a_densifier_knows_a_white_background(background, white, 
     context = lab.new(NoDensifier(), background=background).context
     assert context.white_background is white
     assert context.extent == lab.scene.extent
-    assert context.schedule is None
 
 
 @pytest.mark.parametrize("spare, resident", [(0, True), (-2, False)])

@@ -74,20 +74,17 @@ def test_rasterizers_without_a_gpu(no_gpu, monkeypatch):
     texts = dict(text.split(" ", 1) for _, text in said(of_devices("rasterizer")))
     assert texts["raster=auto"] == "is cpu on cpu"
     assert texts["raster=cpu"].startswith("on cpu: compiled")
-    assert texts["raster=gsplat"].startswith("runs on device=cuda, not on cpu; ")
+    assert texts["raster=triton"].startswith("runs on device=cuda, not on cpu; ")
 
 
 def test_rasterizers_on_a_gpu(gpus, monkeypatch):
     from gsbench.raster import executors
 
-    monkeypatch.setattr(
-        executors.importlib.util, "find_spec", lambda name: None if name == "gsplat" else object()
-    )
+    monkeypatch.setattr(executors.importlib.util, "find_spec", lambda name: object())
     texts = dict(text.split(" ", 1) for _, text in said(of_devices("rasterizer")))
     assert texts["raster=auto"] == "is cpu on cpu and triton on cuda"
     assert texts["raster=triton"].startswith("on cuda: ")
     assert texts["raster=reference"].startswith("on cpu and cuda: ")
-    assert texts["raster=gsplat"].startswith("needs gsplat: ")
 
 
 def test_doctor_on_this_machine_covers_all_topics(tmp_path, capsys):
@@ -161,7 +158,7 @@ def test_proofs_are_listed_and_rasterizers_of_a_gpu_without_one_noted(gpus, monk
             )
         return None
 
-    obstacle = lambda self, device: "no" if self.name == "gsplat" else None  # noqa: E731
+    obstacle = lambda self, device: "no" if self.name == "cpu" else None  # noqa: E731
     monkeypatch.setattr(type(machine.EXECUTORS[0]), "obstacle", obstacle)
     monkeypatch.setattr("gsbench.train.proof.known_proof", known)
     found = said(machine.check_proofs())
@@ -170,7 +167,7 @@ def test_proofs_are_listed_and_rasterizers_of_a_gpu_without_one_noted(gpus, monk
         "raster=triton departs from the reference on cuda:0 (3 s): image 1.0e-06",
     ) in found
     assert ("note", "raster=triton on cuda:1: none yet; its first use makes it") in found
-    assert not [text for _, text in found if "gsplat" in text or " cpu" in text]
+    assert not [text for _, text in found if " cpu" in text]
 
 
 @pytest.mark.parametrize(

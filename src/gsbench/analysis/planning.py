@@ -7,7 +7,7 @@ Trainings are simulated with equally noisy scenes, and decided by the thresholds
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import cache, partial
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,13 +24,12 @@ from gsbench.analysis.designs import (
     designs_needed,
     power_of_mean,
 )
-from gsbench.analysis.looks import look_levels, plan_looks
+from gsbench.analysis.questions import look_shares, plan_looks
 from gsbench.analysis.statistics import ALPHA
 from gsbench.analysis.thresholds import Region, evenness
 
-COMMANDS = ("sweep", "looks", "check", "gate", "ledger")
-LEVEL_DRAWS = 10_000  # for the levels of looks: fewer than in verdicts, since there are many plans
-# seeds and scenes of designs with looks, whose levels take a second each
+COMMANDS = ("sweep", "looks", "gate", "ledger")
+# seeds and scenes of designs with looks
 LOOK_SEEDS, LOOK_SCENES = 12, (1, 2, 3, 4, 5, 6, 8, 10, 13)
 UNSURE = 0.8  # of pilots have the real deviation within the stated range
 
@@ -154,7 +153,7 @@ def _looks(
 ) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64], Region, float]]:
     """Means and standard errors [DESIGN_DRAWS] at each look, thresholds, and the level."""
     looks = plan_looks(design.seeds)
-    levels = _levels(design.scenes, looks, rate)
+    levels = [rate * share for share in look_shares(len(looks))]
     draws = np.random.default_rng(0).standard_normal((DESIGN_DRAWS, design.scenes, design.seeds))
     for seeds, level in zip(looks, levels, strict=True):
         pairs = draws[:, :, :seeds]
@@ -166,8 +165,3 @@ def _looks(
             Region(design.scenes, seeds, evenness(variances)),
             level,
         )
-
-
-@cache
-def _levels(scenes: int, looks: tuple[int, ...], rate: float) -> tuple[float, ...]:
-    return look_levels(scenes, looks, rate, LEVEL_DRAWS)

@@ -1,6 +1,5 @@
 """A complete trial as tables and verdicts see it: its record, settings, code and conditions."""
 
-import math
 import os
 import re
 from collections.abc import Mapping
@@ -10,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from gsbench.analysis.trial_settings import Configurations, canonical, config_if_readable
+from gsbench.runs.commands import Digest, make_digest
 from gsbench.runs.experiments import QUESTIONS, Arm, trial_key, unix_time
 from gsbench.runs.freshness import Change, Part, code_changes, code_of, present_version
 from gsbench.runs.layout import RESULTS
 from gsbench.runs.nested import SHOWN
-from gsbench.runs.seen import SeenResult
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS, TrialRecord, split_text
 from gsbench.system.machine import kind_of_machine
@@ -25,8 +24,7 @@ class TrialResult:
     """One complete trial.
 
     ``record`` is its ``results.json``, ``config_hash`` the hash in its folder's name. ``settings``
-    reads the configurations of its experiment. ``known`` is the Unix time of a declaration that
-    its results came before, whatever their own time says.
+    reads the configurations of its experiment.
     """
 
     path: Path
@@ -35,7 +33,7 @@ class TrialResult:
     # swept settings that distinguish arms of one initialiser and densifier
     variant: tuple[tuple[str, str], ...] = ()
     settings: Configurations = field(default_factory=Configurations, repr=False, compare=False)
-    known: float = field(default=math.inf, repr=False)
+    alias: Digest = ""  # stands for the digest where a question names its sides otherwise
 
     @property
     def experiment(self) -> str:
@@ -110,9 +108,18 @@ class TrialResult:
         return code_of(self.record.code)
 
     @cached_property
-    def as_seen(self) -> SeenResult:
-        """The result as the record of what was ever measured has it."""
-        return SeenResult.of(self.record)
+    def digest(self) -> Digest:
+        """The digest of its arm on its scene: settings, user's modules, edited packages."""
+        if self.alias:
+            return self.alias
+        code = self.record.code
+        arm = f"{self.init}-{self.densify}"
+        return make_digest(arm, self.config_hash, code.sources, code.packages)
+
+    @property
+    def asked(self) -> bool:
+        """Return whether a question covered it before its training began."""
+        return bool(self.record.questions)
 
     @property
     def code_texts(self) -> list[str]:
@@ -152,7 +159,7 @@ class TrialResult:
     def measured(self) -> float:
         """The Unix time of measuring the metrics; if unrecorded, that of finishing the trial."""
         moment = unix_time(self.record.measured)
-        return min(self.finished if moment is None else moment, self.known - 1)
+        return self.finished if moment is None else moment
 
     @cached_property
     def conditions(self) -> Mapping[str, str]:

@@ -1,8 +1,8 @@
 """A command line becomes trials and an exit code.
 
 It is read once (`gsbench.app.sweep`), and its trials are composed. Then they are listed, run by
-gsbench's own sweeper (`gsbench.app.grids`), or proposed by another one, which is a plug-in of
-Hydra's (`gsbench.app.plugins`).
+gsbench's own sweeper (`gsbench.app.grids`), or by what of Hydra's the command asks for
+(`gsbench.app.hydra_app`).
 """
 
 import logging
@@ -12,8 +12,7 @@ from collections.abc import Sequence
 
 from gsbench.analysis.quantities import COSTS
 from gsbench.app.grids import planned_trials, run_sweep
-from gsbench.app.hydra_main import run_main
-from gsbench.app.plugins import TrialTask, other_sweep, words_for_plugins, words_without_sweeper
+from gsbench.app.hydra_app import run_by_hydra, words_without_sweeper
 from gsbench.app.sweep import HYDRA_ERRORS, Ended, Sweep
 from gsbench.claims.stopping import log_verdicts
 from gsbench.config.command_words import parse
@@ -41,7 +40,9 @@ def launch(argv: list[str]) -> int:
     with explained(words, HYDRA_ERRORS):
         if is_dry_run:
             return dry_run(sweep)
-        ended = other_sweep(sweep, run_batch) if sweep.other_sweeper else own_sweep(sweep)
+        if sweep.config.hydra.job.chdir:
+            log.info("hydra.job.chdir: paths still start in %s, as the command does", os.getcwd())
+        ended = run_by_hydra(sweep, run_batch) or own_path(sweep)
     if not ended.trials:  # a sweep whose question is decided needs no trial
         return 0
     return summarize(ended.outcomes, ended.trials)
@@ -87,16 +88,8 @@ def dry_run(sweep: Sweep) -> int:
     return 0
 
 
-def own_sweep(sweep: Sweep) -> Ended:
-    """Run the trials of a command by gsbench's own sweeper, and by what of Hydra's it asks for."""
-    if sweep.config.hydra.job.chdir:
-        log.info(
-            "hydra.job.chdir: paths still start in %s, where the command was given", os.getcwd()
-        )
-    if (words := words_for_plugins(sweep)) is not None:
-        task = TrialTask(run_batch, sweep.composer.allowed, sweep=sweep)
-        run_main(task, words, sweep.config)
-        return task.ended
+def own_path(sweep: Sweep) -> Ended:
+    """Run the trials of a command by gsbench's own sweeper and launcher."""
     ended = Ended()
 
     def run(trials: Sequence[Trial]) -> None:
@@ -137,9 +130,12 @@ def require_waiting(verb: str, trials: Sequence[Trial]) -> None:
         raise InputError(f"{verb} waits for its trials: leave out launch.wait=false")
 
 
-def run_trials(trials: Sequence[Trial]) -> int:
-    """Run the ``trials`` that are not done, by their launcher; returns the exit code."""
-    return summarize(run_batch(trials), trials)
+def run_trials(trials: Sequence[Trial], asks: bool = True) -> int:
+    """Run the ``trials`` that are not done, by their launcher; returns the exit code.
+
+    With ``asks``, their questions are written down first.
+    """
+    return summarize(run_batch(trials, asks), trials)
 
 
 def list_trials(trials: Sequence[Trial]) -> None:

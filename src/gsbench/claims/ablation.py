@@ -8,14 +8,16 @@ that differ only in such switches are trained once.
 
 import itertools
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
-from gsbench.analysis.judgement import Verdict, judge
+from gsbench.analysis.judge import Verdict, judge
 from gsbench.analysis.quantities import asked_quantity
 from gsbench.analysis.results import TrialResult
-from gsbench.analysis.verdict_words import reason
+from gsbench.analysis.sentences import reason
 from gsbench.errors import InputError
-from gsbench.runs.experiments import NO_TIME, Arm, Declaration, Question
+from gsbench.runs.commands import ERROR_RATE, Question
+from gsbench.runs.experiments import Arm
 from gsbench.settings import Switch, check_values
 from gsbench.words import did_you_mean, listed
 
@@ -127,23 +129,32 @@ def run_name(run: Run, switches: Sequence[str]) -> str:
 def judge_runs(
     trials: Sequence[TrialResult], runs: Mapping[Run, TrialKeys], metric: str
 ) -> list[Verdict]:
-    """The verdicts on all ``runs`` against the run with all switches on, as one family."""
+    """The verdicts on all ``runs`` against the run with all switches on; they share 5 %."""
     quantity = asked_quantity(metric, trials)
     full = max(runs, key=len)
+    named = [replace(trial, alias=trial.key) for trial in trials]
     questions = []
     for run, keys in runs.items():
         if run == full:
             continue
         question = Question(
             metric=metric,
-            sign=quantity.direction or 1,
+            sign=1 if quantity.direction >= 0 else -1,
             least=quantity.worthwhile,
             baseline=Arm("", run_name(full, sorted(full))),
-            arm=Arm("", run_name(run, sorted(full))),
-            scenes={scene: (runs[full][scene], key) for scene, key in keys.items()},
+            idea=Arm("", run_name(run, sorted(full))),
+            digests={scene: (runs[full][scene], key) for scene, key in keys.items()},
+            seeds={scene: _seeds(named, runs[full][scene], key) for scene, key in keys.items()},
+            rule="ablation",
+            level=ERROR_RATE / (len(runs) - 1),
         )
         questions.append(question)
-    return judge(trials, Declaration(time=NO_TIME, questions=tuple(questions)))
+    return [judge(named, question) for question in questions]
+
+
+def _seeds(trials: Sequence[TrialResult], one: str, two: str) -> tuple[int, ...]:
+    """The seeds of two runs on a scene."""
+    return tuple(sorted({trial.seed for trial in trials if trial.alias in (one, two)}))
 
 
 def markdown_table(verdicts: Sequence[Verdict]) -> list[str]:
@@ -156,5 +167,5 @@ def markdown_table(verdicts: Sequence[Verdict]) -> list[str]:
     for verdict in verdicts:
         mean = "–" if verdict.mean is None else verdict.shown(verdict.mean)
         interval = "–" if verdict.interval is None else verdict.shown_interval(verdict.interval)
-        lines.append(f"| {verdict.question.arm} | {mean} | {interval} | {reason(verdict)} |")
+        lines.append(f"| {verdict.question.idea} | {mean} | {interval} | {reason(verdict)} |")
     return lines

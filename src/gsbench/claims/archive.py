@@ -9,10 +9,10 @@ An archive is a zip file that is also an RO-Crate 1.2 (`gsbench.claims.export` w
 - ``configurations.jsonl``: every configuration without the seed, with its trials' folders and
   seeds;
 - ``per_view.csv``: the metrics of every test view;
-- ``declared.jsonl``: the declarations of the experiment, if there are any;
+- ``commands.jsonl``: the commands of the experiment and their questions; ``declared.jsonl`` in
+  archives of earlier versions;
 - ``ledger.jsonl``: the ideas of a ledger (`gsbench ledger`), if it is one;
 - ``searches.jsonl``: the records of searches that tuned its arms, or of the search that it is;
-- ``seen.jsonl``: all results that were ever measured (`gsbench.runs.seen`);
 - ``from_pixels.jsonl``: measures of the trials' pictures, if declared claims use them;
 - ``pictures/``: renders and photographs of test views by trial, only if they were asked for;
 - ``archive.json``: the version of this format and the sha256 of the files above;
@@ -46,8 +46,10 @@ from gsbench.errors import InputError
 from gsbench.parsing import parse_typed
 from gsbench.runs.experiments import TuningRecord
 from gsbench.runs.layout import (
+    COMMANDS,
     CONFIG,
     DECLARED,
+    FAILED,
     FROM_PIXELS,
     GROUND_TRUTH,
     LEDGER,
@@ -56,12 +58,12 @@ from gsbench.runs.layout import (
     RESULTS,
     TUNING,
 )
-from gsbench.runs.seen import seen_path
+from gsbench.runs.trial_files import Failure
 from gsbench.settings import ARM_BYTES, is_folder_name
 from gsbench.words import readable_bytes
 
 FORMAT, VERSION = "gsbench results", 1
-PIXELS, SEEN_RESULTS = "from_pixels.jsonl", "seen.jsonl"
+PIXELS = "from_pixels.jsonl"
 MANIFEST, CRATE = "archive.json", "ro-crate-metadata.json"
 TRIALS, CONFIGURATIONS = "results.jsonl", "configurations.jsonl"
 SEARCHES = "searches.jsonl"
@@ -107,7 +109,8 @@ def unpack_archive(file: Path, runs: Path) -> Experiment:
             f"{file}: its content is not that of an archive ({error!r}): export it again"
         ) from None
     experiment = read_experiment(home)
-    others = set(experiment.lacking) != unfinished or len(experiment.warnings) > len(unfinished)
+    begun = {one.path for one in experiment.unfinished if one.path.is_dir()}
+    others = begun != unfinished or len(experiment.warnings) > len(unfinished)
     if not experiment.trials or others:
         reason = experiment.warnings[0] if experiment.warnings else "it has no trial"
         raise InputError(f"{file}: {reason}")
@@ -251,7 +254,7 @@ def _unpack(
 
 def records_of(home: Path) -> dict[str, Path]:
     """The files of the experiment itself, by their names in an archive."""
-    return {DECLARED: home / DECLARED, LEDGER: home / LEDGER, SEEN_RESULTS: seen_path(home)}
+    return {name: home / name for name in (COMMANDS, DECLARED, LEDGER)}
 
 
 def _unpack_unfinished(home: Path, line: Mapping[str, Any]) -> Path:
@@ -261,6 +264,9 @@ def _unpack_unfinished(home: Path, line: Mapping[str, Any]) -> Path:
         raise InputError(f"the trial {line['folder']} is in it twice")
     folder.mkdir(parents=True)
     (folder / CONFIG).write_text(yaml.safe_dump(line["configuration"]), encoding="utf-8")
+    if line.get("failed", True):  # archives of earlier versions do not tell: no verdict waits
+        failure = Failure(message="its reason is not in the archive")
+        (folder / FAILED).write_text(json.dumps(failure.to_json()), encoding="utf-8")
     return folder
 
 

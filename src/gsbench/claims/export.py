@@ -14,12 +14,14 @@ import time
 import zipfile
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path, PurePath
 from typing import Any
 
 from gsbench import __version__
 from gsbench.analysis.fairness import searches_of
 from gsbench.analysis.images import PixelMeasures, textured_error
+from gsbench.analysis.old_declarations import all_questions
 from gsbench.analysis.quantities import TEXTURED
 from gsbench.analysis.results import (
     Experiment,
@@ -40,7 +42,6 @@ from gsbench.claims.archive import (
     PIXELS,
     SEARCHES,
     SEED_KEY,
-    SEEN_RESULTS,
     TRIALS,
     UNFINISHED,
     VERSION,
@@ -50,10 +51,14 @@ from gsbench.claims.archive import (
 from gsbench.errors import InputError
 from gsbench.files import atomic
 from gsbench.parsing import read_bytes, read_typed, read_yaml
-from gsbench.runs.experiments import STAMP, TuningRecord, read_declarations
+from gsbench.runs.commands import Command, read_lines
+from gsbench.runs.commands import chained as chained_commands
+from gsbench.runs.experiments import STAMP, TuningRecord
 from gsbench.runs.layout import (
+    COMMANDS,
     CONFIG,
     DECLARED,
+    FAILED,
     LEDGER,
     PER_VIEW,
     TUNING,
@@ -79,9 +84,9 @@ FILES = {  # media types and descriptions
     PER_VIEW: ("text/csv", "Metrics of every test view of every trial"),
     PIXELS: ("application/jsonl", "What declared claims ask of the trials' pictures, measured"),
     SEARCHES: ("application/jsonl", "The searches that tuned arms, with all points"),
+    COMMANDS: ("application/jsonl", "The commands, with the questions that they asked"),
     DECLARED: ("application/jsonl", "What was declared before the trials were run"),
     LEDGER: ("application/jsonl", "The ideas of a ledger and their tests (gsbench ledger)"),
-    SEEN_RESULTS: ("application/jsonl", "All results that were measured, also removed ones"),
     MANIFEST: ("application/json", "Version of the archive, and the sha256 of its files"),
 }
 
@@ -91,7 +96,7 @@ def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> 
 
     ``pictures`` adds those of the test views. Raises InputError if no trial can be exported.
     """
-    left_out, unfinished = list(experiment.warnings), [*experiment.lacking]
+    left_out, unfinished = list(experiment.warnings), [*_begun(experiment)]
     experiment = newest_code(experiment)
     kept, rows = list[TrialResult](), list[dict[str, Any]]()
     # {configuration as JSON: (folder, seed) of its trials}
@@ -122,7 +127,7 @@ def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> 
             for text, trials in configurations.items()
         ),
         PER_VIEW: _table(rows),
-        **_declared(experiment.folder, kept),
+        **_declared(experiment, kept),
         **_searches(experiment.folder, kept),
     }
     if unfinished:
@@ -153,18 +158,19 @@ def _write_zip(
             archive.writestr(info, content, zipfile.ZIP_DEFLATED, compresslevel=9)
 
 
-def _declared(home: Path, trials: Sequence[TrialResult]) -> dict[str, bytes]:
+def _declared(experiment: Experiment, trials: Sequence[TrialResult]) -> dict[str, bytes]:
     """The experiment's own records, and what declared questions ask of pictures.
 
     The pictures themselves are mostly not in the archive.
     """
+    home = experiment.folder
     records = {name: place for name, place in records_of(home).items() if place.is_file()}
+    shared = {LEDGER: _shared_ledger, COMMANDS: _shared_commands}
     contents = {
-        name: _shared_ledger(home) if name == LEDGER else read_bytes(place)
+        name: shared[name](home) if name in shared else read_bytes(place)
         for name, place in records.items()
     }
-    asked = itertools.chain(*(one.questions for one in read_declarations(home)))
-    if TEXTURED.key in {question.metric for question in asked}:
+    if TEXTURED.key in {question.metric for question in all_questions(experiment)}:
         measured = []
         for trial in trials:
             with suppress(InputError):  # a trial whose pictures cannot be read
@@ -201,6 +207,26 @@ def _shared_ledger(home: Path) -> bytes:
     return chained(entries).encode()
 
 
+def _shared_commands(home: Path) -> bytes:
+    """The commands for others, without folders and servers of this machine, and so linked anew."""
+    lines = []
+    for line in read_lines(home):
+        if isinstance(line, Command):
+            trials = {
+                name: replace(trial, words=tuple(without_private_words(trial.words)))
+                for name, trial in line.trials.items()
+            }
+            words = tuple(without_private_words(line.words))
+            line = replace(line, words=words, cwd="", trials=trials)
+        lines.append(line)
+    return chained_commands(lines).encode()
+
+
+def _begun(experiment: Experiment) -> list[Path]:
+    """The folders of trials without a usable result."""
+    return [one.path for one in experiment.unfinished if one.path.is_dir()]
+
+
 def without_private_words(words: Sequence[str]) -> list[str]:
     """Settings as words, without the user's folders and servers; of paths, only the names."""
     shared = []
@@ -225,7 +251,8 @@ def _unfinished(path: Path) -> dict[str, Any]:
     configuration = "{}"
     with suppress(InputError, OSError):
         configuration = _configuration(path)
-    return {"folder": _folder(path), "configuration": json.loads(configuration)}
+    failed = (path / FAILED).exists()
+    return {"folder": _folder(path), "configuration": json.loads(configuration), "failed": failed}
 
 
 def _configuration(path: Path) -> str:

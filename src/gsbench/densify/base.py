@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -23,25 +23,6 @@ CPU = torch.device("cpu")
 NEVER = 10**9  # an iteration or interval longer than any training
 
 
-class CountSchedule(Protocol):
-    """A limit on the count that the training sets for each round.
-
-    This is the only way from a schedule of the training to its densifier, and back.
-    ``train.resolution_schedule=pictures_and_count`` has one, `gsbench.train.resolution`.
-    """
-
-    def limit(self, refinement: Refinement, most: int | None) -> int:
-        """The largest count after this round; ``most`` is the densifier's own limit, if any.
-
-        `gsbench.densify.budget.Budgeted.allowance` asks.
-        """
-        ...
-
-    def observe(self, event: RefineEvent) -> None:
-        """Learn what a round did; `Densifier.refine` tells."""
-        ...
-
-
 @dataclass(frozen=True)
 class DensifyContext(NamesAttributes):
     """Facts of a training that its densifier may use."""
@@ -50,7 +31,6 @@ class DensifyContext(NamesAttributes):
     white_background: bool = False
     device: torch.device = CPU  # of the Gaussians
     views: TrainingViews | None = None
-    schedule: CountSchedule | None = None
 
     @property
     def training_views(self) -> TrainingViews:
@@ -130,7 +110,7 @@ class Densifier:
     STATISTICS: ClassVar[Mapping[str, torch.dtype | Statistic]] = {}
     SWITCHES: ClassVar[Mapping[str, Switch]] = {}
     needs_absolute_gradient: bool = False
-    needs_footprint: bool = False  # ``RenderOutput.footprint``, which gsplat does not give
+    needs_footprint: bool = False  # ``RenderOutput.footprint``, which not every rasterizer gives
     # the extra output to ask for (``RenderOutput.extra``), which not every rasterizer gives
     needs_extra: str | None = None
 
@@ -195,8 +175,6 @@ class Densifier:
         for rule in rules:
             rule(refinement)
         refinement.event.after = len(gaussians)
-        if self.context.schedule is not None:
-            self.context.schedule.observe(refinement.event)
         return refinement.event
 
     def after_step(self, step: int, gaussians: TrainableGaussians, rng: torch.Generator) -> None:

@@ -91,9 +91,6 @@ class Budgeted(Densifier):
     - ``governor``: thresholds are adjusted so that the count follows that curve and ends at it
       (`govern`).
 
-    Under ``soft`` and ``hard``, the training may also set a limit for each round
-    (`gsbench.densify.base.CountSchedule`).
-
     A subclass calls `allowance` before it adds Gaussians. To support ``freeze`` and ``governor``,
     it also overrides `forecast`, and multiplies its growth thresholds by ``strictness`` and its
     opacity for pruning by ``cull``.
@@ -125,7 +122,7 @@ class Budgeted(Densifier):
     stop: int = 15_000
     interval: PositiveInt = 100
     max_gaussians: PositiveInt | None = PAPER_CAP  # None: no limit, as 3DGS
-    # The paper has a cap of 3.4 million. Its eight capped counts are 3.41 to 3.57 million, so its cap
+    # The paper has a cap of 3.4 million. Its eight capped counts are 3.41 to 3.57 million, so it
     # was not hard, and it also applied to the baseline: without it, bicycle, garden and stump reach
     # 6.1, 5.7 and 4.8 million. It was soft or freeze; which of them is not known.
     cap: CapKind = "soft"
@@ -172,13 +169,7 @@ class Budgeted(Densifier):
 
     def allowance(self, refinement: Refinement) -> int | None:
         """The number of Gaussians that may be added now; None: no limit."""
-        count = len(refinement.gaussians)
-        allowed = allowance(count, self.limit(refinement.step), self.cap)
-        schedule = self.context.schedule
-        if schedule is None or self.cap not in ("soft", "hard"):
-            return allowed
-        most = schedule.limit(refinement, self.max_gaussians if self.cap == "hard" else None)
-        return max(0, most - count) if allowed is None else max(0, min(allowed, most - count))
+        return allowance(len(refinement.gaussians), self.limit(refinement.step), self.cap)
 
     def forecast(self, refinement: Refinement) -> int:
         """The count after a round with the present ``strictness`` and ``cull``, without a cap."""

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsbench.errors import InputError, TrainingError
-from gsbench.eval import metrics, structure
 from gsbench.eval.color_correction import Corrected
 from gsbench.eval.facts import (
     CORRECTED,
@@ -34,6 +33,7 @@ from gsbench.eval.metric import MaskedMetric, Metric, UnavailableError
 from gsbench.eval.metrics import psnr
 from gsbench.eval.protocol import Protocol
 from gsbench.eval.ssim import ssim
+from gsbench.eval.structure import STRUCTURAL, load_structural
 from gsbench.weights import MissingWeightsError
 
 
@@ -123,15 +123,12 @@ class Flip:
 class StructuralMetric:
     """A structural metric by its authors' definition, which is the same in all protocols."""
 
-    def __init__(self, function: Callable[[Tensor, Tensor], Tensor], min_side: int) -> None:
-        self._function, self._min_side = function, min_side  # px
+    def __init__(self, context: MetricContext, key: str) -> None:
+        self._measure, self._min_side = load_structural(key), STRUCTURAL[key].min_side  # px
 
     def measure(self, image: Tensor, truth: Tensor) -> float:
         _require_size(image, self._min_side)
-        value = float(self._function(in_double_precision(image), in_double_precision(truth)))
-        if not math.isfinite(value):
-            raise UnavailableError("a view is flat: it has no structure to compare")
-        return value
+        return self._measure(in_double_precision(image), in_double_precision(truth))
 
 
 def _require_size(image: Tensor, min_side: int) -> None:
@@ -156,13 +153,8 @@ MEASURES: dict[str, Callable[[MetricContext], Metric]] = {
     "lpips_alex": partial(LpipsMetric, net="alex"),
     "lpips_squeeze": partial(LpipsMetric, net="squeeze"),
     "flip": Flip,
-    "ms_ssim": lambda _: StructuralMetric(structure.ms_ssim, structure.MULTISCALE_MIN_SIZE),
-    "iw_ssim": lambda _: StructuralMetric(structure.iw_ssim, structure.MULTISCALE_MIN_SIZE),
-    "fsim": lambda _: StructuralMetric(structure.fsim, structure.FSIM_MIN_SIZE),
-    "gmsd": lambda _: StructuralMetric(metrics.gmsd, metrics.GMSD_MIN_SIZE),
 }
-
-
+MEASURES |= {key: partial(StructuralMetric, key=key) for key in STRUCTURAL}
 MEASURES |= {
     f"{key}{CORRECTED}": _corrected(key)
     for key in list(MEASURES)

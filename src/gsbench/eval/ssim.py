@@ -51,8 +51,7 @@ def ssim(
         raise ValueError(f"ssim padding is {padding!r}; choose {', '.join(get_args(SsimPadding))}")
     if padding == "valid":
         check_size(as_batch(image), WINDOW_SIZE, "ssim without padding")
-    luminance, structure = ssim_parts(as_batch(image), as_batch(target), padding)
-    values = luminance * structure  # [B, 3, H', W']
+    values = _ssim_maps(as_batch(image), as_batch(target), padding)  # [B, 3, H', W']
     if mask is not None:
         inner = slice(WINDOW_RADIUS, -WINDOW_RADIUS) if padding == "valid" else slice(None)
         return values[0][:, mask[inner, inner]].mean()
@@ -65,26 +64,21 @@ def ssim_map(image: Tensor, target: Tensor) -> Tensor:
 
     The images are padded with zeros.
     """
-    luminance, structure = ssim_parts(as_batch(image), as_batch(target), "zero")
-    return (luminance * structure)[0]
+    return _ssim_maps(as_batch(image), as_batch(target), "zero")[0]
 
 
-def ssim_parts(
-    x: Tensor, y: Tensor, padding: SsimPadding, data_range: float = 1.0
-) -> tuple[Tensor, Tensor]:
-    """The two factors of SSIM, [B, C, H', W'] each, of images [B, C, H, W].
+def _ssim_maps(x: Tensor, y: Tensor, padding: SsimPadding) -> Tensor:
+    """SSIM at every pixel, [B, C, H', W'], of images [B, C, H, W] with values from 0 to 1.
 
-    Image values are from 0 to ``data_range``. The first factor is luminance (eq. 6), the second is
-    contrast times structure (eq. 9 times eq. 10, with C3 = C2 / 2).
+    It is luminance (eq. 6) times contrast and structure (eq. 9 times eq. 10, with C3 = C2 / 2).
     """
     moments = _blur(torch.cat([x, y, x * x, y * y, x * y]), padding)  # [5B, C, H', W']
     mean_x, mean_y, mean_xx, mean_yy, mean_xy = moments.chunk(5)  # [B, C, H', W'] each
-    c1, c2 = C1 * data_range**2, C2 * data_range**2
     covariance = mean_xy - mean_x * mean_y
     variances = mean_xx - mean_x.square() + mean_yy - mean_y.square()
-    luminance = (2 * mean_x * mean_y + c1) / (mean_x.square() + mean_y.square() + c1)
-    structure = (2 * covariance + c2) / (variances + c2)
-    return luminance, structure
+    luminance = (2 * mean_x * mean_y + C1) / (mean_x.square() + mean_y.square() + C1)
+    structure = (2 * covariance + C2) / (variances + C2)
+    return luminance * structure
 
 
 def _blur(images: Tensor, padding: SsimPadding) -> Tensor:

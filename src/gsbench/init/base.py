@@ -13,6 +13,7 @@ import numpy as np
 from annotated_types import Interval
 from numpy.typing import NDArray
 
+from gsbench.errors import InputError
 from gsbench.logs import Progress, no_progress
 from gsbench.scene.types import Capture
 
@@ -23,13 +24,16 @@ OWN_GAUGE_FOLDER = Path("sparse_own_gauge", "0")
 WORK_FOLDER = "work"  # below the output folder, during a run
 REPORT_FILE = "report.json"
 GAUSSIANS_FILE = "gaussians.ply"  # only if training starts from given Gaussians instead of points
-PICTURE_FILE = "cloud.png"  # the cloud and its cameras from above
 # share of images with a pose; with fewer, the search for a mapping goes on, and the report warns
 REGISTERED_SHARE = 0.9
 FIELD_OF_VIEW_DEG = (5.0, 150.0)  # plausible range, along the longest side
 Poses = Literal["shared", "own"]
 PointsFrom = Literal["all", "train"]
 Seed = Annotated[int, Interval(ge=0, le=2**31 - 1)]  # COLMAP accepts no larger seed
+
+
+class UnplacedError(InputError):
+    """Error for photographs that no mapper can place by the matches that were made."""
 
 
 @dataclass(frozen=True)
@@ -181,8 +185,8 @@ class Initializer(ABC):
     """Makes cameras and an initial cloud. Subclasses are dataclasses; their fields are settings.
 
     Examples:
-        If only the points are new, derive from `PlacedCloud`. Its ``run`` adds cameras, report and
-        picture.
+        If only the points are new, derive from `PlacedCloud`. Its ``run`` adds cameras and
+        report.
 
         >>> from gsbench.init.placed import PlacedCloud
         >>> @dataclass(frozen=True, kw_only=True)
@@ -223,9 +227,9 @@ class Initializer(ABC):
         reference: Path | None = None,
         work_dir: Path | None = None,
     ) -> InitReport:
-        """Write a model to `MODEL_FOLDER`, a report to `REPORT_FILE`, a picture to `PICTURE_FILE`.
+        """Write a model to `MODEL_FOLDER` and a report to `REPORT_FILE`.
 
-        All are below ``output_dir``. The cameras have the sizes of the files in ``capture.images``.
+        Both are below ``output_dir``. The cameras have the sizes of the capture's files.
         ``reference`` is a COLMAP model of the same files whose cameras replace those of the
         capture. ``work_dir`` may keep files that a later run can reuse. Raises ``InputError`` if no
         model can be made from the capture.

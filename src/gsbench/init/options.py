@@ -7,7 +7,7 @@ not on the initialisers that call them.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from annotated_types import Ge, Interval
 from pydantic import PositiveFloat, PositiveInt
@@ -31,7 +31,7 @@ MatchRatio = Annotated[float, Interval(gt=0, le=1)]  # distance to the best over
 
 @dataclass(frozen=True, kw_only=True)
 class ColmapOptions(Initializer):
-    """The settings that `Sfm`, `SfmDense`, `Dim` and `SiftKornia` share.
+    """The settings that `Sfm`, `SfmDense` and `Dim` share.
 
     With ``poses=shared``, points are triangulated under the reference cameras. With ``poses=own``,
     cameras and points are estimated; if there is a reference and ``align`` is set, a similarity
@@ -43,6 +43,9 @@ class ColmapOptions(Initializer):
 
     The reference is the ``reference`` given to `run`, else the model that came with the capture.
     """
+
+    # estimates the poses itself if poses=shared and there is no reference
+    is_own_reference: ClassVar[bool] = False
 
     poses: Poses = "shared"
     align: bool = True
@@ -64,6 +67,11 @@ class ColmapOptions(Initializer):
 
     def __post_init__(self) -> None:
         check_settings(self, "init")
+
+    def needs_reference(self, capture: Capture) -> bool:
+        """Return whether `run` needs a ``reference`` because the capture came without cameras."""
+        needs_poses = self.poses == "shared" and not self.is_own_reference
+        return capture.model is None and (needs_poses or self.intrinsics == "reference")
 
     @property
     def num_threads(self) -> int:
@@ -111,18 +119,3 @@ class SiftOptions(ColmapOptions):
     max_ratio: MatchRatio = 0.8
     cross_check: bool = True
     guided_matching: bool = False
-
-
-@dataclass(frozen=True, kw_only=True)
-class FeatureOptions(ColmapOptions):
-    """The settings of features and matches from outside COLMAP.
-
-    ``max_image_size`` is in px of the longest side.
-    """
-
-    # SIFT has no "lowres"
-    pairs: Pairing | Literal["lowres"] = "exhaustive"  # type: ignore[assignment]
-    max_keypoints: PositiveInt = 2048
-    max_image_size: ImageSize = 1600
-    max_ratio: MatchRatio = 0.95
-    device: str = "cpu"

@@ -195,33 +195,6 @@ class Random(PlacedCloud):
         return PointCloud(points, generator.integers(0, 256, (self.count, 3), dtype=np.uint8))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Carved(Random):
-    """`Random` without the points that fewer than ``seen_by`` training cameras have in view.
-
-    ``count`` points are drawn, so fewer remain. The idea is from Faster-GS: points that no camera
-    sees cost time and train nothing.
-    """
-
-    name: ClassVar[str] = "carved"
-
-    seen_by: PositiveInt = 1
-
-    def cloud(self, capture: Capture, model: pycolmap.Reconstruction) -> PointCloud:
-        cloud = super().cloud(capture, model)
-        num_cameras = np.zeros(self.count, dtype=np.int64)  # [P] that have each point in view
-        for name in capture.train_names:
-            num_cameras[points_in_view(cloud.points, name, model)[0]] += 1
-        kept = num_cameras >= self.seen_by
-        if not kept.any():
-            raise InputError(
-                f"init=carved: of {self.count} points none is in view of {self.seen_by} training "
-                f"cameras of scene {capture.name}; take more (init.count), a smaller box "
-                "(init.size) or fewer cameras (init.seen_by)"
-            )
-        return PointCloud(cloud.points[kept], cloud.colors[kept])
-
-
 def points_in_view(
     points: Array, name: str, model: pycolmap.Reconstruction
 ) -> tuple[NDArray[np.int64], Array, Array]:

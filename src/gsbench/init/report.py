@@ -1,4 +1,4 @@
-"""The report on a model: its content, reasons to doubt it, and a picture."""
+"""The report on a model: its content, and reasons to doubt it."""
 
 from __future__ import annotations
 
@@ -15,14 +15,12 @@ import pycolmap
 from gsbench.init.base import (
     FIELD_OF_VIEW_DEG,
     MODEL_FOLDER,
-    PICTURE_FILE,
     REGISTERED_SHARE,
     REPORT_FILE,
     InitReport,
 )
 from gsbench.init.colmap.alignment import measure_gauge, training_extent
 from gsbench.init.colmap.reconstruct import poses_by_name
-from gsbench.init.picture import draw_cloud
 from gsbench.scene.colmap import save_model
 from gsbench.scene.types import Capture
 
@@ -67,13 +65,8 @@ def make_report(
 
 
 def write_result(model: pycolmap.Reconstruction, report: InitReport, output_dir: Path) -> None:
-    """Write model, report and picture where `gsbench.init.base.Initializer` promises them."""
+    """Write model and report where `gsbench.init.base.Initializer` promises them."""
     save_model(model, output_dir / MODEL_FOLDER)
-    title = (
-        f"{report.init}, {report.poses} poses: {report.num_points:,} points, "
-        f"{report.num_registered} cameras"
-    )
-    draw_cloud(model, output_dir / PICTURE_FILE, f"{title}, from above")
     (output_dir / REPORT_FILE).write_text(json.dumps(report.to_dict(), indent=2) + "\n")
 
 

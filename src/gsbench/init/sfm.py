@@ -2,28 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-import numpy as np
 from pydantic import PositiveFloat, PositiveInt
 
 from gsbench.errors import InputError
 from gsbench.init.base import InitReport, Timer
 from gsbench.init.colmap.pairs import STRONGEST, proposed_pairs
-from gsbench.init.colmap_initializer import ColmapInitializer
 from gsbench.init.options import SiftOptions
-from gsbench.logs import Progress
-from gsbench.scene.types import Array
+from gsbench.init.reconstruction import Job, Matching, reconstruct
+from gsbench.logs import Progress, no_progress
+from gsbench.scene.types import Capture
 
 if TYPE_CHECKING:
-    import pycolmap
-
     from gsbench.init.colmap.database import DatabaseTask
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sfm(SiftOptions, ColmapInitializer):
+class Sfm(SiftOptions):
     """SIFT, matching and incremental mapping by COLMAP.
 
     With the same seed and ``mapper_threads=1`` two runs give the same model bit for bit.
@@ -32,35 +30,16 @@ class Sfm(SiftOptions, ColmapInitializer):
     name: ClassVar[str] = "sfm"
     is_own_reference: ClassVar[bool] = True
 
-    def fill_database(self, task: DatabaseTask, progress: Progress, timer: Timer) -> dict[str, int]:
-        from gsbench.init.colmap.database import (
-            colmap_masks,
-            database_counts,
-            strongest_descriptors,
-        )
-        from gsbench.init.colmap.features import extract_sift
-        from gsbench.init.colmap.matches import match_sift
-
-        with timer.phase("extract"):
-            masks = colmap_masks(task.capture.masks, task.work_dir)
-            extract_sift(
-                task.database, task.images, task.names, self, self.num_threads, progress, masks
-            )
-        if database_counts(task.database)["features"] == 0:
-            raise InputError(
-                f"{self.name}: no keypoint in any image: lower init.peak_threshold, or check the "
-                "photos"
-            )
-        pairs, counts = task.pairs, {}
-        if self.pairs == "auto":
-            with timer.phase("preview"):
-                pairs = proposed_pairs(
-                    task.names, lambda name: strongest_descriptors(task.database, name, STRONGEST)
-                )
-            counts = {"pairs_selected": len(pairs), "pairs_left_out": len(task.pairs) - len(pairs)}
-        with timer.phase("match"):
-            match_sift(task.database, pairs, self, self.num_threads, progress)
-        return counts
+    def run(
+        self,
+        capture: Capture,
+        output_dir: Path,
+        progress: Progress = no_progress,
+        reference: Path | None = None,
+        work_dir: Path | None = None,
+    ) -> InitReport:
+        matching = Matching(match_by_sift)
+        return reconstruct(self, matching, capture, output_dir, progress, reference, work_dir)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,41 +55,30 @@ class SfmDense(Sfm):
     edge_threshold: PositiveFloat = 20.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class Jittered(Sfm):
-    """`Sfm` with ``copies`` randomly shifted copies of each point, in the point's colour.
+def match_by_sift(task: DatabaseTask, job: Job, progress: Progress, timer: Timer) -> dict[str, int]:
+    """Write SIFT features and their verified matches into the database; returns counts."""
+    from gsbench.init.colmap.database import colmap_masks, database_counts, strongest_descriptors
+    from gsbench.init.colmap.features import extract_sift
+    from gsbench.init.colmap.matches import match_sift
 
-    The shift is normal with standard deviation ``shift`` times the distance to the point's nearest
-    neighbour. Copies have no tracks, so the report's errors and track lengths are those of the
-    original points.
-    """
-
-    name: ClassVar[str] = "jittered"
-    is_own_reference: ClassVar[bool] = False
-
-    copies: PositiveInt = 1
-    shift: PositiveFloat = 0.5
-
-    def extend(self, model: pycolmap.Reconstruction, report: InitReport) -> InitReport:
-        import pycolmap
-
-        from gsbench.scene.colmap import model_points
-
-        points, colors = model_points(model)
-        copies = shifted_copies(points, self.copies, self.shift, self.seed)
-        for position, color in zip(copies, np.tile(colors, (self.copies, 1)), strict=True):
-            model.add_point3D(position, pycolmap.Track(), color)
-        counts = {**report.counts, "shifted_copies": len(copies)}
-        return replace(report, num_points=model.num_points3D(), counts=counts)
-
-
-def shifted_copies(points: Array, copies: int, shift: float, seed: int) -> Array:
-    """Shifted copies [copies P, 3] of ``points`` [P, 3]: all points in order, ``copies`` times."""
-    from scipy.spatial import cKDTree  # takes a while to load
-
-    distances, _ = cKDTree(points).query(
-        points, k=2
-    )  # [P, 2], the first neighbour is the point itself
-    spread = shift * distances[:, 1:]  # [P, 1] world units
-    noise = np.random.default_rng(seed).standard_normal((copies, len(points), 3))
-    return (points + spread * noise).reshape(-1, 3)
+    sift = job.options
+    assert isinstance(sift, SiftOptions)
+    with timer.phase("extract"):
+        masks = colmap_masks(task.capture.masks, task.work_dir)
+        extract_sift(
+            task.database, task.images, task.names, sift, sift.num_threads, progress, masks
+        )
+    if database_counts(task.database)["features"] == 0:
+        raise InputError(
+            f"{sift.name}: no keypoint in any image: lower init.peak_threshold, or check the photos"
+        )
+    pairs, counts = task.pairs, {}
+    if sift.pairs == "auto":
+        with timer.phase("preview"):
+            pairs = proposed_pairs(
+                task.names, lambda name: strongest_descriptors(task.database, name, STRONGEST)
+            )
+        counts = {"pairs_selected": len(pairs), "pairs_left_out": len(task.pairs) - len(pairs)}
+    with timer.phase("match"):
+        match_sift(task.database, pairs, sift, sift.num_threads, progress)
+    return counts

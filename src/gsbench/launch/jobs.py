@@ -25,6 +25,7 @@ from gsbench.errors import GsbenchError, InputError
 from gsbench.files import DiskFullError, require_no_links
 from gsbench.launch.states import arm_names, forget_submission, label_of
 from gsbench.logs import set_up_logging
+from gsbench.runs.commands import digest_of
 from gsbench.runs.layout import JOBS, LOG
 from gsbench.runs.nested import sha256_of
 from gsbench.runs.trial_folder import TrialFolder
@@ -153,6 +154,7 @@ class TrialJob:
     path: list[str]  # sys.path of the submitting process
     own: dict[str, str]  # the user's modules that may be imported, with their paths
     visible_gpus: str | None  # CUDA_VISIBLE_DEVICES of the submitting process
+    digest: str = ""  # of settings and code when the command was given
 
     def __call__(self) -> Outcome:
         sys.path[:] = [*self.path, *(entry for entry in sys.path if entry not in self.path)]
@@ -179,7 +181,12 @@ class TrialJob:
                 assign_threads(self.values["threads"], launch["parallel"])
                 # With launch=local, the sweep's own process mirrors all of its trials.
                 mirror = stack.enter_context(Mirror(idle=launch["name"] == "local"))
-                outcome = run_one(Trial(self.values, ()), mirror, wait=True)
+                trial = Trial(self.values, ())
+                if self.digest and digest_of(self.values) != self.digest:
+                    error = InputError("code changed since the command; give it again")
+                    outcome = outcome_of_error(trial.folder, error)
+                else:
+                    outcome = run_one(trial, mirror, wait=True)
                 if outcome.status == "failed":
                     # for the job's log: the trial's folder may lack the reason
                     print(outcome.message, file=sys.stderr)
@@ -327,4 +334,5 @@ def collect(job: Job[Outcome], folder: Path, trials: Sequence[Trial]) -> Outcome
 def job_of(trial: Trial) -> TrialJob:
     """The trial as a job with the environment of this process."""
     path = [entry for entry in sys.path if entry]
-    return TrialJob(trial.values, path, allowed_modules(), os.environ.get("CUDA_VISIBLE_DEVICES"))
+    gpus = os.environ.get("CUDA_VISIBLE_DEVICES")
+    return TrialJob(trial.values, path, allowed_modules(), gpus, digest_of(trial.values))

@@ -27,10 +27,10 @@ from gsbench.files import (
 )
 from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.init import Sfm
-from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER, PICTURE_FILE, REPORT_FILE
+from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER, REPORT_FILE
 from gsbench.logs import log_to
 from gsbench.normalization import Normalization
-from gsbench.parsing import read_json, read_typed
+from gsbench.parsing import read_if_sound, read_json, read_typed
 from gsbench.pipeline.parts import Parts
 from gsbench.pipeline.steps.evaluate import evaluate_step
 from gsbench.pipeline.steps.external import external_step
@@ -46,12 +46,12 @@ from gsbench.pipeline.steps.scene import (
 )
 from gsbench.pipeline.steps.train import train_step
 from gsbench.runs import keys, layout
+from gsbench.runs.commands import digest_of, read_history
 from gsbench.runs.config_hash import arm_hash, config_hash
-from gsbench.runs.experiments import read_declarations
 from gsbench.runs.nested import flatten, sha256_of
 from gsbench.runs.rows import read_rows
 from gsbench.runs.store import Store, StoredResult, read_manifest
-from gsbench.runs.trial_files import Failure
+from gsbench.runs.trial_files import AskedBefore, Failure
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import (
     FROM_MODEL,
@@ -60,7 +60,6 @@ from gsbench.runs.trial_record import (
     RENDERS_ALONE,
     Budget,
     Code,
-    Declared,
     Evaluation,
     Training,
     TrialRecord,
@@ -222,6 +221,8 @@ def _run(trial: Trial, folder: TrialFolder) -> TrialRecord:
         trial_steps = TrialSteps(parts, store)
         entries: dict[str, StoredResult] = {}
         code: dict[str, str] = {}
+        asked: list[str] = []
+        digest = digest_of(values)
         on_cpu = parts.program is None and parts.device.type == "cpu"
         with compiled_beside(parts.rasterizer, on_cpu) as kernels_ready:
             for step in trial_steps.steps():
@@ -229,13 +230,14 @@ def _run(trial: Trial, folder: TrialFolder) -> TrialRecord:
                     scene = trial_steps.views.scene
                     counts = len(scene.train), len(scene.test)
                     log.info("%s: %d training and %d test views", folder.label, *counts)
+                    asked = _questions(folder, digest, values, step, store)
                     kernels_ready()
                 entries[step.stage.name] = entry = store.get(step)
                 code |= step.code
                 if step.stage is keys.INIT:
                     link_or_copy(entry.path / REPORT_FILE, folder.path / layout.INIT_REPORT)
         capture, scene = trial_steps.capture, trial_steps.views.scene
-        results = results_of(values, capture, scene, parts.raster, entries, code)
+        results = results_of(values, capture, scene, parts.raster, entries, code, asked)
         published = _publish(folder.path, entries, capture.normalization)
         kept = {name: entry.path for name, entry in entries.items() if name != keys.CAPTURE.name}
         sources = source_files(trial_steps.photographs, store)
@@ -247,6 +249,26 @@ def _run(trial: Trial, folder: TrialFolder) -> TrialRecord:
     if results.learnt_nothing:
         log.warning("%s: %s", folder.label, results.learnt_nothing)
     return results
+
+
+def _questions(
+    folder: TrialFolder, digest: str, values: Mapping[str, Any], step: keys.Step, store: Store
+) -> list[str]:
+    """The ids of the questions that covered a trial when its training began.
+
+    None for a training that is found in the store, unless it began for this experiment: its result
+    may have been seen before a question was written.
+    """
+    file = folder.path / layout.ASKED
+    before = read_if_sound(file, AskedBefore)
+    if before is not None and before.training == step.key:
+        return before.questions
+    history, place = read_history(folder.home), (values["scene"]["name"], values["seed"])
+    if store.find(step) is not None and (digest, place) not in history.results:
+        return []
+    asked = [question.id for question in history.covering(digest, *place)]
+    write_json(file, AskedBefore(training=step.key, questions=asked).to_json())
+    return asked
 
 
 def source_files(capture: Capture, store: Store) -> list[Path]:
@@ -267,8 +289,8 @@ def _publish(
 
     The model gets the coordinates in which the scene was given.
     """
-    stages = keys.INIT, keys.TRAIN, keys.EVALUATE, keys.GROUND_TRUTH
-    init, trained, evaluated, truth = (entries[stage.name].path for stage in stages)
+    stages = keys.TRAIN, keys.EVALUATE, keys.GROUND_TRUTH
+    trained, evaluated, truth = (entries[stage.name].path for stage in stages)
     links = {
         folder / name: trained / name for name in PUBLISHED_TRAINING if (trained / name).exists()
     }
@@ -281,8 +303,6 @@ def _publish(
     }
     for name, source in pictures.items():
         links |= {folder / name / file.name: file for file in sorted(source.glob("*.png"))}
-    if (init / PICTURE_FILE).exists():
-        links[folder / layout.FIGURES / layout.INITIAL_CLOUD] = init / PICTURE_FILE
     for link, file in links.items():
         link.parent.mkdir(exist_ok=True)
         if file.name == layout.POINT_CLOUD and not normalization.is_identity:
@@ -295,7 +315,7 @@ def _publish(
 # ---- the content of results.json
 
 # packages on whose versions a result depends
-PACKAGES = ("torch", "numpy", "numba", "pycolmap", "kornia", "gsplat")
+PACKAGES = ("torch", "numpy", "numba", "pycolmap", "kornia", "gsplat", "piq")
 # fields that results.json copies from the training and from the evaluation without changes
 OF_TRAINING = (
     "iterations",
@@ -318,14 +338,15 @@ def results_of(
     raster: Proven,
     entries: Mapping[str, StoredResult],
     code: Mapping[str, str],
+    asked: list[str],
 ) -> TrialRecord:
     """The results of the trial with the configuration ``values``.
 
     ``capture`` are the photographs, ``raster`` is the rasterizer, ``entries`` are the steps' store
     entries by stage. ``code`` maps the parts of gsbench's source that the steps used to their
-    states.
+    states. ``asked`` are the ids of the questions that covered the trial before its training.
     """
-    stages = keys.INIT, keys.TRAIN, keys.EVALUATE
+    stages = keys.TRAIN, keys.EVALUATE
     init, trained, evaluated = (entries[stage.name] for stage in stages)
     training = read_typed(trained.path / layout.TRAINING, Training)
     evaluation = read_typed(evaluated.path / layout.METRICS, Evaluation)
@@ -351,7 +372,7 @@ def results_of(
         protocol=manifest.inputs["protocol"],
         unavailable=evaluation.unavailable | _unknown_costs(training, is_ready_made),
         measured=manifest.created,  # of an evaluation found in the store: when it was put there
-        declared=_declared_sweep(values),
+        questions=asked,
         metric_facts=evaluation.facts,
         metrics_at=evaluation.at,
         twins=TwinViews(
@@ -401,17 +422,6 @@ def _unknown_costs(training: Training, is_ready_made: bool) -> dict[str, str]:
         reason = f"{MADE_ELSEWHERE}: not trained here"
         unknown |= {"train_time": reason, "total_time": reason}
     return unknown
-
-
-def _declared_sweep(values: Mapping[str, Any]) -> Declared | None:
-    """The newest declaration of a sweep about this trial's primary metric; None without one."""
-    primary = values["eval"].get("primary")
-    declared = [
-        sweep
-        for sweep in read_declarations(TrialFolder.of(values).home)
-        if sweep.kind == "sweep" and sweep.primary == primary
-    ]
-    return declared[-1].summary() if declared else None
 
 
 def cloud_hash(init: Path) -> str:

@@ -15,7 +15,6 @@ from pathlib import Path
 
 from gsbench.errors import InputError
 from gsbench.settings import MISSING, TargetName, check_settings
-from gsbench.system.install import install_command
 from gsbench.words import did_you_mean
 
 log = logging.getLogger(__name__)
@@ -34,10 +33,7 @@ class Executor:
     package: str | None = None  # a package that it needs beyond gsbench's own requirements
     install: str = ""  # how to get that package
     takes_threads: bool = False  # its class has an argument ``threads``
-    has_footprint: bool = True  # it gives ``RenderOutput.footprint``
-    extras: tuple[str, ...] = ("splitting_matrix",)  # names of its extra outputs
     same_bits: bool = True  # two runs on a device give the same bits
-    keeps_contract: bool = True  # False: its module says where it departs
 
     @property
     def is_installed(self) -> bool:
@@ -88,19 +84,6 @@ EXECUTORS = (  # ``auto`` takes the first that is made for the type of device an
         package="triton",
         install="pip install triton, in the version that your torch asks for",
     ),
-    Executor(
-        "gsplat",
-        "gsbench.raster.gsplat.GsplatRasterizer",
-        devices=("cuda",),
-        text="gsplat's CUDA kernels, to measure against; compiled with a CUDA toolkit (nvcc) at "
-        "first use",
-        package="gsplat",
-        install=install_command("gsplat"),
-        has_footprint=False,
-        extras=(),
-        same_bits=False,
-        keeps_contract=False,
-    ),
 )
 
 
@@ -126,22 +109,20 @@ def find_executor(name: str) -> Executor:
 def lacks(name: str, own: object, needs_footprint: bool, extra: str | None) -> str | None:
     """Say which optional output the rasterizer called ``name`` lacks, with a remedy, or None.
 
-    The outputs are the footprint, if needed, and the extra output called ``extra``. If ``name`` is
-    not an executor of gsbench, the attributes of the rasterizer ``own`` decide.
+    The outputs are the footprint, if needed, and the extra output called ``extra``. The executors
+    of gsbench give all; the attributes of another rasterizer, ``own``, say what it gives.
     """
-    known: dict[str, object] = {executor.name: executor for executor in EXECUTORS}
-
-    def lack(one: object) -> str | None:
-        if needs_footprint and not getattr(one, "has_footprint", False):
-            return "footprints"
-        without = extra is not None and extra not in getattr(one, "extras", ())
-        return f"the extra output {extra}" if without else None
-
-    if (output := lack(known.get(name, own))) is None:
+    known = [executor.name for executor in EXECUTORS]
+    if name in known or name == AUTO:
         return None
-    able = [f"raster={other}" for other in known if lack(known[other]) is None]
-    remedy = " or ".join(able) or "a rasterizer of your own that gives it"
-    return f"needs {output}, which raster={name} does not give; take {remedy}"
+    if needs_footprint and not getattr(own, "has_footprint", False):
+        output = "footprints"
+    elif extra is not None and extra not in getattr(own, "extras", ()):
+        output = f"the extra output {extra}"
+    else:
+        return None
+    able = " or ".join(f"raster={other}" for other in known)
+    return f"needs {output}, which raster={name} does not give; take {able}"
 
 
 def resolve(name: str, device_type: str) -> Executor:

@@ -15,8 +15,9 @@ from gsbench.config.compose import compose_one
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator, summarize
 from gsbench.eval.facts import METRICS
+from gsbench.eval.matching import Matching, match_by_order, match_pictures
 from gsbench.eval.options import EvalConfig
-from gsbench.eval.pictures import Matching, PicturePair, match_by_order, match_pictures, measure
+from gsbench.eval.pictures import PicturePair, check_pairs, measure
 from gsbench.files import storage_errors
 from gsbench.logs import progress
 from gsbench.pipeline.parts import build_metrics, make_evaluator
@@ -65,6 +66,7 @@ def _measure(
         PicturePair(view, path, renders / matching.pairs[view], truth.masks.get(view))
         for view, path in truth.photographs.items()
     ]
+    notes = check_pairs(pairs)
     torch.set_num_threads(available_threads())
     evaluator = _evaluator(truth, options.protocol, options.settings)
     with progress("evaluate") as report:
@@ -72,7 +74,7 @@ def _measure(
     source = {
         "folder": str(Path(options.renders).expanduser().resolve()),
         "names matched": matching.rule or "as they are",
-    }
+    } | ({"notes": "; ".join(notes)} if notes else {})
     measured = Measured(truth, pairs, per_view, evaluator, source)
     folder = None
     if destination is not None:
@@ -148,6 +150,7 @@ def _as_dict(measured: Measured, matching: Matching, folder: Path | None) -> dic
         "views": measured.per_view,
         "pictures": dict(matching.pairs),
         "names_matched": matching.rule,
+        "notes": measured.source.get("notes", ""),
         "left_out": list(matching.left_out),
         "entered": None if folder is None else str(folder),
     }

@@ -11,7 +11,11 @@ from gsbench.runs.user_code import PERMISSIONS, user_modules
 WITHOUT_EFFECT = ("threads", "weights", "download", "time_limit_minutes")
 # Settings that only declare how results are read or what an ablation may turn off.
 # train.steps_scaler has been applied to the steps.
-DECLARED = {"eval": ("primary", "controls"), "densify": ("switches",), "train": ("steps_scaler",)}
+DECLARED = {
+    "eval": ("primary", "baseline", "controls"),
+    "densify": ("switches",),
+    "train": ("steps_scaler",),
+}
 NOT_HASHED = ("name", "seed", "device", "threads", "runs", PERMISSIONS, "tracking", "launch")
 # Settings in which trials of one cell may differ: they do not change what is computed.
 # "x" stands for x and all below it (x.y).

@@ -92,3 +92,10 @@ class ResultsFile(Record):
     """The part of ``results.json`` that this module reads."""
 
     made_of: MadeOf | None = field(default=None, repr=False)
+
+
+class AskedBefore(Record):
+    """The ids of the questions that covered a trial when the ``training`` (a key) began."""
+
+    training: str
+    questions: list[str]

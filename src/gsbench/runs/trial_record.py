@@ -171,7 +171,9 @@ class TrialRecord(Record):
     evaluated_from: Literal["model", "renders"] | None = None  # None if gsbench trained it
     trained_by: ExternalTrainer | None = None
     measured: str | None = None  # time at which the evaluation was stored
-    declared: Declared | None = None
+    # ids of the questions that covered the trial when its training began
+    questions: list[str] = field(default_factory=list)
+    declared: Declared | None = None  # in files of earlier versions
     awaited: list[str] = field(default_factory=list)
     metric_facts: dict[str, MetricRecord] = field(default_factory=dict)
     metrics_at: dict[Iteration, Earlier] = field(default_factory=dict)

@@ -134,7 +134,7 @@ class Mirror:
         log.debug("gsbench sync %s: %s", home.name, said)
         if self._process.returncode == 0:
             return ""
-        lines = said.strip().splitlines() or [describe_exit(self._process.returncode)]
+        lines = said.strip().splitlines() or [f"it {describe_exit(self._process.returncode)}"]
         return one_line(lines[-1]).removeprefix("gsbench: ")
 
 

@@ -26,6 +26,8 @@ from gsbench.analysis.results import (
     read_experiment,
     seeds_text,
 )
+from gsbench.analysis.sentences import headline
+from gsbench.analysis.statistics import UNDECIDED
 from gsbench.analysis.table_formats import to_markdown
 from gsbench.analysis.tables import build_table
 from gsbench.errors import InputError
@@ -137,13 +139,13 @@ def _means(trials: Sequence[TrialResult]) -> dict[str, float]:
 
 def _tags(arm: Arm, trials: Sequence[TrialResult], comparison: Comparison) -> dict[str, str]:
     """The verdict on an idea, and the note that MLflow's page shows of its run."""
-    pairs = list(zip(comparison.pairs, comparison.sentences, strict=False))
-    own = [text for (_, idea), text in pairs if idea == arm]
-    is_baseline = any(baseline == arm for (baseline, _), _ in pairs)
-    verdict = " ".join(own) or ("baseline" if is_baseline else NO_VERDICT)
+    own = [answer for answer in comparison.answers if answer.arm == arm]
+    is_baseline = any(answer.baseline == arm for answer in comparison.answers)
+    verdict = "; ".join(answer.badge for answer in own)
+    verdict = verdict or ("baseline" if is_baseline else NO_VERDICT)
     scenes = sorted({trial.scene for trial in trials})
     lines = [
-        markdown_text(verdict),
+        *[markdown_text(answer.sentence) for answer in own],
         markdown_text(
             f"{counted(len(trials), 'trial')} on {', '.join(scenes)}, {seeds_text(trials)}: means "
             f"over scenes; {DEVIATION} is the standard deviation over seeds."
@@ -201,9 +203,12 @@ def description(experiment: Experiment, comparison: Comparison) -> str:
     except InputError as error:  # cells would average unlike trials
         lines = [markdown_text(f"No table: {error}")]
     rest = [line for line in lines if not line.startswith((f"- {VERDICT}", "#"))]
-    verdicts = [f"- {markdown_text(line)}" for line in comparison.sentences] or [NO_VERDICT]
+    # The page shows only the first line until it is clicked: decided ideas come first there.
+    ordered = sorted(comparison.answers, key=lambda one: one.verdict.outcome == UNDECIDED)
+    first = "; ".join(headline(one.verdict) for one in ordered) or NO_VERDICT
+    verdicts = [f"- {markdown_text(line)}" for line in comparison.sentences]
     end = f"\n\n{_more(experiment.name)}"
-    text = "\n".join([*verdicts, "", *rest]).strip()
+    text = "\n".join([f"**{markdown_text(first)}**", "", *verdicts, "", *rest]).strip()
     if len(text) + len(end) > MAX_TAG:
         text = text[: MAX_TAG - len(end)].rpartition("\n")[0]
     return text + end

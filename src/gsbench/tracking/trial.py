@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from gsbench.eval.facts import find_metric
-from gsbench.parsing import read_if_sound
 from gsbench.runs import layout
+from gsbench.runs.commands import read_history
 from gsbench.runs.keys import TRAIN
 from gsbench.runs.nested import flatten, sha256_of
-from gsbench.runs.plan import PlanFile
 from gsbench.runs.rows import read_rows
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import TrialRecord
@@ -226,10 +225,9 @@ class TrackedTrial:
             markdown_text(f"{', '.join(texts)} after {results.iterations:,} iterations."),
             f"Folder: {markdown_code(self.path)}",
         ]
-        plan = read_if_sound(self.folder.home / layout.PLAN, PlanFile)
-        place = self.folder.path.relative_to(self.folder.home).as_posix()
-        if plan and (planned := plan.trials.get(place)):
-            lines.append(f"Again: {markdown_code(command(*planned.overrides))}")
+        planned = read_history(self.folder.home).planned.get(self.folder.path)
+        if planned is not None:
+            lines.append(f"Again: {markdown_code(command(*planned.words))}")
         return "\n\n".join(lines)
 
     def _pictures(self, count: int) -> dict[str, Array]:

@@ -48,7 +48,7 @@ class TrainConfig(LearningRates):
     # True: the optimiser steps before a refinement, as in gsplat, so no step is lost
     step_after_refine: bool = False
     # DashGaussian (train/resolution.py): training starts on small images
-    resolution_schedule: Literal["none", "pictures", "pictures_and_count"] = "none"
+    resolution_schedule: Literal["none", "pictures"] = "none"
     visible_adam: bool = False  # the optimiser updates visible Gaussians only; not in the baseline
     # time budget; training ends with the iteration that reaches it
     max_seconds: PositiveFloat | None = None

@@ -13,6 +13,7 @@ import dataclasses
 import hashlib
 import json
 import logging
+import math
 import os
 import time
 from collections.abc import Iterator
@@ -30,7 +31,7 @@ from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.parsing import read_if_sound
 from gsbench.raster import Rasterizer, create_rasterizer
 from gsbench.raster.contract import Case, Error, measure, render_with_gradients
-from gsbench.raster.executors import AUTO, Executor, automatic, find_executor, resolve
+from gsbench.raster.executors import AUTO, automatic, find_executor, resolve
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.runs.trial_record import RasterProof
 from gsbench.system.install import version_of
@@ -80,60 +81,55 @@ def prove(
     """Compare ``rasterizer`` on ``device`` with the reference.
 
     All ``scenes`` are rendered, with gradients; rendered again, if the same bits are promised; and
-    the first is trained for ten steps with ``loss``, by default that of a training on ``device``.
-    For an executor that does not keep the contract (gsplat), opacities are so low that no alpha is
-    clamped, and radii are not compared. It takes seconds, besides the compilation of the kernels.
+    the first is trained for ten steps with ``loss``, by default that of a training on ``device``. A
+    departure ends the proof, since the next comparison would only repeat it. It takes seconds,
+    besides the compilation of the kernels.
     """
     started = time.perf_counter()
-    executor = find_executor(rasterizer.name)
-    if not executor.keeps_contract:
-        scenes = tuple(dataclasses.replace(case, logit=-4.0) for case in scenes)
-    failures: list[str] = []
-    largest: dict[str, float] = {}
-    parts = [
-        _compiled_ahead(rasterizer, device),
-        _render_errors(rasterizer, device, scenes, executor),
-        _repeat_errors(rasterizer, device, scenes) if executor.same_bits else (),
-        _training_errors(rasterizer, device, scenes[0], loss or PhotometricLoss()),
-    ]
+    errors: list[Error] = []
+    broken: list[str] = []
+
+    def sound() -> bool:
+        return not any(error.is_departure for error in errors)
+
     try:
-        for errors in parts:
-            for error in errors:
-                largest[error.quantity] = max(largest.get(error.quantity, 0.0), error.off)
-                if error.is_departure:
-                    failures.append(str(error))
-            if failures:  # the next parts would only repeat them
-                break
+        _compile_for_gpu(rasterizer, device)
+        for case in scenes:
+            errors += measure(rasterizer, case, str(device))
+        if sound() and find_executor(rasterizer.name).same_bits:
+            errors += _repeat_errors(rasterizer, device, scenes)
+        if sound():
+            errors += _training_errors(rasterizer, device, scenes[0], loss or PhotometricLoss())
     except (torch.OutOfMemoryError, InputError):
         raise
     except Exception as error:  # noqa: BLE001
         # Whatever a compiler or a driver raises is the result of the proof.
-        failures.append(
-            f"{type(error).__name__}: "
-            f"{str(error).strip().splitlines()[0] if str(error).strip() else ''}"
-        )
+        reason, *_ = str(error).strip().splitlines() or [""]
+        broken.append(f"{type(error).__name__}: {reason}")
+    failures = [str(error) for error in errors if error.is_departure] + broken
+    largest: dict[str, float] = {}
+    for error in errors:
+        if math.isfinite(error.off):
+            largest[error.quantity] = max(largest.get(error.quantity, 0.0), error.off)
     return RasterProof(
         raster=rasterizer.name,
         device=_device_name(device),
         versions=versions_on(device),
-        errors={
-            quantity: off for quantity, off in largest.items() if off == off and off != float("inf")
-        },
+        errors=largest,
         failures=failures,
         seconds=round(time.perf_counter() - started, 1),
         direct_fault="" if failures else _direct_fault(rasterizer, device, scenes[-1]),
     )
 
 
-def _compiled_ahead(rasterizer: Rasterizer, device: torch.device) -> Iterator[Error]:
-    """No errors; compile Triton's kernels for a GPU side by side."""
+def _compile_for_gpu(rasterizer: Rasterizer, device: torch.device) -> None:
+    """Compile Triton's kernels for a GPU side by side."""
     if rasterizer.name == "triton" and device.type == "cuda":
         from gsbench.raster.triton.executor import TritonRasterizer
         from gsbench.train.compile_ahead import compile_ahead
 
         if isinstance(rasterizer, TritonRasterizer):
             compile_ahead(rasterizer, device)
-    yield from ()
 
 
 def _direct_fault(rasterizer: Rasterizer, device: torch.device, case: Case) -> str:
@@ -149,32 +145,18 @@ def _direct_fault(rasterizer: Rasterizer, device: torch.device, case: Case) -> s
     return direct_fault(rasterizer, device, case)
 
 
-def _render_errors(
-    rasterizer: Rasterizer, device: torch.device, scenes: tuple[Case, ...], executor: Executor
-) -> Iterator[Error]:
-    for case in scenes:
-        errors = measure(rasterizer, case, str(device))
-        yield from (
-            errors if executor.keeps_contract else [e for e in errors if e.quantity != "radius"]
-        )
-
-
 def _repeat_errors(
     rasterizer: Rasterizer, device: torch.device, scenes: tuple[Case, ...]
-) -> Iterator[Error]:
+) -> list[Error]:
     first = [_bits(rasterizer, case, str(device)) for case in scenes]
     # The second run is after all scenes, so that it reuses memory.
-    for case, bits in zip(scenes, first, strict=True):
-        again = _bits(rasterizer, case, str(device))
-        unequal = [name for name in bits if bits[name] != again[name]]
-        yield Error(
-            str(case),
-            "bits of a second run",
-            float(len(unequal)),
-            0.5,
-            ", ".join(unequal),
-            " tensors",
-        )
+    again = [_bits(rasterizer, case, str(device)) for case in scenes]
+    errors = []
+    for case, bits, other in zip(scenes, first, again, strict=True):
+        unequal = [name for name in bits if bits[name] != other[name]]
+        count, names = float(len(unequal)), ", ".join(unequal)
+        errors.append(Error(str(case), "bits of a second run", count, 0.5, names, " tensors"))
+    return errors
 
 
 def _bits(rasterizer: Rasterizer, case: Case, device: str) -> dict[str, bytes]:
@@ -189,8 +171,8 @@ def _bits(rasterizer: Rasterizer, case: Case, device: str) -> dict[str, bytes]:
 
 def _training_errors(
     rasterizer: Rasterizer, device: torch.device, case: Case, loss: Loss
-) -> Iterator[Error]:
-    """Train ten steps with ``loss`` and Adam; yield the errors against torch in float64."""
+) -> list[Error]:
+    """Train ten steps with ``loss`` and Adam; return the errors against torch in float64."""
     other = dataclasses.replace(case, count=case.count + 1)  # another random scene, the target
     with torch.no_grad():
         target = (
@@ -205,8 +187,8 @@ def _training_errors(
         )
     expected, image = _train(ReferenceRasterizer(), case, target, torch_photometric_loss)
     found, own_image = _train(rasterizer, case, target.to(device, torch.float32), loss)
-    for step, (value, reference) in enumerate(zip(found, expected, strict=True), start=1):
-        yield Error(
+    errors = [
+        Error(
             str(case),
             "loss",
             abs(value / reference - 1),
@@ -214,10 +196,11 @@ def _training_errors(
             f"training step {step}",
             " of itself",
         )
-    off = (own_image.double().cpu() - image).abs()
-    yield Error(
-        str(case), "trained image", float(off.max()), TRAINED_TOLERANCE, f"training step {STEPS}"
-    )
+        for step, (value, reference) in enumerate(zip(found, expected, strict=True), start=1)
+    ]
+    off = float((own_image.double().cpu() - image).abs().max())
+    last = f"training step {STEPS}"
+    return [*errors, Error(str(case), "trained image", off, TRAINED_TOLERANCE, last)]
 
 
 def _train(
@@ -252,7 +235,7 @@ def versions_on(device: torch.device) -> dict[str, str]:
         root = PACKAGE / source
         for path in sorted(root.rglob("*.py")) if root.is_dir() else [root]:
             digest.update(hashlib.sha256(path.read_bytes()).digest())
-    found = {name: version_of(name) or "" for name in ("torch", "triton", "gsplat", "numba")}
+    found = {name: version_of(name) or "" for name in ("torch", "triton", "numba")}
     found |= {"cuda": torch.version.cuda or "", "hip": torch.version.hip or "", "driver": _driver()}
     found |= {"kernels": digest.hexdigest()[:16]}
     return {name: version for name, version in found.items() if version}

@@ -1,7 +1,4 @@
-"""Training that starts on small pictures (DashGaussian, arXiv 2503.18402).
-
-The number of Gaussians can be limited to what the pictures can show.
-"""
+"""Training that starts on small pictures (DashGaussian, arXiv 2503.18402)."""
 
 import math
 from collections.abc import Sequence
@@ -11,8 +8,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsbench.densify import Refinement
-from gsbench.events import RefineEvent
 from gsbench.scene.masks import resize_mask
 from gsbench.scene.types import Camera, View
 from gsbench.train.options import TrainConfig
@@ -112,27 +107,16 @@ def _first_reaching(
     return float(fractions[np.argmax(curve >= value * (1 - 1e-12))])
 
 
-# From the authors' code (utils/schedule_utils.py).
-FIRST_MOMENTUM = 5  # times the initial count: the momentum before the first round
-KEPT_MOMENTUM = 0.98  # factor of the momentum in each round
-MAX_CANDIDATES = 1_000_000  # candidates of one round that are added to the momentum, at most
-MAX_GROWTH = 0.2  # share of the count that one round may add
-
-
 class Resolution:
-    """The size of the pictures at each iteration, and the limit on the count for this size.
-
-    The limit is that of a `gsbench.densify.base.CountSchedule`.
+    """The size of the pictures at each iteration.
 
     Sizes depend only on the pictures and on the densification window of ``options``; they change
     only after rounds of densification.
     """
 
-    def __init__(self, options: TrainConfig, views: Sequence[View], initial: int) -> None:
-        self.options, self.initial = options, initial
+    def __init__(self, options: TrainConfig, views: Sequence[View]) -> None:
+        self.options = options
         self.schedule = scale_schedule([view.image for view in views], options.densify_stop)
-        # number of Gaussians that pictures of full size may add to ``initial``
-        self.momentum = FIRST_MOMENTUM * initial
 
     def scale(self, step: int) -> int:
         """The number by which the sides of pictures are divided at iteration ``step``."""
@@ -149,26 +133,6 @@ class Resolution:
         """
         end, wait = self.options.position_steps, self.schedule.full_from
         return end * max(0, step - wait) / max(end - wait, 1)
-
-    def limit(self, refinement: Refinement, most: int | None) -> int:
-        """The limit on the count after a round: n0 + (n - n0) / s^(2 - x), and n in the last round.
-
-        n0 is the initial count, n the limit ``most`` for pictures of full size (None: n0 plus the
-        momentum), s the divisor of the sides, and x is ``step / densify_stop``. A round adds at
-        most a fifth of the count.
-        """
-        options, step = self.options, refinement.step
-        added = self.momentum if most is None else most - self.initial
-        if step + options.densify_interval < options.densify_stop:
-            added = int(added / self.scale(step) ** (2 - step / options.densify_stop))
-        return min(self.initial + added, int((1 + MAX_GROWTH) * refinement.event.before))
-
-    def observe(self, event: RefineEvent) -> None:
-        """Update the momentum by the candidates of a round, added to the model or refused."""
-        candidates = sum(getattr(event, name) for name in RefineEvent.GROWN) + event.blocked_by_cap
-        self.momentum = max(
-            self.momentum, int(KEPT_MOMENTUM * self.momentum + min(MAX_CANDIDATES, candidates))
-        )
 
 
 class ScaledViews:

@@ -108,11 +108,9 @@ class Trainer:
         )
         self.scaled_views = ScaledViews(scene.train, self.targets, self.device, image_budget)
         scheduled = options.resolution_schedule != "none"
-        self.resolution = Resolution(options, scene.train, len(initial)) if scheduled else None
-        counts = options.resolution_schedule == "pictures_and_count"
-        schedule = self.resolution if counts else None
+        self.resolution = Resolution(options, scene.train) if scheduled else None
         is_white = bool((self.background == 1).all())
-        self.context = DensifyContext(scene.extent, is_white, self.device, views, schedule)
+        self.context = DensifyContext(scene.extent, is_white, self.device, views)
         densifier.begin(initial, self.context)
 
     def run(
@@ -317,7 +315,6 @@ class Trainer:
             "smoothed_loss": self.losses.smoothed,
             "gaussians": self.gaussians.state_dict(),
             "densifier": self.densifier.state_dict(),
-            "momentum": None if self.resolution is None else self.resolution.momentum,
             "rngs": {name: rng.get_state() for name, rng in self.rngs.items()},
             "remaining_views": list(self.order.remaining),
         }
@@ -333,8 +330,6 @@ class Trainer:
                 state["gaussians"], old.rates, old.spatial_scale, self.device, old.step_all
             )
             self.densifier.load_state_dict(state["densifier"], self.context)
-            if self.resolution is not None:
-                self.resolution.momentum = state["momentum"]
             for name, rng in self.rngs.items():
                 rng.set_state(state["rngs"][name])
             self.order.remaining = list(state["remaining_views"])

@@ -25,7 +25,8 @@ LITTLE_SPACE = 5_000_000_000  # bytes
 REQUIRED = ("pycolmap", "kornia", "numba", "mlflow")
 OPTIONAL = {  # module -> what needs it, and the extra that brings it
     "transformers": ("init=dim", "dim"),
-    "gsplat": ("raster=gsplat", "gsplat"),
+    "gsplat": ("benchmarks.gsplat_raster", "gsplat"),
+    "piq": ("MS-SSIM, IW-SSIM, FSIM and GMSD (eval.more)", "piq"),
     "optuna": ("searches (hydra.sweeper.tune)", "search"),
     "tensorboard": ("tracking=tensorboard", "tensorboard"),
     "viser": ("gsbench view", "view"),
@@ -216,10 +217,11 @@ def check_weights() -> Iterator[Finding]:
         except MissingWeightsError as error:
             verdict, text = "note", str(error)
             if "not found" in text:
+                others = "".join(f" or {spec.names[0]} (from {spec.source})" for spec in specs[1:])
                 text = (
                     f"{specs[0].names[0]} is not here; gsbench downloads it when needed from "
-                    f"{specs[0].url or specs[0].source}; or put it into ${WEIGHTS_VARIABLE} or "
-                    f"{hub_cache()}"
+                    f"{specs[0].url or specs[0].source}; or put it{others} into "
+                    f"${WEIGHTS_VARIABLE} or {hub_cache()}"
                 )
         yield Finding(verdict, "weights", f"{purpose}: {text}")
 

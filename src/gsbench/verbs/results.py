@@ -17,7 +17,7 @@ from gsbench.analysis.cells import (
     with_variants,
 )
 from gsbench.analysis.fairness import fairness_table
-from gsbench.analysis.pairing import BASELINE
+from gsbench.analysis.pairs import BASELINE
 from gsbench.analysis.paper import (
     layout_of,
     load_published,
@@ -130,9 +130,9 @@ def _tables(
 def _fairness_sheets(experiment: Experiment, format_name: str) -> dict[str, str]:
     """The fairness sheets of all compared pairs of arms, from all trials of the experiment."""
     # here, since SciPy is slow to import
-    from gsbench.analysis.comparison import pair_arms
+    from gsbench.analysis.comparison import compare
 
-    arms = pair_arms(experiment)
+    arms = compare(experiment)
     trials, pairs = arms.trials, arms.pairs
     if not pairs:
         raise InputError(
@@ -246,7 +246,7 @@ def report(argv: Sequence[str], runs: Path) -> int:
     output = writable_output if options.out in (None, file) else own_output
     for warning in experiment.warnings:
         print(f"left out: {warning}", file=sys.stderr)
-    text = build_report(experiment, options.baseline or BASELINE, dict(options.where))
+    text = build_report(experiment, options.baseline, dict(options.where))
     with output(file):
         write_text(file, text)
     print(file)

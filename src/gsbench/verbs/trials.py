@@ -25,8 +25,8 @@ from gsbench.launch.dry_run import describe_plan
 from gsbench.launch.progress import Progress, progress_of
 from gsbench.launch.record import remove
 from gsbench.launch.states import TrialState, label_of, names_of, states_of_experiment
+from gsbench.runs.commands import PlannedTrial, drop
 from gsbench.runs.experiments import experiment_home, list_experiments, trial_folders
-from gsbench.runs.plan import PlannedTrial, change_plan
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS
 from gsbench.runs.user_code import PERMISSIONS
@@ -84,7 +84,7 @@ def status(argv: Sequence[str], runs: Path) -> int:
         return 0
     if options.forget:
         missing = [trial.folder for trial in trials if trial.state == "missing"]
-        change_plan(home, dropped=missing)
+        drop(home, missing)
         print(f"{counted(len(missing), 'trial')} removed from the plan")
         return 0
     if options.json:
@@ -241,7 +241,7 @@ def retry(argv: Sequence[str], runs: Path) -> int:
             TrialFolder(old.folder).label,
         )
     code = run_trials(trials)
-    change_plan(home, dropped=[old.folder for old in replaced if old.planned is not None])
+    drop(home, [old.folder for old in replaced if old.planned is not None])
     return code
 
 
@@ -258,8 +258,8 @@ def recompose(
             # relative paths were meant from there, and the trials are run from there
             os.chdir(planned.cwd)
         replaced = {PERMISSIONS, *map(key_of, changes)}
-        kept = [word for word in planned.overrides if key_of(word) not in replaced]
-        added = set(changes) - set(planned.overrides)
+        kept = [word for word in planned.words if key_of(word) not in replaced]
+        added = set(changes) - set(planned.words)
         if any(change.startswith("launch=") for change in added):
             # Planned settings of a launcher were meant for the other one.
             kept = [word for word in kept if not word.startswith("launch.")]

@@ -15,7 +15,7 @@ from PIL.TiffImagePlugin import IFDRational
 from gsbench.init import Sfm
 from gsbench.init.colmap import database as made
 from gsbench.init.colmap import features, geometry, matches
-from gsbench.init.colmap_initializer import report_lenses, report_unused
+from gsbench.init.reconstruction import report_lenses, report_unused
 from gsbench.scene.exif import (
     DIGITAL_ZOOM,
     EXIF_IFD,

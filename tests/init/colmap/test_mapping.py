@@ -17,7 +17,7 @@ from gsbench.init.colmap.database import (
     write_matches,
 )
 from gsbench.init.colmap.geometry import verification_options, verify_pairs
-from gsbench.init.colmap.mapping import map_images
+from gsbench.init.colmap.mapping import Attempt, Geometry, map_images, measure_geometry
 from gsbench.init.colmap.pairs import select_pairs
 from gsbench.init.colmap.reconstruct import common_poses
 from gsbench.logs import no_progress
@@ -79,9 +79,9 @@ def test_a_small_baseline_without_a_focal_length_is_placed_by_another_strategy(t
         mapped(database, "incremental")
     result = mapped(database, "auto")
     assert result.model.num_reg_images() == 9
-    assert result.tried[0] == ("incremental", 0)
+    assert (result.tried[0].strategy, result.tried[0].images) == ("incremental", 0)
     assert result.strategy != "incremental"
-    (warning,) = result.warnings
+    (warning,) = result.warnings(Sfm())
     assert result.strategy in warning
     true = model_with({name: camera_at(center) for name, center in truth.items()})
     centers, _, true_centers, _ = common_poses(result.model, true)
@@ -95,7 +95,8 @@ def test_a_small_baseline_without_a_focal_length_is_placed_by_another_strategy(t
 def test_the_global_mapper_places_all_images(tmp_path):
     database, _ = small_baseline(tmp_path)
     result = mapped(database, "global")
-    assert (result.strategy, result.model.num_reg_images(), result.warnings) == ("global", 9, ())
+    assert (result.strategy, result.model.num_reg_images()) == ("global", 9)
+    assert result.warnings(Sfm()) == ()
 
 
 @pytest.mark.parametrize("mapper", [pytest.param("auto", marks=pytest.mark.slow), "global"])
@@ -109,8 +110,9 @@ def test_copies_of_one_view_are_refused(tmp_path, mapper):
 class Model:
     """A stand-in for a reconstruction, which has a size only."""
 
-    def __init__(self, images, points=10):
+    def __init__(self, images, points=10, depth_spread=2.0):
         self.images, self.points = images, points
+        self.geometry = Geometry(images, points, 10.0, depth_spread)
 
     def num_reg_images(self):
         return self.images
@@ -135,7 +137,7 @@ def test_strategies_are_tried_until_one_places_nine_of_ten_images(
 ):
     camera = pycolmap.Camera.create_from_model_name(1, "PINHOLE", 30.0, 40, 30)
     create_database(tmp_path / "database.db", [(camera, [f"{k}.png" for k in range(10)])])
-    monkeypatch.setattr(mapping, "_is_plausible", lambda model: True)
+    monkeypatch.setattr(mapping, "measure_geometry", lambda model: model.geometry)
 
     def way(name, sizes):
         return name, lambda: [Model(*size) for size in sizes]
@@ -147,8 +149,8 @@ def test_strategies_are_tried_until_one_places_nine_of_ten_images(
     place = next(k for k, sizes in enumerate(found) if best in sizes)
     assert (result.strategy, result.models) == (f"way {place}", len(found[place]))
     most = [max(sizes, default=(0, 0))[0] for sizes in found[:tried]]
-    assert result.tried == tuple((f"way {k}", count) for k, count in enumerate(most))
-    assert bool(result.warnings) == (tried > 1)
+    assert result.tried == tuple(Attempt(f"way {k}", count, "") for k, count in enumerate(most))
+    assert bool(result.warnings(Sfm())) == (tried > 1)
     for sizes, said in (([], "found no pair of images"), ([(2, 99)], "placed only 2 of 10 images")):
         ways[:] = [way("only", sizes)]
         with refusal(said):
@@ -202,18 +204,102 @@ def test_mapping_reports_progress_from_no_image_to_all(tmp_path, monkeypatch):
     assert told == [("map", 0, 3), ("map", 3, 3)]
 
 
-@pytest.mark.parametrize("share, plausible", [(0.9, False), (1.1, True)])
-def test_a_model_needs_an_angle_at_half_of_its_points(share, plausible):
+@pytest.mark.parametrize("share, sound", [(0.9, False), (1.1, True)])
+def test_a_model_needs_an_angle_at_half_of_its_points(share, sound):
     """Two cameras see points at distance one under an angle; a third is at the first one's place."""
     half = np.tan(np.radians(share * mapping.MIN_ANGLE_DEG) / 2)
     places = enumerate((-half, half, -half))
     model = model_with({f"{k}": camera_at([x, 5, 2]) for k, x in places}, 4)
     for index, images in enumerate([(1, 2, 3), (1, 2), (1, 3)]):
         add_point(model, [0, 5, 3], seen_by=dict.fromkeys(images, index))
-    assert mapping._is_plausible(model) == plausible
+    assert (measure_geometry(model).fault == "") == sound
     add_point(model, [0, 5, 3], seen_by={1: 3, 3: 3})  # now half of them have none
-    assert not mapping._is_plausible(model)
-    assert not mapping._is_plausible(pycolmap.Reconstruction())
+    assert "meet at less than" in measure_geometry(model).fault
+    assert measure_geometry(pycolmap.Reconstruction()).fault == "no image sees a point"
+
+
+def model_of(centers, targets, depths, rng):
+    """Cameras that look from ``centers`` at ``targets``, with 40 points each at about its depth.
+
+    Each point is seen by the camera itself and by the next one.
+    """
+    poses, points = {}, []
+    for k, (center, target, depth) in enumerate(zip(centers, targets, depths, strict=True)):
+        forward = (target - center) / np.linalg.norm(target - center)
+        right = np.cross(forward, [0.3, 0.2, 0.93])
+        right /= np.linalg.norm(right)
+        turn = np.stack([right, np.cross(forward, right), forward])
+        poses[f"{k:03d}.png"] = camera_at(center, turn)
+        local = depth * rng.uniform((-0.4, -0.3, 0.8), (0.4, 0.3, 1.2), (40, 3))
+        points.append(center + local @ turn)
+    model = model_with(poses, 80)
+    for k, own in enumerate(points):
+        other = (k + 1) % len(points)
+        for index, place in enumerate(own):
+            add_point(model, place, seen_by={k + 1: index, other + 1: 40 + index})
+    return model
+
+
+def captured(kind):
+    """Centres, targets and depths of thirty cameras of a capture, in metres."""
+    rng, turn = np.random.default_rng(0), np.linspace(0, 2 * np.pi, 30, endpoint=False)
+    ring = np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
+    flat = rng.uniform(-1, 1, (30, 3)) * (1, 1, 0.05)
+    few = np.arange(30) < 8
+    if kind == "forward facing":
+        return 0.2 * flat, 0.2 * flat + (0, 0, 6), rng.uniform(4, 9, 30)
+    if kind == "panorama":  # turned by hand, in a room with windows
+        return 0.3 * ring, 5 * ring, np.where(few, 200.0, 3.0)
+    if kind == "tripod and walk":
+        walk = np.linspace(0, 60, 30)[:, None] * (1, 0, 0)
+        return np.where(few[:, None], 0.02 * flat, walk), walk + 5 * ring, rng.uniform(2, 15, 30)
+    if kind == "macro and drone":  # a flower at 15 cm, and the garden from 60 m
+        return (
+            np.where(few[:, None], 0.1 * flat + (0, 0, 0.1), 40 * flat + (0, 0, 60)),
+            0.0 * flat,
+            np.where(few, 0.15, 60.0),
+        )
+    # a collapsed model: most in one point, others far away
+    return (
+        np.where(few[:, None], 1e4 * ring, 1e-3 * flat),
+        10 * ring,
+        np.where(few, 1e4, 0.01),
+    )
+
+
+KINDS = ("forward facing", "panorama", "tripod and walk", "macro and drone", "collapsed")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_only_a_collapsed_model_has_depths_that_differ_by_a_factor_of_thousands(kind):
+    centers, targets, depths = captured(kind)
+    model = model_of(centers, targets, depths, np.random.default_rng(1))
+    geometry = measure_geometry(model)
+    assert geometry.images == 30
+    assert (geometry.fault != "") == (kind == "collapsed")
+    medians = []
+    for image in model.images.values():  # from its observations, in its own coordinates
+        seen = [model.points3D[point.point3D_id].xyz for point in image.get_observation_points2D()]
+        medians.append(np.median((image.cam_from_world() * np.array(seen))[:, 2]))
+    low, high = np.percentile(medians, [5, 95])
+    assert geometry.depth_spread == pytest.approx(high / low)
+
+
+def test_a_smaller_sound_model_is_kept_and_the_setting_is_named(tmp_path, monkeypatch):
+    camera = pycolmap.Camera.create_from_model_name(1, "PINHOLE", 30.0, 40, 30)
+    create_database(tmp_path / "database.db", [(camera, [f"{k}.png" for k in range(10)])])
+    monkeypatch.setattr(mapping, "measure_geometry", lambda model: model.geometry)
+    ways = [("small", lambda: [Model(7)]), ("large", lambda: [Model(10, 99, 4000.0)])]
+    monkeypatch.setattr(mapping._Mapper, "strategies", lambda mapper: iter(ways))
+    result = mapped(tmp_path / "database.db", "auto")
+    assert (result.strategy, result.model.images) == ("small", 7)
+    (line,) = result.warnings(Sfm(pairs="sequential"))
+    assert "small 7, large 10 (collapsed: depths of its images differ by a factor of 4,000)" in line
+    assert "init.pairs=exhaustive may place more" in line
+    assert "init.pairs" not in result.warnings(Sfm())[0]
+    ways[:] = ways[1:]
+    with refusal("made no sound model of 10 images .large 10 .collapsed"):
+        mapped(tmp_path / "database.db", "auto")
 
 
 @pytest.mark.parametrize("intrinsics", ["estimate", "reference"])

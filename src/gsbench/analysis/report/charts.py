@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from gsbench.analysis.ranks import Ranking
+from gsbench.analysis.sentences import p_text
 from gsbench.analysis.statistics import Interval
 from gsbench.analysis.table_formats import fill
-from gsbench.analysis.verdict_words import p_text
 from gsbench.words import true_minus
 
 WIDTH, HEIGHT = 380, 250  # px at full size; text is 12 px

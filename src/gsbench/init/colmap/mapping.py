@@ -8,6 +8,7 @@ isolated.
 
 from __future__ import annotations
 
+import math
 import shutil
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
@@ -19,22 +20,62 @@ import numpy as np
 import pycolmap
 
 from gsbench.errors import InputError
-from gsbench.init.base import REGISTERED_SHARE
+from gsbench.init.base import REGISTERED_SHARE, UnplacedError
 from gsbench.init.colmap import database as colmap_database
 from gsbench.init.colmap import geometry
 from gsbench.init.options import ColmapOptions
 from gsbench.logs import Progress
 from gsbench.scene.options import MIN_IMAGES
+from gsbench.scene.types import Array
 
 SMALL_ANGLE_DEG = 2.0  # triangulation angle of the initial pair; COLMAP's default is 16
 # focal length over the longest side: lenses of 27, 36 and 50 mm on 35 mm film
 FOCAL_FACTORS = (0.75, 1.0, 1.4)
 # median over points of the widest triangulation angle; below it depth is not determined
 MIN_ANGLE_DEG = 0.5
+# Depths in one model: the 95th over the 5th percentile of the images' median depths. 7 is the
+# largest of the sound captures that were tried; a macro photograph and a drone's differ by 500. In
+# a collapsed model some cameras lie in one point, and others thousands of times as far.
+MAX_DEPTH_SPREAD = 1000.0
 NO_PAIR = (
     "structure from motion found no pair of images to start from: the photos need more overlap (60 "
     "% and more between neighbours), more texture, or a focal length (init.focal_length, px)"
 )
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Measurements of the points of a model, which say whether its cameras are sound."""
+
+    images: int  # that see a point
+    points: int
+    # degrees: the median over points of the widest angle between two of its rays; NaN without one
+    angle: float
+    depth_spread: float  # see `MAX_DEPTH_SPREAD`
+
+    @property
+    def fault(self) -> str:
+        """The reason why the model is wrong, although its images have poses; "" if it is sound."""
+        if self.images == 0:
+            return "no image sees a point"
+        if not self.angle >= MIN_ANGLE_DEG:  # the rays of equal images, too
+            return f"rays to its points meet at less than {MIN_ANGLE_DEG:g} degrees"
+        if not self.depth_spread <= MAX_DEPTH_SPREAD:
+            return f"collapsed: depths of its images differ by a factor of {self.depth_spread:,.0f}"
+        return ""
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """The largest model of a strategy: the images that it places, and its fault or ""."""
+
+    strategy: str
+    images: int
+    fault: str
+
+    def __str__(self) -> str:
+        note = f" ({self.fault})" if self.fault else ""
+        return f"{self.strategy} {self.images}{note}"
 
 
 @dataclass(frozen=True)
@@ -44,52 +85,68 @@ class MappingResult:
     model: pycolmap.Reconstruction
     models: int
     strategy: str
-    # strategies in order, each with the number of images that it placed
-    tried: tuple[tuple[str, int], ...]
+    tried: tuple[Attempt, ...]  # in order
 
-    @property
-    def warnings(self) -> tuple[str, ...]:
+    def warnings(self, options: ColmapOptions) -> tuple[str, ...]:
         """One line for the report if COLMAP's defaults were not enough, else none."""
         if len(self.tried) < 2:
             return ()
-        counts = ", ".join(f"{strategy} {count}" for strategy, count in self.tried)
+        counts = ", ".join(map(str, self.tried))
         return (
             f"cameras come from the strategy {self.strategy!r}: COLMAP's defaults placed too few "
-            f"(images: {counts})",
+            f"(images: {counts}){_remedy(options)}",
         )
 
 
 def map_images(
     database: Path, images: Path, output: Path, options: ColmapOptions, progress: Progress
 ) -> MappingResult:
-    """Estimate cameras and points from the matches in ``database``: the model with the most images.
+    """Estimate cameras and points from the matches in ``database``: the largest sound model.
 
     With ``mapper=auto``, the strategies are COLMAP's incremental mapper, the same from a smaller
-    initial angle, the global mapper, and assumed focal lengths. The first that places
-    `REGISTERED_SHARE` of the images ends the search, and the best model so far wins.
+    initial angle, the global mapper, and assumed focal lengths. The first with a sound model
+    (`Geometry.fault`) of `REGISTERED_SHARE` of the images ends the search, and the best model so
+    far wins. Images that see no point count for nothing.
 
-    Raises InputError if no model has at least `MIN_IMAGES` images.
+    Raises UnplacedError if no sound model has at least `MIN_IMAGES` images.
     """
     with pycolmap.Database.open(database) as opened:
         total = opened.num_images()
     best: tuple[pycolmap.Reconstruction, int, str] | None = None
-    tried: list[tuple[str, int]] = []
+    best_size = (0, 0)
+    tried: list[Attempt] = []
     for strategy, run in _Mapper(database, images, output, options, progress, total).strategies():
-        models = [model for model in run() if _is_plausible(model)]
-        largest = max(models, key=_model_size, default=None)
-        tried.append((strategy, 0 if largest is None else largest.num_reg_images()))
-        if largest is not None and (best is None or _model_size(largest) > _model_size(best[0])):
-            best = largest, len(models), strategy
-        if best is not None and best[0].num_reg_images() >= REGISTERED_SHARE * total:
+        models = [(measure_geometry(model), model) for model in run()]
+        sound = [(geometry, model) for geometry, model in models if not geometry.fault]
+        largest = max(sound or models, key=lambda made: _size(made[0]), default=None)
+        if largest is None:
+            tried.append(Attempt(strategy, 0, ""))
+            continue
+        geometry, model = largest
+        tried.append(Attempt(strategy, geometry.images, geometry.fault))
+        if sound and (best is None or _size(geometry) > best_size):
+            best, best_size = (model, len(sound), strategy), _size(geometry)
+        if best_size[0] >= REGISTERED_SHARE * total:
             break
+    if best is None and (faults := [attempt for attempt in tried if attempt.fault]):
+        raise UnplacedError(
+            f"structure from motion made no sound model of {total} images ("
+            f"{', '.join(map(str, faults))}): the photos need more overlap or more texture"
+            f"{_remedy(options)}"
+        )
     if best is None:
-        raise InputError(NO_PAIR)
-    if best[0].num_reg_images() < MIN_IMAGES:
-        raise InputError(
-            f"structure from motion placed only {best[0].num_reg_images()} of {total} images: the "
+        raise UnplacedError(NO_PAIR)
+    if best_size[0] < MIN_IMAGES:
+        raise UnplacedError(
+            f"structure from motion placed only {best_size[0]} of {total} images: the "
             "photos need more overlap, more texture, or a focal length (init.focal_length, px)"
         )
     return MappingResult(*best, tuple(tried))
+
+
+def _remedy(options: ColmapOptions) -> str:
+    """What else may place more images; "" if all pairs were matched."""
+    return "" if options.pairs == "exhaustive" else "; init.pairs=exhaustive may place more"
 
 
 Models = Sequence[pycolmap.Reconstruction]
@@ -180,24 +237,38 @@ def _empty(folder: Path) -> Path:
     return folder
 
 
-def _model_size(model: pycolmap.Reconstruction) -> tuple[int, int]:
-    return model.num_reg_images(), model.num_points3D()
+def _size(geometry: Geometry) -> tuple[int, int]:
+    return geometry.images, geometry.points
 
 
-def _is_plausible(model: pycolmap.Reconstruction) -> bool:
-    """Return whether rays meet at angles that determine depth; those of equal images do not."""
-    posed = [image for image in model.images.values() if image.has_pose]
-    centers = {image.image_id: image.projection_center() for image in posed}
-    seen_twice = [point for point in model.points3D.values() if point.track.length() > 1]
-    angles = [_widest_angle(point, centers) for point in seen_twice]
-    return bool(angles) and float(np.median(angles)) >= MIN_ANGLE_DEG
+def measure_geometry(model: pycolmap.Reconstruction) -> Geometry:
+    """Measure the rays and depths of a model."""
+    poses = {image.image_id: image for image in model.images.values() if image.has_pose}
+    centers = {image_id: image.projection_center() for image_id, image in poses.items()}
+    axes = {image_id: image.viewing_direction() for image_id, image in poses.items()}
+    depths: dict[int, list[float]] = {}  # of the points that each image sees
+    angles = []
+    for point in model.points3D.values():
+        seen_by = [element.image_id for element in point.track.elements]
+        rays = point.xyz - np.array([centers[image_id] for image_id in seen_by]).reshape(-1, 3)
+        for image_id, ray in zip(seen_by, rays, strict=True):  # [3]
+            depths.setdefault(image_id, []).append(float(ray @ axes[image_id]))
+        if len(seen_by) > 1:
+            angles.append(_widest_angle(rays))
+    # no depth is 0 or less in a sound model, so such a median makes the spread infinite
+    medians = [float(np.median(own)) for own in depths.values()]
+    low, high = np.percentile(medians, [5, 95]) if medians else (math.nan, math.nan)
+    return Geometry(
+        images=len(depths),
+        points=model.num_points3D(),
+        angle=float(np.median(angles)) if angles else math.nan,
+        depth_spread=float(high / low) if low > 0 else math.inf,
+    )
 
 
-def _widest_angle(point: pycolmap.Point3D, centers: dict[int, np.ndarray]) -> float:
-    """The widest angle between two rays from a point to its cameras, in degrees."""
-    seen_from = np.array([centers[element.image_id] for element in point.track.elements])
-    rays = seen_from - point.xyz  # [T, 3]
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+def _widest_angle(rays: Array) -> float:
+    """The widest angle between two rays [T, 3], in degrees."""
+    rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     return float(np.degrees(np.arccos(np.clip(rays @ rays.T, -1, 1)).max()))
 
 

@@ -106,7 +106,7 @@ def count_agreements(descriptors: Sequence[NDArray[np.generic]]) -> NDArray[np.i
 
 
 def select_pairs(names: Sequence[str], options: ColmapOptions) -> list[tuple[str, str]]:
-    """The pairs of names to match; for ``auto`` and ``lowres`` all, since these drop some later."""
+    """The pairs of names to match; for ``auto`` all, since it drops some later."""
     if options.pairs == "sequential":
         return _named(sequential_pairs(len(names), options.overlap), names)
     return list(combinations(names, 2))

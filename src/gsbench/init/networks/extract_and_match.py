@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from gsbench.init.colmap.reconstruct import load_reference
 from gsbench.init.networks.extractors import EXTRACTORS, extract_features
 from gsbench.init.networks.features import Features, FeatureSettings, FeatureStore
 from gsbench.init.networks.matchers import build_matcher, match
-from gsbench.init.options import FeatureOptions
+from gsbench.init.options import ColmapOptions
 from gsbench.logs import Progress
 from gsbench.scene.masks import read_mask
 from gsbench.scene.types import Capture
@@ -25,24 +25,19 @@ from gsbench.system.device import select_device
 from gsbench.words import some_of
 
 CACHE_BYTES = 1 << 30  # of descriptors kept in memory while pairs are matched
-# deep-image-matching's `matching_lowres`, its default choice of pairs (pairs_generator.py, state of
-# December 2024)
-LOWRES_SIZE = 1000  # px
-LOWRES_KEYPOINTS = 2048
-LOWRES_FILTER = 0.3  # lowest score of a match
-LOWRES_MATCHES = 20  # pairs with more matches are matched at full size
 
 
 @dataclass(frozen=True)
 class NetworkJob:
     """Inputs of the isolated process. Weights are checked files, or None if not needed."""
 
-    options: FeatureOptions
+    options: ColmapOptions
     settings: FeatureSettings
+    device: str
     capture: Capture
     reference: Path | None
     work_dir: Path
-    extractor_weights: Path | None
+    extractor_weights: Path
     matcher_weights: Path | None
 
 
@@ -60,7 +55,7 @@ def extract_and_match(job: NetworkJob, progress: Progress) -> Preparation:
     """
     options, capture = job.options, job.capture
     torch.set_num_threads(options.num_threads)
-    device = select_device(options.device, "init.device")
+    device = select_device(job.device, "init.device")
     reference = load_reference(capture, job.reference)
     names = options.select_images(capture, reference)
     pairs = select_pairs(names, options)
@@ -72,11 +67,6 @@ def extract_and_match(job: NetworkJob, progress: Progress) -> Preparation:
             f"{options.name}: no keypoint in any image: lower init.keypoint_threshold or check "
             "the photos"
         )
-    if options.pairs == "lowres":
-        with timer.phase("preselect"):
-            small = at_low_resolution(job)
-            _extract_all(small, names, device, progress)
-            _match_all(small, pairs, device, progress)
     candidates, pairs = len(pairs), choose_pairs(job, names, pairs)
     with timer.phase("match"):
         without = _match_all(job, pairs, device, progress)
@@ -86,7 +76,7 @@ def extract_and_match(job: NetworkJob, progress: Progress) -> Preparation:
             "texture"
         )
     counts = {"pairs_selected": len(pairs)}
-    if options.pairs in ("auto", "lowres"):
+    if options.pairs == "auto":
         counts["pairs_left_out"] = candidates - len(pairs)
     counts |= {"pairs_without_matches": len(without), "images_without_keypoints": len(empty)}
     warnings: tuple[str, ...] = ()
@@ -107,22 +97,7 @@ def choose_pairs(
         return proposed_pairs(
             names, lambda name: store.require_features(name).descriptors[:STRONGEST]
         )
-    if job.options.pairs == "lowres":
-        small = open_store(at_low_resolution(job))
-        return [pair for pair in pairs if len(small.require_matches(*pair)) > LOWRES_MATCHES]
     return pairs
-
-
-def at_low_resolution(job: NetworkJob) -> NetworkJob:
-    """The same job on small images, to find the pairs that overlap."""
-    own = job.settings
-    settings = replace(
-        own,
-        max_image_size=min(own.max_image_size, LOWRES_SIZE),
-        max_keypoints=min(own.max_keypoints, LOWRES_KEYPOINTS),
-        filter_threshold=max(own.filter_threshold, LOWRES_FILTER),
-    )
-    return replace(job, settings=settings)
 
 
 def _extract_all(

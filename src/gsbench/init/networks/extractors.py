@@ -74,7 +74,7 @@ def load_into(
     network.to(device).eval()
 
 
-def _superpoint(settings: FeatureSettings, weights: Path | None, device: torch.device) -> Extractor:
+def _superpoint(settings: FeatureSettings, weights: Path, device: torch.device) -> Extractor:
     try:
         from transformers import SuperPointConfig, SuperPointForKeypointDetection
     except ImportError as error:
@@ -83,7 +83,6 @@ def _superpoint(settings: FeatureSettings, weights: Path | None, device: torch.d
             "(and pip uninstall torchvision where that cannot be imported)"
         ) from error
 
-    assert weights is not None
     network = SuperPointForKeypointDetection(
         SuperPointConfig(
             keypoint_threshold=settings.keypoint_threshold,
@@ -117,10 +116,9 @@ def _superpoint(settings: FeatureSettings, weights: Path | None, device: torch.d
     return extract
 
 
-def _aliked(settings: FeatureSettings, weights: Path | None, device: torch.device) -> Extractor:
+def _aliked(settings: FeatureSettings, weights: Path, device: torch.device) -> Extractor:
     from kornia.feature import ALIKED
 
-    assert weights is not None
     network = ALIKED(
         f"aliked-{settings.aliked_model}",
         max_num_keypoints=settings.max_keypoints,
@@ -136,10 +134,9 @@ def _aliked(settings: FeatureSettings, weights: Path | None, device: torch.devic
     return extract
 
 
-def _disk(settings: FeatureSettings, weights: Path | None, device: torch.device) -> Extractor:
+def _disk(settings: FeatureSettings, weights: Path, device: torch.device) -> Extractor:
     from kornia.feature import DISK
 
-    assert weights is not None
     network = DISK()
     load_into(network, load_state(weights, entry="extractor"), weights, device)
 
@@ -156,34 +153,16 @@ def _disk(settings: FeatureSettings, weights: Path | None, device: torch.device)
     return extract
 
 
-def _sift_kornia(
-    settings: FeatureSettings, weights: Path | None, device: torch.device
-) -> Extractor:
-    from kornia.feature import SIFTFeatureScaleSpace, laf_is_filled
-
-    network = SIFTFeatureScaleSpace(
-        settings.max_keypoints, device=device, descriptor_backend="pyramid"
-    ).eval()
-
-    def extract(image: Tensor) -> Found:
-        frames, responses, descriptors = network(_gray(image)[:, :1])
-        filled = laf_is_filled(frames)[0]  # [K]: slots stay empty in an image with few extrema
-        return frames[0, filled, :, 2], descriptors[0, filled], responses[0, filled]
-
-    return extract
-
-
 def _gray(image: Tensor) -> Tensor:
     """The luma of ITU-R BT.601 in three equal channels [1, 3, H, W]."""
     weights = image.new_tensor([0.299, 0.587, 0.114])[None, :, None, None]
     return (image * weights).sum(dim=1, keepdim=True).expand(-1, 3, -1, -1)
 
 
-# Each makes an extractor with its network on a device; the path is the checked file of weights,
-# None if it needs none. They raise ``MissingWeightsError`` if the file does not fit the network.
-EXTRACTORS: dict[str, Callable[[FeatureSettings, Path | None, torch.device], Extractor]] = {
+# Each makes an extractor with its network on a device from the checked file of weights. They raise
+# ``MissingWeightsError`` if the file does not fit the network.
+EXTRACTORS: dict[str, Callable[[FeatureSettings, Path, torch.device], Extractor]] = {
     "superpoint": _superpoint,
     "aliked": _aliked,
     "disk": _disk,
-    "sift_kornia": _sift_kornia,
 }

@@ -1,0 +1,112 @@
+"""Train the paper's tables in small over several days and machines, in a clone of one commit.
+
+    python findings/scripts/paper_tables.py train CLONE EXPERIMENT
+    python findings/scripts/paper_tables.py save CLONE EXPERIMENT
+
+``CLONE`` is a checkout of the commit that the page names, with its own environment in ``.venv``.
+``train`` first unpacks ``findings/archives/EXPERIMENT.zip`` into ``$GSBENCH_RUNS``, if nothing of
+the experiment is there. It then trains one after the other what has no result yet, and can be
+killed and started again at any time. ``save`` writes the archive, with all trials so far, and
+``EXPERIMENT.csv`` beside it: what archives lack and a machine that is gone cannot tell.
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+import re
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+FINDINGS = Path(__file__).resolve().parents[1]
+LINE = re.compile(r"^(\w+) +(?P<scene>\S+?)/\S+-(?P<densify>\S+) seed (?P<seed>\d+) \(\w+\)")
+THRESHOLD = 0.03  # V_th of the paper
+MEASURED = "measured_here.csv"  # in the experiment's folder: CPU time of each training
+FIELDS = ("trial", "cpu_seconds", "gaussians", "share_below_threshold")
+
+
+def gsbench(clone: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    """Run the clone's gsbench; its output is returned only if it is not written to a log."""
+    return subprocess.run(
+        [clone / ".venv/bin/gsbench", *words], cwd=clone, check=False, text=True, stdout=-1
+    )
+
+
+def words_of(clone: Path, experiment: str) -> list[str]:
+    return [f"hydra.searchpath=['file://{clone}/findings']", f"+experiment={experiment}"]
+
+
+def missing(clone: Path, experiment: str) -> list[re.Match[str]]:
+    """The trials without a result, in the order of the experiment's file."""
+    listed = gsbench(clone, *words_of(clone, experiment), "--dry-run").stdout.splitlines()
+    lines = [found for line in listed if (found := LINE.match(line))]
+    return [found for found in lines if found[1] != "done"]
+
+
+def train(clone: Path, experiment: str) -> None:
+    home = Path(os.environ["GSBENCH_RUNS"]) / experiment
+    archive = FINDINGS / "archives" / f"{experiment}.zip"
+    if archive.exists() and not home.exists():
+        code = "import sys, pathlib; from gsbench.claims.archive import unpack_archive;"
+        code += "unpack_archive(*map(pathlib.Path, sys.argv[1:]))"
+        python = clone / ".venv/bin/python"
+        subprocess.run([python, "-c", code, archive, home.parent], check=True)
+    while todo := missing(clone, experiment):
+        first, before = todo[0], resource.getrusage(resource.RUSAGE_CHILDREN)
+        print(f"{len(todo)} trials to go: {first[0]}", flush=True)
+        one = [f"scene.path={os.environ['GSBENCH_DATA']}/{first['scene']}"]
+        one += [f"seed={first['seed']}", f"densify={first['densify']}"]
+        done = gsbench(clone, *words_of(clone, experiment), *one)
+        if done.returncode:
+            sys.exit(done.returncode)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        spent = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+        trial = f"{first['scene']}-{first['densify']}-{first['seed']}"
+        with (home / MEASURED).open("a") as stream:
+            stream.write(f"{trial},{spent:.0f}\n")
+
+
+def share_below(model: Path) -> tuple[int, float]:
+    """How many Gaussians a PLY of 3DGS has, and the share with a volume of at most V_th.
+
+    The volume is that of eq. 5 of the paper: 4/3 π times the three scales.
+    """
+    from plyfile import PlyData
+
+    vertex = PlyData.read(model)["vertex"]
+    volumes = (
+        4 / 3 * np.pi * np.exp(sum(vertex[f"scale_{axis}"].astype(float) for axis in range(3)))
+    )
+    return len(volumes), float((volumes <= THRESHOLD).mean())
+
+
+def save(clone: Path, experiment: str) -> None:
+    home = Path(os.environ["GSBENCH_RUNS"]) / experiment
+    archives = FINDINGS / "archives"
+    exported = gsbench(
+        clone, "export", "--results", experiment, "--out", str(archives / f"{experiment}.zip")
+    )
+    print(exported.stdout, end="")
+    table, rows = archives / f"{experiment}.csv", dict[str, dict[str, str]]()
+    if table.exists():
+        with table.open() as stream:
+            rows = {row["trial"]: row for row in csv.DictReader(stream)}
+    spent = dict(line.split(",") for line in (home / MEASURED).read_text().split())
+    for model in sorted(home.glob("*/*/*-seed*/point_cloud.ply")):
+        scene, arm, trial = model.relative_to(home).parts[:3]
+        name = f"{scene}-{arm.partition('-')[2]}-{trial.partition('-seed')[2]}"
+        count, share = share_below(model)
+        values = (name, spent.get(name, ""), str(count), f"{share:.6f}")
+        rows[name] = dict(zip(FIELDS, values, strict=True))
+    with table.open("w", newline="") as stream:
+        writer = csv.DictWriter(stream, FIELDS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows.values())
+
+
+if __name__ == "__main__":
+    {"train": train, "save": save}[sys.argv[1]](Path(sys.argv[2]).resolve(), sys.argv[3])

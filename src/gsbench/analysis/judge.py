@@ -1,0 +1,378 @@
+"""The verdict on a question. `judge` is the only code that decides one.
+
+It needs the question and its trials and nothing else: no folder, no clock, no other question. It
+serves tables, reports, looks, gates and ledgers.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from gsbench.analysis.differences import between_scenes_notes
+from gsbench.analysis.notes import Note
+from gsbench.analysis.pairs import SAME_CAPTURE, Pairs, are_equal, pair, pair_sides
+from gsbench.analysis.quantities import Quantity, asked_quantity
+from gsbench.analysis.questions import look_shares
+from gsbench.analysis.results import TrialResult, Unfinished, group_by
+from gsbench.analysis.statistics import (
+    ALPHA,
+    UNDECIDED,
+    Interval,
+    LikeThese,
+    Outcome,
+    StudentT,
+    favoured,
+    judge_like_these,
+    outcome_of,
+    t_test,
+)
+from gsbench.runs.commands import BY_COMMAND, Question
+from gsbench.runs.experiments import Arm
+from gsbench.words import signed
+
+# deviations from the other trials of its scene and arm, beyond which a trial is outlying
+OUTLYING = 5.0
+LEAST_OTHERS = 2  # the fewest other trials that this needs
+# corrects the median sample deviation of three trials, which is too small: 1 / sqrt(ln 2)
+FEW = 1.2
+
+State = Literal["answered", "running", "stopped", "not tested", "not asked beforehand"]
+ANSWERED: State = "answered"
+RUNNING: State = "running"
+STOPPED: State = "stopped"
+NOT_TESTED: State = "not tested"
+NOT_ASKED: State = "not asked beforehand"
+
+
+@dataclass(frozen=True)
+class SceneEstimate:
+    """The mean paired difference of one scene, with its 95 % interval; it is not tested.
+
+    Without an interval if one arm lacks results, or with a single pair.
+    """
+
+    scene: str
+    mean: float
+    seeds: int
+    interval: Interval | None
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The answer to a question from ``pairs`` of trials.
+
+    Only in the ``state`` "answered" the ``outcome`` says more than "undecided". ``test`` is about
+    these scenes, None with a single pair of each; ``like_these`` is about scenes like these. Both
+    have the ``level``. ``done`` of the question's trials have a result or have failed.
+    ``untestable`` says why such trials can never answer it. ``final`` is False while trials to come
+    may decide. ``lacking`` are trials of one arm without a result where the other arm has one; if
+    the outcome favoured that arm, the verdict ``favours_lacking`` and is undecided. ``outlying``
+    trials lie far outside the others of their scene and arm; they change nothing.
+    """
+
+    question: Question
+    quantity: Quantity
+    pairs: Pairs
+    state: State
+    level: float
+    outcome: Outcome = "undecided"
+    test: StudentT | None = None
+    like_these: LikeThese | None = None
+    scenes: tuple[SceneEstimate, ...] = ()
+    done: int = 0
+    final: bool = True
+    untestable: Note | None = None
+    outlying: tuple[TrialResult, ...] = ()
+    missing: tuple[Unfinished, ...] = ()  # planned trials that are not there yet
+    lacking: tuple[Unfinished, ...] = ()
+    favours_lacking: bool = False
+    notes: tuple[Note, ...] = ()
+
+    @property
+    def wanted(self) -> int:
+        """The number of the question's trials."""
+        return self.question.trials
+
+    @property
+    def least(self) -> float | None:
+        """The least difference that matters, in the unit of the test.
+
+        A relative question is tested in logarithms.
+        """
+        least = self.question.least
+        return math.log1p(least) if self.question.relative and least is not None else least
+
+    @property
+    def mean(self) -> float | None:
+        return float(self.pairs.differences.mean()) if self.pairs.seeds else None
+
+    @property
+    def interval(self) -> Interval | None:
+        return None if self.test is None else self.test.interval(self.level)
+
+    @property
+    def p(self) -> float | None:
+        return None if self.test is None else self.test.p
+
+    @property
+    def statements(self) -> int:
+        """The number of statements that it makes or will make, each at its level."""
+        tested = self.state not in (NOT_TESTED, NOT_ASKED)
+        return tested * (1 + (self.like_these is not None))
+
+    @property
+    def relative(self) -> float:
+        """The mean difference relative to the baseline's value."""
+        if self.mean is None:
+            return math.nan
+        if self.pairs.relative:
+            return math.expm1(self.mean)
+        return self.mean / self.pairs.baseline if self.pairs.baseline else math.nan
+
+    @property
+    def deviation(self) -> float | None:
+        """The deviation of paired differences within scenes; None with one pair per scene."""
+        if self.pairs.seeds < 2:
+            return None
+        return float(np.sqrt(self.pairs.differences.var(axis=1, ddof=1).mean()))
+
+    @property
+    def equal(self) -> bool:
+        """Return whether all pairs have a difference of exactly 0; False without a pair."""
+        differences = self.pairs.differences
+        return differences.size > 0 and not differences.any()
+
+    @property
+    def loss_excluded(self) -> bool:
+        """Return whether the interval excludes a loss of the least difference that matters."""
+        if self.interval is None or self.least is None:
+            return False
+        sign = self.question.sign
+        return min(sign * self.interval.low, sign * self.interval.high) > -self.least
+
+    def gain_excluded(self, error_rate: float) -> bool:
+        """Return whether a gain of the least difference that matters is excluded.
+
+        ``error_rate`` is the chance that such a gain is excluded although it is there.
+        """
+        if self.test is None or self.least is None:
+            return False
+        sign, interval = self.question.sign, self.test.interval(2 * error_rate)
+        return max(sign * interval.low, sign * interval.high) < self.least
+
+    def shown(self, value: float) -> str:
+        """A difference as text: ``−0.0123``, or ``+28.4 %`` if the question is relative."""
+        if self.question.relative:
+            return f"{signed(100 * math.expm1(value), '.1f')} %"
+        return signed(value, f".{self.quantity.decimals + 1}f")
+
+    def shown_interval(self, interval: Interval) -> str:
+        return f"{self.shown(interval.low)} to {self.shown(interval.high)}"
+
+
+def judge(
+    trials: Sequence[TrialResult], question: Question, unfinished: Sequence[Unfinished] = ()
+) -> Verdict:
+    """The verdict on a question by the ``trials`` of its experiment, done or ``unfinished``.
+
+    Trials of which it does not ask change nothing. It waits until all its trials are done or have
+    failed; with looks, it is answered at the first look that decides it.
+    """
+    own = [one for one in trials if question.has(one.digest, one.scene, one.seed)]
+    open_ = [one for one in unfinished if one.is_of(question)]
+    pairs = pair(own, question)
+    verdict = Verdict(
+        question,
+        asked_quantity(question.metric, own),
+        pairs,
+        _state(question, own, open_),
+        question.level,
+        done=len(own) + sum(one.failed for one in open_),
+        notes=(*pairs.left_out, *between_scenes_notes(pairs.of_baseline, pairs.of_arm)),
+        missing=tuple(one for one in open_ if not one.failed),
+    )
+    if why := _untestable(verdict):
+        others = tuple(note for note in verdict.notes if note != why)
+        return replace(verdict, untestable=why, notes=others)
+    if question.looks and verdict.state not in (NOT_TESTED, NOT_ASKED):
+        verdict = _at_looks(verdict)
+    elif verdict.state == ANSWERED:
+        verdict = _without_lacking(_decide(verdict), own, open_)
+    else:
+        verdict = replace(_measure(verdict), final=verdict.state in (NOT_TESTED, NOT_ASKED))
+    return replace(verdict, scenes=_scenes(verdict))
+
+
+def _state(
+    question: Question, own: Sequence[TrialResult], unfinished: Sequence[Unfinished]
+) -> State:
+    if question.untested:
+        return NOT_TESTED
+    ideas = {second for _, second in question.digests.values()}
+    # gates, ledgers and old declarations know by themselves what was asked before
+    if question.rule == BY_COMMAND and not all(one.asked for one in own if one.digest in ideas):
+        return NOT_ASKED
+    ended = len(own) + sum(one.failed for one in unfinished)
+    if ended >= question.trials:
+        return ANSWERED
+    return RUNNING if any(one.running for one in unfinished) else STOPPED
+
+
+def _untestable(verdict: Verdict) -> Note | None:
+    """The reason why the question's trials can never answer it."""
+    pairs = verdict.pairs
+    same = [note for note in pairs.left_out if note.kind in (SAME_CAPTURE, "unlike")]
+    if same or (pairs.left_out and not pairs.rows and verdict.state == ANSWERED):
+        return (*same, *pairs.left_out)[0]
+    if (
+        pairs.rows
+        and verdict.state == ANSWERED
+        and all(are_equal(*both) for row in pairs.rows for both in row.trials)
+    ):
+        return Note.of("equal", pairs=sum(len(row.trials) for row in pairs.rows))
+    return None
+
+
+def _at_looks(asked: Verdict) -> Verdict:
+    """Judge at each look that has all its trials, and stop at the first look that decides."""
+    looks, rate = asked.question.looks, asked.question.level
+    verdict = replace(asked, pairs=asked.pairs.first(0), final=False)
+    whole = len(asked.pairs.rows) == len(asked.question.seeds)
+    for seeds, share in zip(looks, look_shares(len(looks)), strict=True):
+        if not whole or seeds > asked.pairs.seeds:
+            break
+        at_look = replace(asked, pairs=asked.pairs.first(seeds), level=rate * share)
+        verdict = replace(_decide(at_look), state=ANSWERED)
+        verdict = replace(verdict, final=verdict.outcome != UNDECIDED or seeds == looks[-1])
+        if verdict.final:
+            return verdict
+    return replace(verdict, state=RUNNING if asked.state == ANSWERED else asked.state)
+
+
+def _measure(verdict: Verdict) -> Verdict:
+    """The verdict with mean and test, the outlying trials, and no outcome."""
+    pairs = verdict.pairs
+    test = t_test(pairs.differences) if pairs.seeds else None
+    return replace(verdict, test=test, outlying=tuple(find_outlying(pairs)))
+
+
+def _decide(verdict: Verdict) -> Verdict:
+    verdict = _measure(verdict)
+    if verdict.interval is None:
+        return verdict
+    sign, least = verdict.question.sign, verdict.least
+    means = verdict.pairs.differences.mean(axis=1)
+    return replace(
+        verdict,
+        outcome=outcome_of(verdict.interval, sign, least),
+        like_these=judge_like_these(means, sign, least, verdict.level),
+    )
+
+
+def _without_lacking(
+    verdict: Verdict, trials: Sequence[TrialResult], unfinished: Sequence[Unfinished]
+) -> Verdict:
+    """The verdict, undecided if it favours an arm that lacks results which the other arm has."""
+    question, read = verdict.question, verdict.quantity.read
+    sides = {second for _, second in question.digests.values()}
+    done: tuple[set[tuple[str, int]], set[tuple[str, int]]] = (set(), set())
+    for trial in trials:
+        if read(trial) is not None:
+            done[trial.digest in sides].add((trial.scene, trial.seed))
+    valueless = [Unfinished.of(trial) for trial in trials if read(trial) is None]
+    lacking: tuple[list[Unfinished], list[Unfinished]] = ([], [])
+    for one in (*unfinished, *valueless):
+        side = int(one.is_of(question, 1))
+        if (one.scene, one.seed) in done[1 - side] - done[side]:
+            lacking[side].append(one)
+
+    def favours_lacking(outcome: Outcome) -> bool:
+        favoured_sides = favoured(outcome, question.sign, verdict.quantity.direction)
+        return any(lacking[side] for side in favoured_sides)
+
+    like, favours = verdict.like_these, favours_lacking(verdict.outcome)
+    if like is not None and favours_lacking(like.outcome):
+        like = replace(like, outcome=UNDECIDED)
+    return replace(
+        verdict,
+        outcome=UNDECIDED if favours else verdict.outcome,
+        like_these=like,
+        lacking=(*lacking[0], *lacking[1]),
+        favours_lacking=favours,
+    )
+
+
+def _scenes(verdict: Verdict) -> tuple[SceneEstimate, ...]:
+    lacking = {one.scene for one in verdict.lacking}
+    found = []
+    for row, differences in zip(verdict.pairs.rows, verdict.pairs.differences, strict=True):
+        if not len(differences):
+            continue
+        test = None if row.scene in lacking else t_test(differences[None])
+        interval = None if test is None else test.interval(ALPHA)
+        found.append(
+            SceneEstimate(row.scene, float(differences.mean()), len(differences), interval)
+        )
+    return tuple(found)
+
+
+def find_outlying(pairs: Pairs) -> list[TrialResult]:
+    """The trials that are far from the other trials of their scene and arm.
+
+    Far is more than `OUTLYING` deviations from the mean of the others. The deviation of two or
+    three trials is often small by chance. So the largest of three counts: the other trials'
+    deviation, that of the scene's other arm, and the typical deviation over all scenes and
+    arms.
+    """
+    rows = [row for row in pairs.rows if len(row.seeds) > LEAST_OTHERS]
+    deviations = [(float(row.baseline.std(ddof=1)), float(row.arm.std(ddof=1))) for row in rows]
+    ordered = sorted(deviation for both in deviations for deviation in both)
+    typical = FEW * ordered[(len(ordered) - 1) // 2] if ordered else 0.0
+    outlying = []
+    for row, both in zip(rows, deviations, strict=True):
+        for side, values in enumerate((row.baseline, row.arm)):
+            for index, value in enumerate(values):
+                others = np.delete(values, index)
+                deviation = max(float(others.std(ddof=1)), both[1 - side], typical)
+                if abs(value - others.mean()) > OUTLYING * deviation > 0:
+                    outlying.append(row.trials[index][side])
+    return outlying
+
+
+def interval_of(
+    trials: Sequence[TrialResult],
+    baseline: Arm,
+    idea: Arm,
+    metric: str,
+    state: State = NOT_TESTED,
+    why: str = "",
+) -> Verdict:
+    """Mean and 95 % interval of all trials of two arms in any metric; it is no verdict."""
+    own = [trial for trial in trials if trial.arm in (baseline, idea)]
+    quantity = asked_quantity(metric, own)
+    sides = {
+        scene: ([t for t in of_scene if t.arm == baseline], [t for t in of_scene if t.arm == idea])
+        for scene, of_scene in group_by(own, lambda trial: trial.scene).items()
+    }
+    sides = {scene: both for scene, both in sides.items() if all(both)}
+    question = Question(
+        idea=idea,
+        baseline=baseline,
+        metric=metric,
+        sign=quantity.direction,  # type: ignore[arg-type]
+        least=quantity.worthwhile,
+        digests={scene: (one[0].digest, two[0].digest) for scene, (one, two) in sides.items()},
+        seeds={
+            scene: tuple(sorted({t.seed for t in one} & {t.seed for t in two}))
+            for scene, (one, two) in sides.items()
+        },
+        untested=why or state,
+    )
+    pairs = pair_sides(sides, question)
+    notes = (*pairs.left_out, *between_scenes_notes(pairs.of_baseline, pairs.of_arm))
+    verdict = Verdict(question, quantity, pairs, state, ALPHA, done=len(own), notes=notes)
+    verdict = _measure(verdict)
+    return replace(verdict, scenes=_scenes(verdict))
