@@ -15,7 +15,7 @@ from gsbench.analysis.comparison import compare
 from gsbench.analysis.results import read_experiment
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.tracking import connect, ensure_experiment, show_ideas
-from gsbench.tracking.ideas import address, description
+from gsbench.tracking.ideas import addresses, description
 from gsbench.tracking.sync import sync
 from gsbench.verbs import servers
 from tests.helpers import change_json
@@ -74,7 +74,7 @@ def test_an_idea_is_a_run_with_its_trials_below(kind, tmp_path, request):
     numbers = ideas["volumetric"].data.metrics
     # over scenes and seeds 0 and 1: 21.0 and 21.1 in both scenes
     assert_allclose(numbers["eval/psnr_dB"], 21.05)
-    assert_allclose(numbers["eval/psnr_dB_sd"], 0.1 / 2**0.5, rtol=1e-6)
+    assert_allclose(numbers["deviation/psnr_dB"], 0.1 / 2**0.5, rtol=1e-6)
     assert numbers["trials"] == 4
     assert "a_init-volumetric against a_init-adc" in ideas["volumetric"].data.tags[NOTE]
     assert ideas["adc"].data.tags["verdict"] == "baseline"
@@ -191,7 +191,7 @@ def test_a_browser_shows_a_row_for_each_idea(tmp_path, monkeypatch):
     runs, port = tmp_path / "runs", free_port()
     list(sync(write_sweep(runs), None))
     server = f"http://127.0.0.1:{port}"
-    page = address(server, show_ideas(runs / "swept", None))
+    page = addresses(server, show_ideas(runs / "swept", None))["ideas"]
     started = []
     popen = servers.subprocess.Popen
     monkeypatch.setattr(

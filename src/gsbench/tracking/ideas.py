@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 IDEA = "gsbench.idea"  # the tag of a parent run
 PARENT = "mlflow.parentRunId"  # MLflow's tag of a nested run
 SUPERSEDED = "superseded"  # the tag of a trial that later code repeated
-DEVIATION = "_sd"  # ends the names of standard deviations
+DEVIATION = "deviation"  # MLflow shows the charts of such a prefix together
 OWN_NOTE = "`gsbench report"  # in a description that gsbench wrote
 NO_VERDICT = "No verdict: it needs two arms."
 RUNS_AT_ONCE = 1000
@@ -133,7 +133,7 @@ def _means(trials: Sequence[TrialResult]) -> dict[str, float]:
         if cell.mean is not None:
             numbers[name] = cell.mean
         if cell.std is not None:
-            numbers[f"{name}{DEVIATION}"] = cell.std
+            numbers[name.replace(EVAL, DEVIATION, 1)] = cell.std
     return numbers
 
 
@@ -148,7 +148,7 @@ def _tags(arm: Arm, trials: Sequence[TrialResult], comparison: Comparison) -> di
         *[markdown_text(answer.sentence) for answer in own],
         markdown_text(
             f"{counted(len(trials), 'trial')} on {', '.join(scenes)}, {seeds_text(trials)}: means "
-            f"over scenes; {DEVIATION} is the standard deviation over seeds."
+            f"over scenes, and standard deviations over seeds."
         ),
         _more(comparison.experiment.name),
     ]
@@ -214,6 +214,7 @@ def description(experiment: Experiment, comparison: Comparison) -> str:
     return text + end
 
 
-def address(server: str, experiment_id: str) -> str:
-    """The page of an experiment on a server of MLflow."""
-    return f"{server.rstrip('/')}/#/experiments/{experiment_id}/runs"
+def addresses(server: str, experiment_id: str) -> dict[str, str]:
+    """The page of an experiment on a server of MLflow: its ideas as rows, and as bars."""
+    page = f"{server.rstrip('/')}/#/experiments/{experiment_id}/runs"
+    return {"ideas": page, "bars": f"{page}?compareRunsMode=CHART"}
