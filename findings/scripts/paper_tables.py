@@ -7,7 +7,9 @@
 ``train`` first unpacks ``findings/archives/EXPERIMENT.zip`` into ``$GSBENCH_RUNS``, if nothing of
 the experiment is there. It then trains one after the other what has no result yet, and can be
 killed and started again at any time. ``save`` writes the archive, with all trials so far, and
-``EXPERIMENT.csv`` beside it: what archives lack and a machine that is gone cannot tell.
+beside it what archives lack and a machine that is gone cannot tell: ``EXPERIMENT.csv`` (CPU time,
+the share of volumes below V_th) and ``EXPERIMENT_regions.npz`` (the mean squared errors of regions
+of 32 px by trial and view, `gsbench.analysis.regions`).
 """
 
 from __future__ import annotations
@@ -18,13 +20,19 @@ import re
 import resource
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from gsbench.analysis.regions import region_errors
 
 FINDINGS = Path(__file__).resolve().parents[1]
 LINE = re.compile(r"^(\w+) +(?P<scene>\S+?)/\S+-(?P<densify>\S+) seed (?P<seed>\d+) \(\w+\)")
 THRESHOLD = 0.03  # V_th of the paper
+PICTURES = ("renders", "ground_truth")
 MEASURED = "measured_here.csv"  # in the experiment's folder: CPU time of each training
 FIELDS = ("trial", "cpu_seconds", "gaussians", "share_below_threshold")
 
@@ -61,13 +69,13 @@ def train(clone: Path, experiment: str) -> None:
         one = [f"scene.path={os.environ['GSBENCH_DATA']}/{first['scene']}"]
         one += [f"seed={first['seed']}", f"densify={first['densify']}"]
         done = gsbench(clone, *words_of(clone, experiment), *one)
-        if done.returncode:
-            sys.exit(done.returncode)
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         spent = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
         trial = f"{first['scene']}-{first['densify']}-{first['seed']}"
         with (home / MEASURED).open("a") as stream:
             stream.write(f"{trial},{spent:.0f}\n")
+        if done.returncode:
+            sys.exit(done.returncode)
 
 
 def share_below(model: Path) -> tuple[int, float]:
@@ -84,6 +92,15 @@ def share_below(model: Path) -> tuple[int, float]:
     return len(volumes), float((volumes <= THRESHOLD).mean())
 
 
+def regions_of(folder: Path) -> dict[str, NDArray[np.float32]]:
+    """The errors of the regions of a trial's test views, by view."""
+    found = {}
+    for path in sorted((folder / "renders").glob("*.png")):
+        pair = (np.asarray(Image.open(folder / kind / path.name)) for kind in PICTURES)
+        found[path.stem] = region_errors(*pair).astype(np.float32)
+    return found
+
+
 def save(clone: Path, experiment: str) -> None:
     home = Path(os.environ["GSBENCH_RUNS"]) / experiment
     archives = FINDINGS / "archives"
@@ -91,21 +108,32 @@ def save(clone: Path, experiment: str) -> None:
         clone, "export", "--results", experiment, "--out", str(archives / f"{experiment}.zip")
     )
     print(exported.stdout, end="")
-    table, rows = archives / f"{experiment}.csv", dict[str, dict[str, str]]()
+    table, maps = archives / f"{experiment}.csv", archives / f"{experiment}_regions.npz"
+    rows = dict[str, dict[str, str]]()
     if table.exists():
         with table.open() as stream:
             rows = {row["trial"]: row for row in csv.DictReader(stream)}
-    spent = dict(line.split(",") for line in (home / MEASURED).read_text().split())
-    for model in sorted(home.glob("*/*/*-seed*/point_cloud.ply")):
-        scene, arm, trial = model.relative_to(home).parts[:3]
+    regions = dict(np.load(maps)) if maps.exists() else {}
+    spent = Counter[str]()  # a training that was killed and continued has several lines
+    if (home / MEASURED).exists():
+        for line in (home / MEASURED).read_text().split():
+            trial, seconds = line.split(",")
+            spent[trial] += int(seconds)
+    for results in sorted(home.glob("*/*/*-seed*/results.json")):
+        scene, arm, trial = results.relative_to(home).parts[:3]
         name = f"{scene}-{arm.partition('-')[2]}-{trial.partition('-seed')[2]}"
-        count, share = share_below(model)
-        values = (name, spent.get(name, ""), str(count), f"{share:.6f}")
-        rows[name] = dict(zip(FIELDS, values, strict=True))
+        model = results.parent / "point_cloud.ply"
+        if model.exists():  # else it was trained elsewhere, and is in the files already
+            count, share = share_below(model)
+            values = (name, str(spent.get(name, "")), str(count), f"{share:.6f}")
+            rows[name] = dict(zip(FIELDS, values, strict=True))
+            of_views = regions_of(results.parent)
+            regions |= {f"{name}/{view}": errors for view, errors in of_views.items()}
     with table.open("w", newline="") as stream:
         writer = csv.DictWriter(stream, FIELDS, lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows.values())
+    np.savez_compressed(maps, **regions)
 
 
 if __name__ == "__main__":

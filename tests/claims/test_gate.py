@@ -6,11 +6,11 @@ from shlex import split
 import numpy as np
 import pytest
 
-from gsbench.analysis.judge import Verdict
 from gsbench.analysis.pairs import Pairs
 from gsbench.analysis.quantities import asked_quantity
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.statistics import StudentT
+from gsbench.analysis.verdicts import Verdict
 from gsbench.claims.export import write_archive
 from gsbench.claims.gate import (
     NOT_DECIDED,

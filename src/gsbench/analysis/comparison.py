@@ -12,7 +12,14 @@ from functools import cached_property
 from typing import Any
 
 from gsbench.analysis.cells import with_variants
-from gsbench.analysis.judge import (
+from gsbench.analysis.notes import Note, texts
+from gsbench.analysis.old_declarations import all_questions
+from gsbench.analysis.pairs import are_equal
+from gsbench.analysis.quantities import choose_quantities
+from gsbench.analysis.questions import Asked, Row, choose_pairs, rows_of
+from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by
+from gsbench.analysis.sentences import asked_words, badge, headline, risk, sentence
+from gsbench.analysis.verdicts import (
     ANSWERED,
     NOT_ASKED,
     NOT_TESTED,
@@ -21,13 +28,6 @@ from gsbench.analysis.judge import (
     interval_of,
     judge,
 )
-from gsbench.analysis.notes import Note, texts
-from gsbench.analysis.old_declarations import all_questions
-from gsbench.analysis.pairs import are_equal
-from gsbench.analysis.quantities import choose_quantities
-from gsbench.analysis.questions import Asked, Row, choose_pairs, rows_of
-from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by
-from gsbench.analysis.sentences import asked_words, badge, headline, risk, sentence
 from gsbench.runs.commands import Question, code_in
 from gsbench.runs.layout import TUNING
 

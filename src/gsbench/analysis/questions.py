@@ -20,15 +20,16 @@ import itertools
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
+from gsbench.analysis.addresses import ArmName
 from gsbench.analysis.statistics import ALPHA, MIN_SCENES, sign_test_needs
 from gsbench.analysis.trial_settings import canonical
 from gsbench.errors import InputError
 from gsbench.runs.commands import Digest, History, Place, Question, code_in
 from gsbench.runs.config_hash import is_among, is_hashed
 from gsbench.runs.experiments import Arm
-from gsbench.words import counted, least_text
+from gsbench.words import counted, least_text, some_of
 
 ORDINALS = ("first", "second", "third", "fourth", "fifth")
 LAST_LOOK = 0.6  # of a question's level
@@ -182,11 +183,50 @@ def rows_of(trials: Iterable[Any]) -> list[Row]:
 
 
 @dataclass(frozen=True)
+class NamedQuestion:
+    """A question that an experiment's file names: an entry of ``questions``.
+
+    ``idea`` and ``baseline`` are arms as tables name them, such as ``longaxis`` or
+    ``mine[decay=0.9]``. Without ``scenes`` it is about all. ``budget`` has the settings of the arms
+    that are meant. It ``says`` what a paper says, ``where``.
+    """
+
+    idea: str
+    baseline: str = "adc"
+    metric: str = ""  # "": that of eval.primary
+    direction: Literal["higher", "lower", "same", ""] = ""  # "": the better one
+    least: float | str | None = None
+    scenes: list[str] = field(default_factory=list)
+    budget: dict[str, Any] = field(default_factory=dict)
+    says: str = ""
+    where: str = ""
+
+    def rows(self, word: str, planned: Sequence[Row]) -> list[Row]:
+        """The planned trials of the arm called ``word``; raises InputError unless it is one."""
+        name = ArmName.read(word)
+        found = [
+            row
+            for row in planned
+            if name.fits(row)
+            and all(
+                str(row.config.get(key, value)) == str(value) for key, value in self.budget.items()
+            )
+            and row.scene in (self.scenes or [row.scene])
+        ]
+        arms = list(dict.fromkeys(row.arm for row in found))
+        if len(arms) != 1:
+            known = some_of([str(arm) for arm in dict.fromkeys(row.arm for row in planned)])
+            fault = "no arm" if not arms else f"several arms, {some_of(list(map(str, arms)))}"
+            raise InputError(f"questions: {word} names {fault} of this sweep (it has {known})")
+        return found
+
+
+@dataclass(frozen=True)
 class Asked:
     """What a command asks, beside its trials.
 
-    ``pairs`` are (baseline, idea) as texts of arms if the experiment's file names them. The error
-    rate is for each idea, or ``shared`` by all.
+    The error rate is that of each idea, or ``shared`` by all. ``named`` are the questions that the
+    experiment's file names, each with sign and least difference, in place of the usual ones.
     """
 
     metric: str
@@ -197,6 +237,7 @@ class Asked:
     looks: tuple[int, ...] = ()
     shared: bool = False
     split: str = ""  # ask about trials with this rule of held-out views alone
+    named: tuple[tuple[NamedQuestion, int, LeastEffect | None], ...] = ()
 
 
 def ask(
@@ -210,8 +251,38 @@ def ask(
     planned = [
         row for row in planned if not asked.split or row.config.get("scene.split") == asked.split
     ]
-    pairs = choose_pairs(planned, asked, measured)
-    return write_questions(pairs, planned, asked, measured, history)
+    if asked.named:
+        drafts = [
+            _named_draft(number, *one, planned, asked, measured)
+            for number, one in enumerate(asked.named, 1)
+        ]
+    else:
+        pairs = choose_pairs(planned, asked, measured)
+        drafts = [_about(*pair, planned, asked, measured) for pair in pairs]
+    return _with_levels(drafts, planned, asked, measured, history)
+
+
+def _named_draft(
+    number: int,
+    named: NamedQuestion,
+    sign: int,
+    least: LeastEffect | None,
+    planned: Sequence[Row],
+    asked: Asked,
+    measured: Sequence[Row],
+) -> Question:
+    ideas, baselines = (named.rows(word, planned) for word in (named.idea, named.baseline))
+    draft = _about(baselines[0].arm, ideas[0].arm, [*baselines, *ideas], asked, measured)
+    return replace(
+        draft,
+        metric=named.metric or asked.metric,
+        sign=sign,  # type: ignore[arg-type]
+        least=None if least is None else least.size,
+        relative=least is not None and least.relative,
+        name=f"{named.idea}-{number}",
+        says=named.says,
+        where=named.where,
+    )
 
 
 def choose_pairs(
@@ -265,17 +336,16 @@ def _unlike(arm: Arm, other: Arm, configs: Mapping[Arm, Mapping[str, str]]) -> i
     return sum(key in one and key in two and one[key] != two[key] for key in swept)
 
 
-def write_questions(
-    pairs: Sequence[tuple[Arm, Arm]],
+def _with_levels(
+    drafts: Sequence[Question],
     planned: Sequence[Row],
     asked: Asked,
     measured: Sequence[Row],
     history: History,
 ) -> tuple[list[Question], list[str]]:
-    """The questions about ``pairs`` that no earlier one covers, and the ids of those that do."""
+    """The ``drafts`` that no earlier question covers, with levels, and the ids of those that do."""
     new, shown = list[Question](), list[str]()
-    for baseline, idea in pairs:
-        question = _about(baseline, idea, planned, asked, measured)
+    for question in drafts:
         if not question.places:
             continue
         covering = [one for one in history.questions if one.covers(question)]

@@ -2,15 +2,6 @@
 
 from collections.abc import Sequence
 
-from gsbench.analysis.judge import (
-    ANSWERED,
-    NOT_ASKED,
-    NOT_TESTED,
-    RUNNING,
-    STOPPED,
-    SceneEstimate,
-    Verdict,
-)
 from gsbench.analysis.questions import ORDINALS, places_text
 from gsbench.analysis.results import Unfinished
 from gsbench.analysis.statistics import (
@@ -21,6 +12,15 @@ from gsbench.analysis.statistics import (
     Interval,
     Outcome,
     exact_for,
+)
+from gsbench.analysis.verdicts import (
+    ANSWERED,
+    NOT_ASKED,
+    NOT_TESTED,
+    RUNNING,
+    STOPPED,
+    SceneEstimate,
+    Verdict,
 )
 from gsbench.words import command, counted, least_text, some_of
 

@@ -11,10 +11,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from gsbench.analysis.judge import Verdict, judge
 from gsbench.analysis.quantities import asked_quantity
 from gsbench.analysis.results import TrialResult
 from gsbench.analysis.sentences import reason
+from gsbench.analysis.verdicts import Verdict, judge
 from gsbench.errors import InputError
 from gsbench.runs.commands import ERROR_RATE, Question
 from gsbench.runs.experiments import Arm

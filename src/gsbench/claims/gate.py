@@ -9,13 +9,13 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from gsbench.analysis.judge import Verdict
 from gsbench.analysis.notes import Note
 from gsbench.analysis.quantities import COSTS, NO_DIRECTION
 from gsbench.analysis.questions import FIRST_LOOK, LeastEffect, plan_looks, read_least
 from gsbench.analysis.results import Arm, TrialResult
 from gsbench.analysis.sentences import in_words, least_words, with_notes
 from gsbench.analysis.statistics import REFUTED, SUPPORTED, TOO_SMALL, UNDECIDED
+from gsbench.analysis.verdicts import Verdict
 from gsbench.claims.stopping import SequentialTest
 from gsbench.errors import InputError
 from gsbench.eval.facts import known_keys

@@ -17,13 +17,13 @@ import hashlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 
-from gsbench.analysis.judge import Verdict
 from gsbench.analysis.notes import Note
 from gsbench.analysis.quantities import COSTS, relative_change
 from gsbench.analysis.questions import plan_looks
 from gsbench.analysis.results import Arm, TrialResult
 from gsbench.analysis.sentences import least_words, reason, with_notes
 from gsbench.analysis.statistics import REFUTED, SUPPORTED, TOO_SMALL
+from gsbench.analysis.verdicts import Verdict
 from gsbench.claims.stopping import SequentialTest
 from gsbench.errors import InputError
 from gsbench.runs.commands import ERROR_RATE, Question

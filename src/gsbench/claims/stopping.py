@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 
 from gsbench.analysis.comparison import compare
 from gsbench.analysis.fairness import counts_notes, limit_notes
-from gsbench.analysis.judge import Verdict, judge
 from gsbench.analysis.notes import texts
 from gsbench.analysis.results import TrialResult, newest_code, read_experiment
+from gsbench.analysis.verdicts import Verdict, judge
 from gsbench.config.compose import Trial
 from gsbench.runs.commands import Digest, Question
 from gsbench.runs.layout import LEDGER

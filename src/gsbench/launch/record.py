@@ -15,7 +15,19 @@ from typing import Any
 import yaml
 
 from gsbench.analysis.cells import with_variants
-from gsbench.analysis.questions import FIRST_LOOK, Asked, Row, announce, ask, plan_looks, rows_of
+from gsbench.analysis.quantities import COSTS, TEXTURED
+from gsbench.analysis.questions import (
+    FIRST_LOOK,
+    Asked,
+    LeastEffect,
+    NamedQuestion,
+    Row,
+    announce,
+    ask,
+    plan_looks,
+    read_least,
+    rows_of,
+)
 from gsbench.analysis.results import group_by, read_experiment
 from gsbench.config.compose import Trial
 from gsbench.errors import InputError
@@ -25,10 +37,12 @@ from gsbench.runs.commands import Command, History, PlannedTrial, Question, appe
 from gsbench.runs.experiments import QUESTIONS, metric_and_question
 from gsbench.runs.layout import LEDGER, RESULTS, SEED, TUNING
 from gsbench.runs.nested import flatten
+from gsbench.settings import check_values
 
 log = logging.getLogger(__name__)
 
 DEFAULT_METRIC = "psnr"
+DIRECTIONS = {"higher": 1, "lower": -1, "same": 0}
 
 
 def record(trials: Sequence[Trial], asks: bool = True) -> list[Question]:
@@ -131,6 +145,7 @@ def asked_of(trials: Sequence[Trial], rows: Sequence[Row]) -> Asked | None:
     if not facts.direction:
         log.warning("whether more of %s is better is not known: nothing is tested", metric)
         return None
+    named = _named(values, metric)
     split = next((key for key, question in QUESTIONS.items() if question == about), "")
     return Asked(
         metric=metric,
@@ -142,7 +157,31 @@ def asked_of(trials: Sequence[Trial], rows: Sequence[Row]) -> Asked | None:
             plan_looks(len({row.seed for row in rows})) if launch.get("stop_when_decided") else ()
         ),
         split=split,
+        shared=values.get("error_rate") == "shared",
+        named=named,
     )
+
+
+def _named(
+    values: Mapping[str, Any], metric: str
+) -> tuple[tuple[NamedQuestion, int, LeastEffect | None], ...]:
+    """The questions that the experiment's file names; raises InputError for a wrong one."""
+    found = []
+    for number, entry in enumerate(values.get("questions") or (), 1):
+        where = f"questions[{number}]"
+        if not isinstance(entry, dict) or "idea" not in entry:
+            raise InputError(f"{where} must be a mapping with idea, baseline, metric, …")
+        named = NamedQuestion(**check_values(NamedQuestion, entry, where))
+        asked = named.metric or metric
+        facts = None if asked in (*COSTS, TEXTURED.key) else facts_for(asked, values)
+        sign = DIRECTIONS.get(named.direction, facts.direction if facts else -1)
+        usual = facts.worthwhile if facts else None
+        least = usual if named.least is None else named.least
+        effect = None if least is None else read_least(least, f"{where}.least")
+        if effect is None and named.direction == "same":
+            raise InputError(f"{where}.least is needed: a difference below which both are the same")
+        found.append((named, sign, effect))
+    return tuple(found)
 
 
 def check_looks(trials: Sequence[Trial], rows: Sequence[Row]) -> tuple[int, ...]:

@@ -16,7 +16,18 @@ DECLARED = {
     "densify": ("switches",),
     "train": ("steps_scaler",),
 }
-NOT_HASHED = ("name", "seed", "device", "threads", "runs", PERMISSIONS, "tracking", "launch")
+NOT_HASHED = (
+    "name",
+    "questions",
+    "error_rate",
+    "seed",
+    "device",
+    "threads",
+    "runs",
+    PERMISSIONS,
+    "tracking",
+    "launch",
+)
 # Settings in which trials of one cell may differ: they do not change what is computed.
 # "x" stands for x and all below it (x.y).
 IGNORED_SETTINGS = (

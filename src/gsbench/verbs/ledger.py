@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from gsbench.analysis.judge import judge
 from gsbench.analysis.ledger_table import describe_ledger, difference_text, ledger_tables, why
 from gsbench.analysis.results import read_experiment
 from gsbench.analysis.table_formats import to_markdown
+from gsbench.analysis.verdicts import judge
 from gsbench.app.command import run_trials
 from gsbench.app.ledger_trials import (
     Trials,

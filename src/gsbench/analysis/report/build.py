@@ -15,7 +15,6 @@ from gsbench.analysis.designs import seeds_needed
 from gsbench.analysis.differences import between_scenes_notes
 from gsbench.analysis.fairness import caveats, counts_notes, fairness_table, limit_notes
 from gsbench.analysis.images import choose_views, png_uri
-from gsbench.analysis.judge import Verdict
 from gsbench.analysis.ledger_table import describe_ledger, ledger_tables
 from gsbench.analysis.notes import texts
 from gsbench.analysis.pairs import pair_trials
@@ -24,10 +23,12 @@ from gsbench.analysis.quantities import COSTS, choose_quantities, relative_chang
 from gsbench.analysis.ranks import rank_all
 from gsbench.analysis.report.charts import ForestRow, forest_plot, line_chart, rank_plot
 from gsbench.analysis.report.curves import event_charts, event_table, training_charts
+from gsbench.analysis.report.quality import quality_charts
 from gsbench.analysis.report.volumes import volume_charts
 from gsbench.analysis.results import Experiment, TrialResult, group_by, trials_of
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry, fill
 from gsbench.analysis.tables import build_table, with_agreement
+from gsbench.analysis.verdicts import Verdict
 from gsbench.errors import InputError
 from gsbench.eval.facts import find_metric
 from gsbench.parsing import read_if_sound
@@ -88,7 +89,10 @@ def build_report(
         say=sentences,
         seeds_to_resolve=seeds_to_resolve,
         signed=lambda value, decimals: "–" if value is None else signed(value, f".{decimals}f"),
-        training=training_charts(trials, arms),
+        training=[
+            *quality_charts(trials, dict.fromkeys(one.verdict.quantity for one in judged)),
+            *training_charts(trials, arms),
+        ],
         event_table=event_table(trials, arms),
         events=event_charts(trials, arms),
         volumes=volumes,

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from gsbench.analysis.judge import find_outlying, interval_of, judge
 from gsbench.analysis.notes import texts
 from gsbench.analysis.pairs import Pairs, ScenePairs, pair
 from gsbench.analysis.results import Unfinished, read_experiment
 from gsbench.analysis.sentences import badge, in_words, reason, risk, sentence
+from gsbench.analysis.verdicts import find_outlying, interval_of, judge
 from gsbench.runs.trial_record import Budget
 from tests.analysis.helpers import ADC, VOLUMETRIC
 from tests.trials import ask_about, write_runs
