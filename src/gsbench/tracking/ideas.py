@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from filelock import FileLock
 
 from gsbench.analysis.cells import make_cell
-from gsbench.analysis.comparison import VERDICT, Comparison, compare
+from gsbench.analysis.comparison import Comparison, compare
 from gsbench.analysis.quantities import Quantity, metric_keys
 from gsbench.analysis.results import (
     Arm,
@@ -199,16 +199,15 @@ def _more(name: str) -> str:
 def description(experiment: Experiment, comparison: Comparison) -> str:
     """Verdicts, table and its notes in Markdown, cut to what a tag may hold."""
     try:
-        lines = to_markdown(build_table(experiment)).splitlines()
+        lines = to_markdown(build_table(experiment, comparison=comparison)).splitlines()
     except InputError as error:  # cells would average unlike trials
         lines = [markdown_text(f"No table: {error}")]
-    rest = [line for line in lines if not line.startswith((f"- {VERDICT}", "#"))]
+    rest = [line for line in lines if not line.startswith("#")]
     # The page shows only the first line until it is clicked: decided ideas come first there.
     ordered = sorted(comparison.answers, key=lambda one: one.verdict.outcome == UNDECIDED)
     first = "; ".join(headline(one.verdict) for one in ordered) or NO_VERDICT
-    verdicts = [f"- {markdown_text(line)}" for line in comparison.sentences]
     end = f"\n\n{_more(experiment.name)}"
-    text = "\n".join([f"**{markdown_text(first)}**", "", *verdicts, "", *rest]).strip()
+    text = "\n".join([f"**{markdown_text(first)}**", "", *rest]).strip()
     if len(text) + len(end) > MAX_TAG:
         text = text[: MAX_TAG - len(end)].rpartition("\n")[0]
     return text + end
