@@ -268,10 +268,8 @@ def _text_camera(line: str, _: Lines, checks: ModelChecks) -> None:
     if PARAMETERS.get(words[1]) != len(words) - 4:
         raise InputError(f"camera {words[0]} is of an unknown model or lacks parameters")
     for word in words[2:4]:
-        _require_whole(
-            word,
-            f"camera {words[0]} has the size {word}: sizes are whole numbers of px, without a point",
-        )
+        said = f"camera {words[0]} has the size {word}: write whole numbers of px, without a point"
+        _require_whole(word, said)
     checks.camera(int(words[0]), words[1], int(words[2]), int(words[3]), _numbers(words[4:]))
 
 
