@@ -26,7 +26,7 @@ from tests.analysis.untruths import KINDS, rates
 from tests.conftest import script
 from tests.helpers import refusal
 
-shared_baseline = script("shared_baseline")  # all draws at once; test_comparison.py compares them
+habits = script("habits")  # all draws at once; test_promises.py compares them with one
 
 
 def test_the_test_of_one_scene_is_the_paired_t_test():
@@ -185,7 +185,7 @@ def test_seeds_needed_give_the_promised_power():
     rng = np.random.default_rng(0)
 
     def power(count):
-        found = shared_baseline.p_values(rng.normal(0.1, 0.1, (2000, 2, count)))
+        found = habits.p_values(rng.normal(0.1, 0.1, (2000, 2, count)))[1]
         return (found < ALPHA).mean()
 
     assert 0.76 < power(seeds) < 0.93
@@ -237,7 +237,7 @@ def test_power_is_the_share_of_simulated_sweeps_that_see_the_difference(like_ask
         agree = (values.mean(axis=2) > 0).sum(axis=1)
         seen = [scipy.stats.binomtest(int(count), design.scenes).pvalue <= 0.05 for count in agree]
     else:
-        seen = shared_baseline.p_values(values) < 0.05
+        seen = habits.p_values(values)[1] < 0.05
     assert power(design, effect, KNOWN, like_asked) == pytest.approx(np.mean(seen), abs=0.03)
 
 
