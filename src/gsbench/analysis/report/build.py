@@ -93,7 +93,9 @@ def build_report(
         seeds_to_resolve=seeds_to_resolve,
         signed=lambda value, decimals: "–" if value is None else signed(value, f".{decimals}f"),
         training=[
-            *quality_charts(trials, dict.fromkeys(one.verdict.quantity for one in judged)),
+            *quality_charts(
+                trials, dict.fromkeys(one.verdict.quantity for one in comparison.answers)
+            ),
             *training_charts(trials, arms),
         ],
         event_table=event_table(trials, arms),
