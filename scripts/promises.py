@@ -135,15 +135,29 @@ def noise_of(scenes: int, ratio: float) -> Array:
 
 
 def arms(
-    rng: Rng, noise: Array, seeds: int, effects: Sequence[float], correlation: float = 0.0
+    rng: Rng,
+    noise: Array,
+    seeds: int,
+    effects: Sequence[float],
+    correlation: float = 0.0,
+    degrees: float = math.inf,
 ) -> list[TrialResult]:
-    """Trials of the baseline and of arms with these effects."""
+    """Trials of the baseline and of arms with these effects.
+
+    Their noise is normal, or (``degrees``) Student's of unit variance, with heavy tails.
+    """
     shape = (len(noise), seeds)
-    baseline = rng.standard_normal(shape)
+
+    def drawn() -> Array:
+        if math.isinf(degrees):
+            return rng.standard_normal(shape)
+        return rng.standard_t(degrees, shape) * math.sqrt((degrees - 2) / degrees)
+
+    baseline = drawn()
     found = trials("adc", 25 + noise * math.sqrt(0.5) * baseline)
     for number, effect in enumerate(effects):
         own = correlation * baseline
-        own += math.sqrt(1 - correlation**2) * rng.standard_normal(shape)
+        own += math.sqrt(1 - correlation**2) * drawn()
         found += trials(f"arm{number}", 25 + effect + noise * math.sqrt(0.5) * own)
     return found
 
@@ -366,6 +380,9 @@ def _of_single_questions() -> Iterator[Promise]:
         yield Promise(name, judged, 0.05, 3000, sweep(scenes, seeds, ratio, 0.0))
     name = "false signs, 8 × 6, trainings of a seed correlate by −.17"
     yield Promise(name, judged, 0.05, 2000, sweep(8, 6, 1.0, 0.0, correlation=-0.17))
+    for scenes, seeds in ((1, 3), (3, 3), (8, 3)):
+        name = f"false signs, {scenes} × {seeds}, heavy tails (Student's with 3 degrees)"
+        yield Promise(name, judged, 0.05, 3000, sweep(scenes, seeds, 1.0, 0.0, degrees=3.0))
     name = "false signs of four questions of a command, 3 × 3"
     yield Promise(name, judged, 0.05, 1500, sweep(3, 3, 1.0, 0.0, 4))
     for scenes, seeds in ((1, 6), (3, 4), (20, 4)):

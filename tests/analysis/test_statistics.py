@@ -22,7 +22,6 @@ from gsbench.analysis.statistics import (
     outcome_of,
     t_test,
 )
-from tests.analysis.untruths import KINDS, rates
 from tests.conftest import script
 from tests.helpers import refusal
 
@@ -163,21 +162,6 @@ def test_the_statement_agrees_with_the_sign_test_at_every_level():
 # --- false outcomes of simulated checks; scripts/untruths.py has the large table
 
 
-CHECKS = 300
-LIMIT = 0.05 + 3 * (0.05 * 0.95 / CHECKS) ** 0.5  # three standard errors above the stated rate
-
-
-@pytest.mark.parametrize(
-    "kind",
-    ["normal", "one scene in eight stands out", "a training in ten fails, either arm"],
-)
-def test_no_outcome_is_false_in_more_than_5_percent(kind):
-    """By the fast simulator, which test_decision_rules.py compares with the judge."""
-    for effect in (0.0, 0.5, 1.0, 2.0):
-        found = rates(KINDS[kind], effect, CHECKS, fast=True)
-        assert max(found.untrue.values()) < LIMIT, (effect, found)
-        assert found.like_these < LIMIT, (effect, found)
-    assert kind != "normal" or found.outcomes["supported"] > 0.8
 
 
 def test_seeds_needed_give_the_promised_power():
