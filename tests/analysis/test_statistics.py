@@ -162,8 +162,6 @@ def test_the_statement_agrees_with_the_sign_test_at_every_level():
 # --- false outcomes of simulated checks; scripts/untruths.py has the large table
 
 
-
-
 def test_seeds_needed_give_the_promised_power():
     seeds = seeds_needed(deviation=0.1, scenes=2, difference=0.1)
     rng = np.random.default_rng(0)
