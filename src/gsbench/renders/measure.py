@@ -60,7 +60,7 @@ def measure_folders(
         for done, folder in enumerate(folders, 1):
             method, scene, seed = folder.relative_to(root).parts
             images = pictures_in(truth / scene, settings)
-            matching = match_pictures(list(images.photographs), list_images(folder))
+            matching = match_pictures(list(images.photographs), picture_names(folder))
             pairs = [
                 PicturePair(view, path, folder / matching.pairs[view])
                 for view, path in images.photographs.items()
