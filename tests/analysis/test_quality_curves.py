@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from gsbench.analysis.curves import CountRatio, Curve, count_ratio, count_saving
+from tests.analysis.helpers import page_of
 from tests.helpers import refusal
+from tests.trials import ask_about, write_trial
 
 COUNTS = np.array([10_000.0, 20_000, 40_000, 80_000])
 
@@ -97,6 +99,35 @@ def test_wrong_curves_are_refused():
         Curve.of([0, 1, 2], [1, 2, 3], 1)
     with refusal("positive counts and finite values"):
         Curve.of([1, 2, 3], [1, 2, np.nan], 1)
+
+
+def write_curves(tmp_path, limits):
+    """adc at ``limits``, and volumetric with the same PSNR at three quarters of the counts."""
+    for densify, scale in (("adc", 1.0), ("volumetric", 0.75)):
+        for place, limit in enumerate(limits):
+            for seed in (10, 11, 12):
+                write_trial(
+                    tmp_path,
+                    seed,
+                    f"{place}{limit:07d}",
+                    {"densify.max_gaussians": limit, "densify.cap": "governor"},
+                    densify=densify,
+                    psnr=[25 + np.log(limit) + 0.01 * seed],
+                    _num_gaussians=round(scale * limit),
+                )
+    ask_about(tmp_path)
+
+
+def test_the_report_says_how_many_fewer_gaussians_reach_the_baselines_quality(tmp_path):
+    write_curves(tmp_path, [20_000, 40_000, 60_000])
+    page = page_of(tmp_path)
+    said = "garden: volumetric has the PSNR (dB) of adc with 25 % fewer Gaussians (25 to 25 %)"
+    assert page.count(f"{said}; an estimate, not tested.") == 1  # the words of the picture
+
+
+def test_two_counts_make_no_curve(tmp_path):
+    write_curves(tmp_path, [20_000, 40_000])
+    assert "an estimate, not tested" not in page_of(tmp_path)
 
 
 @pytest.mark.slow

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from gsbench.analysis.pairing import pair_trials
 from gsbench.analysis.verdict_words import by_scene_lines, sentence
-from gsbench.analysis.verdicts import judge_pairs
 from PIL import Image
 from plyfile import PlyData
 
@@ -31,6 +30,7 @@ from gsbench.analysis.report.volumes import (
 )
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.statistics import Interval
+from gsbench.analysis.verdicts import judge_pairs
 from gsbench.runs.rows import Histogram
 from tests.analysis.helpers import ADC, VOLUMETRIC, loaded, page_of, rows_of, trials_of
 from tests.helpers import refusal, write

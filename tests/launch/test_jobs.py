@@ -22,7 +22,6 @@ from gsbench.files import DiskFullError
 from gsbench.launch import jobs
 from gsbench.launch import slurm as slurm_jobs
 from gsbench.launch.jobs import (
-    Outcome,
     TrialJob,
     check_job_links,
     collect,
@@ -30,6 +29,7 @@ from gsbench.launch.jobs import (
     new_job_folder,
     run_one,
 )
+from gsbench.launch.outcomes import Outcome
 from gsbench.launch.states import QueuedJob, current_user, read_submission, record_submission
 from gsbench.runs.commands import digest_of
 from gsbench.runs.config_hash import config_hash
@@ -156,7 +156,7 @@ def test_the_files_of_a_trial_tell_how_its_job_ended(tmp_path):
     assert "; its last lines: RuntimeError: no luck; log:" in collected(tmp_path).message
     failure = json.dumps({"message": "no scene\nat all", "bad_input": True})
     outcome = collected(tmp_path, failure)
-    assert (outcome.message, outcome.bad_input) == (f"no scene; log: {log}", True)
+    assert (outcome.message, outcome.bad_input) == (rf"no scene\nat all; log: {log}", True)
     # what it lacks could not be computed a moment ago either
     assert collected(tmp_path, results="kept").status == "done"
     (trial(tmp_path).folder / "failed.json").unlink()

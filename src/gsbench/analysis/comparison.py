@@ -19,6 +19,7 @@ from gsbench.analysis.quantities import choose_quantities
 from gsbench.analysis.questions import Asked, Row, choose_pairs, rows_of
 from gsbench.analysis.results import Arm, Experiment, TrialResult
 from gsbench.analysis.sentences import asked_words, badge, headline, risk, sentence
+from gsbench.analysis.statistics import REFUTED, SUPPORTED
 from gsbench.analysis.verdicts import (
     ANSWERED,
     NOT_ASKED,
@@ -31,7 +32,6 @@ from gsbench.runs.commands import Question, code_in
 from gsbench.runs.layout import TUNING
 
 DEFAULT_METRIC = "psnr"
-VERDICT = Note.of("verdict", sentence="").sentence  # begins the notes that state verdicts
 
 
 @dataclass(frozen=True)
@@ -57,6 +57,11 @@ class Answer:
     def sentence(self) -> str:
         return sentence(self.verdict)
 
+    @property
+    def line(self) -> str:
+        """``BETTER: sfm-mine against sfm-adc: better in PSNR (dB) on these scenes: +0.50 …``"""
+        return f"{self.badge}: {self.sentence}"
+
 
 @dataclass(frozen=True)
 class Comparison:
@@ -74,6 +79,11 @@ class Comparison:
     def sentences(self) -> list[str]:
         """The verdict on each idea, in a sentence or two each."""
         return [answer.sentence for answer in self.answers]
+
+    @property
+    def lines(self) -> list[str]:
+        """The badge and the verdict on each idea."""
+        return [answer.line for answer in self.answers]
 
     @property
     def headlines(self) -> list[str]:
@@ -102,11 +112,6 @@ class Comparison:
                 notes.append(Note.of("unused", trials=labels, arm=answer.arm))
             notes += [note for note in answer.verdict.notes if note.kind == "valueless"]
         return [*notes, *same_bits_notes(self.trials)]
-
-    def notes(self) -> list[Note]:
-        """The notes below a table: verdicts and remarks."""
-        verdicts = [Note.of("verdict", sentence=text) for text in self.sentences]
-        return [*verdicts, *self.remarks]
 
     def to_json(self) -> dict[str, Any]:
         """The verdicts and what is left out, for other programs."""
@@ -235,6 +240,67 @@ def _with_metrics(
         if quantity.direction and not quantity.cost and quantity.key != verdict.quantity.key
     )
     return Answer(baseline, arm, verdict, others, tuple(m for m in metrics if m.pairs.rows))
+
+
+def joined(comparisons: Sequence[Comparison]) -> Comparison:
+    """The answers of several experiments as those of one, called ``A and B``."""
+    first, *others = comparisons
+    if not others:
+        return first
+    experiments = [one.experiment for one in comparisons]
+    both = replace(
+        first.experiment,
+        name=" and ".join(one.name for one in experiments),
+        trials=tuple(itertools.chain(*(one.trials for one in experiments))),
+        faults=tuple(itertools.chain(*(one.faults for one in experiments))),
+        older=tuple(itertools.chain(*(one.older for one in experiments))),
+        versions=tuple(itertools.chain(*(one.versions for one in experiments))),
+    )
+    trials = itertools.chain(*(one.trials for one in comparisons))
+    answers = itertools.chain(*(one.answers for one in comparisons))
+    return Comparison(both, tuple(trials), tuple(answers))
+
+
+def chosen(comparison: Comparison, trials: Sequence[TrialResult], where: str) -> Comparison:
+    """The answers about ``trials`` alone, which ``where`` chose among those of the comparison.
+
+    An answer that lost none of its trials stays; any other is an interval, since the choice may
+    have been made after seeing results. One without a pair of trials left goes.
+    """
+    kept = {trial.path for trial in trials}
+    own = [trial for trial in comparison.trials if trial.path in kept]
+    answers = []
+    for answer in comparison.answers:
+        used = {trial.path for trial in answer.verdict.pairs.trials}
+        if used and used <= kept:
+            answers.append(answer)
+        elif {answer.baseline, answer.arm} <= {trial.arm for trial in own}:
+            metric, why = answer.verdict.quantity.key, f"{where} chose its trials"
+            verdict = interval_of(own, answer.baseline, answer.arm, metric, NOT_TESTED, why)
+            answers.append(_with_metrics(verdict, own, answer.baseline, answer.arm))
+    return replace(comparison, trials=tuple(own), answers=tuple(answers))
+
+
+def winners(comparison: Comparison) -> dict[tuple[str, frozenset[str]], set[Arm]]:
+    """The arms that were shown to be better, by metric and scenes.
+
+    A baseline is one if all arms that are compared with it on these scenes are worse.
+    """
+    found: dict[tuple[str, frozenset[str]], tuple[set[Arm], set[Arm]]] = {}
+    for answer in comparison.answers:
+        verdict = answer.verdict
+        place = verdict.quantity.key, frozenset(verdict.question.seeds)
+        better, worse = found.setdefault(place, (set(), set()))
+        sides = answer.baseline, answer.arm
+        if verdict.state == ANSWERED and verdict.outcome in (SUPPORTED, REFUTED):
+            if verdict.question.sign != verdict.quantity.direction:
+                continue
+            sides = sides if verdict.outcome == SUPPORTED else sides[::-1]
+            worse.add(sides[0])
+            better.add(sides[1])
+        else:
+            worse.update(sides)
+    return {place: better - worse for place, (better, worse) in found.items()}
 
 
 def same_bits_notes(trials: Sequence[TrialResult]) -> list[Note]:

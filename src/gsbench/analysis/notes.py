@@ -90,7 +90,6 @@ SENTENCES: dict[str, str] = {
         "and all were measured on the test views that the verdict uses."
     ),
     # ---- verdicts, and what was declared
-    "verdict": "Verdict, {sentence}",
     "same bits": (
         "The same bits in all trials of one scene and seed: {arms:all}. The settings in which they "
         "differ had no effect, so there is nothing to compare."
@@ -109,14 +108,14 @@ SENTENCES: dict[str, str] = {
         "{idea}: the ledger says {recorded}, but its trials say {now}: one of them was edited"
     ),
     # ---- how to read a table
-    "one trial": "One trial per cell, so there is no deviation.",
-    "mean": "Mean over {trials:n trial}; ± is the deviation (n − 1) over {spread}.",
-    "bold": "Bold: best mean of a scene after rounding; this is not a test.",
+    "one trial": "One trial per cell, so there is no deviation. Protocol {protocols:list}.{bold}",
+    "mean": (
+        "Mean over {trials:n trial}; ± is the deviation (n − 1) over {spread}. Protocol "
+        "{protocols:list}.{bold}"
+    ),
     "few values": "(k/{trials}): k of {trials:n trial} with a value; —: none.",
-    "protocol": "Protocol {protocols:list}.",
     "not available": "n/a, {reason}.",
     "no mean": "No mean over the scenes is shown, since they differ in conditions or code.",
-    "no best": "{place}: not compared, no best marked: the arms differ in {conditions:list}.",
     "unusable": "Left out ({count}): {folders:few}.",
     "agreement": (
         "Metrics agree with people only in part. Their rank correlation with viewers' scores of "

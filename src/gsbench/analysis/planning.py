@@ -1,7 +1,8 @@
 """Numbers of scenes and seeds that a command needs to show a difference.
 
 The commands differ in their error rate and in their looks, so the same trials have other chances.
-Trainings are simulated with equally noisy scenes, and decided by the thresholds of the judge.
+Trainings are simulated with the shares of noise that the pilot's scenes have, and decided by the
+thresholds of the judge.
 """
 
 import math
@@ -48,19 +49,20 @@ class Purpose:
     give_up: float = 0.0
     screen: float = 0.0
 
-    def power(self, design: Design, difference: float, deviation: float) -> float:
-        """The chance that the command shows ``difference``; pairs differ by ``deviation``."""
+    def power(self, design: Design, difference: float, noise: Components) -> float:
+        """The chance that the command shows ``difference`` where pairs differ as in ``noise``."""
+        deviation, shares = noise.within, noise.shares_of(design.scenes)
         if deviation == 0:
             return 1.0 if difference else 0.0
         if self.screen:
             first, then = replace(self, rate=self.screen, screen=0.0), replace(self, screen=0.0)
-            return math.prod(test.power(design, difference, deviation) for test in (first, then))
+            return math.prod(test.power(design, difference, noise) for test in (first, then))
         if not self.looks:
-            return power_of_mean(deviation, design, difference, self.rate)
+            return power_of_mean(deviation, design, difference, self.rate, shares)
         shown = np.zeros(DESIGN_DRAWS, dtype=bool)
         open_ = ~shown
         size = abs(difference) / deviation
-        for mean, error, region, level in _looks(design, self.rate):
+        for mean, error, region, level in _looks(design, self.rate, shares):
             reach = region.limits(level) * error
             better = open_ & (size + mean > reach)
             shown |= better
@@ -70,7 +72,7 @@ class Purpose:
             open_ &= ~ends
         return float(shown.mean())
 
-    def designs(self, difference: float, deviation: float) -> list[Design]:
+    def designs(self, difference: float, noise: Components) -> list[Design]:
         """The designs with a power of `POWER`, one per number of scenes, with the fewest seeds.
 
         A number of scenes is left out if it needs no fewer seeds than fewer scenes do.
@@ -81,11 +83,11 @@ class Purpose:
                 2,
                 chosen[-1].seeds - 1 if chosen else LOOK_SEEDS if self.looks else MAX_SEEDS,
             )
-            if high < 2 or self.power(Design(scenes, high), difference, deviation) < POWER:
+            if high < 2 or self.power(Design(scenes, high), difference, noise) < POWER:
                 continue
             while low < high:  # the power rises with the number of seeds
                 middle = (low + high) // 2
-                enough = self.power(Design(scenes, middle), difference, deviation) >= POWER
+                enough = self.power(Design(scenes, middle), difference, noise) >= POWER
                 low, high = (low, middle) if enough else (middle + 1, high)
             chosen.append(Design(scenes, high))
         return chosen
@@ -128,14 +130,15 @@ def make_plan(components: Components, difference: float, purpose: Purpose, most:
     def fewest(designs: Sequence[Design]) -> tuple[Design, ...]:
         return tuple(sorted(designs, key=lambda design: (design.trials, design.scenes))[:most])
 
-    these, like_these = fewest(purpose.designs(difference, components.within)), None
+    these, like_these = fewest(purpose.designs(difference, components)), None
     if components.between is not None:
         like_these = fewest(designs_needed(difference, components, like_these=True))
     low, high = deviation_range(replace(components, within=1.0))
     powers = None
     if these:
         of_first = partial(purpose.power, these[0], difference)
-        powers = of_first(high * components.within), of_first(low * components.within)
+        ends = [replace(components, within=one * components.within) for one in (high, low)]
+        powers = of_first(ends[0]), of_first(ends[1])
     factors = low, high
     return Plan(components, these, like_these, factors, powers)
 
@@ -149,12 +152,13 @@ def deviation_range(components: Components) -> tuple[float, float]:
 
 
 def _looks(
-    design: Design, rate: float
+    design: Design, rate: float, shares: tuple[float, ...]
 ) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64], Region, float]]:
     """Means and standard errors [DESIGN_DRAWS] at each look, thresholds, and the level."""
     looks = plan_looks(design.seeds)
     levels = [rate * share for share in look_shares(len(looks))]
     draws = np.random.default_rng(0).standard_normal((DESIGN_DRAWS, design.scenes, design.seeds))
+    draws *= np.sqrt(shares)[:, None]
     for seeds, level in zip(looks, levels, strict=True):
         pairs = draws[:, :, :seeds]
         variances = pairs.var(axis=2, ddof=1)

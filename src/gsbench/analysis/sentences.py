@@ -24,6 +24,9 @@ from gsbench.analysis.verdicts import (
 )
 from gsbench.words import command, counted, least_text, some_of
 
+# rules of questions about a table of results (`gsbench.analysis.frames`)
+TABLE, DECLARED_TABLE = "table", "declared table"
+CONDITION = " It holds if metric, scenes and seeds were chosen before the results were seen."
 WORDS: dict[Outcome, str] = {
     "supported": "better",
     "refuted": "worse",
@@ -67,6 +70,19 @@ def badge(verdict: Verdict) -> str:
     if verdict.outcome == REFUTED and not verdict.question.sign:
         return "DIFFERENT"
     return outcome_words(verdict).removesuffix(" to matter").upper()
+
+
+def badge_class(verdict: Verdict) -> str:
+    """The class of a badge on a page, which gives its colour."""
+    if verdict.state in (RUNNING, STOPPED):
+        return "open"
+    if verdict.state != ANSWERED or verdict.untestable:
+        return ""
+    if verdict.outcome == REFUTED and not verdict.question.sign:
+        return "worse"
+    return {"better": "better", "worse": "worse", WORDS[TOO_SMALL]: "small"}.get(
+        outcome_words(verdict), ""
+    )
 
 
 def with_notes(words: str, verdict: Verdict) -> str:
@@ -118,6 +134,8 @@ def _waits(verdict: Verdict) -> str:
     count = f"{verdict.done} of {counted(verdict.wanted, 'trial')}"
     if verdict.state == RUNNING:
         return f"no verdict before all its trials are done: {count}"
+    if verdict.question.rule in (TABLE, DECLARED_TABLE):
+        return f"no verdict without all its trials: the table has {count}"
     if verdict.missing:
         again = command("retry", verdict.missing[0].path.parts[-4])
         return f"stopped at {count}: `{again}` goes on"
@@ -171,6 +189,8 @@ def headline(verdict: Verdict) -> str:
 
 def _level_words(verdict: Verdict) -> str:
     question = verdict.question
+    if question.rule == TABLE and verdict.state == ANSWERED:
+        return CONDITION
     if verdict.state in (NOT_TESTED, NOT_ASKED) or (question.n == 1 and not question.looks):
         return ""
     which = dict(enumerate(ORDINALS, 1)).get(question.n, f"{question.n}th")

@@ -1,16 +1,22 @@
 """The notes below a table: who trained, on what, doubts, and how else the compared arms differ."""
 
+from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from gsbench.analysis.fairness import caveats, counts_notes, limit_notes
 from gsbench.analysis.notes import Note
-from gsbench.analysis.results import Experiment, TrialResult, group_by, seeds_text
+from gsbench.analysis.results import TrialResult, group_by, seeds_text
 from gsbench.events import FEWEST_ROUNDS
 from gsbench.runs.layout import EVENTS
 from gsbench.runs.nested import SHOWN
 from gsbench.runs.trial_record import FROM_MODEL, FROM_RENDERS, TwinViews
 from gsbench.words import counted
+
+if TYPE_CHECKING:
+    from gsbench.analysis.comparison import Comparison
 
 LEARNT_NOTHING = "(!)"  # marks means over a trial that is not better than one colour
 # notes on arms that gsbench did not train: whether another program trained them here, and the
@@ -23,12 +29,36 @@ ORIGINS = {
 }
 
 
-def trials_notes(experiment: Experiment, trials: Sequence[TrialResult]) -> list[Note]:
+# Kinds of notes in the order of their weight; the others come after them.
+HEAVIEST = (
+    "one trial",
+    "mean",
+    "worthless",
+    "unusable",
+    "unused",
+    "edited",
+    "limit not reached",
+    "unequal counts",
+    "no partner",
+    "same bits",
+    "not available",
+    "few values",
+    "no mean",
+)
+
+
+def by_weight(notes: Sequence[Note]) -> list[Note]:
+    """The notes with the heaviest first, so that those are read."""
+    weights = {kind: weight for weight, kind in enumerate(HEAVIEST)}
+    return sorted(notes, key=lambda note: weights.get(note.kind, len(weights)))
+
+
+def trials_notes(comparison: Comparison, trials: Sequence[TrialResult]) -> list[Note]:
     """All notes on ``trials`` of an experiment and on its comparisons."""
     return [
         *doubt_notes(trials),
         *origin_notes(trials),
-        *comparison_notes(experiment),
+        *comparison_notes(comparison),
         *held_out_notes(trials),
         *points_notes(trials),
         *machine_notes(trials),
@@ -36,16 +66,8 @@ def trials_notes(experiment: Experiment, trials: Sequence[TrialResult]) -> list[
     ]
 
 
-def comparison_notes(experiment: Experiment) -> list[Note]:
-    """Notes on the compared arms: verdicts, remarks and caveats.
-
-    They are about the whole experiment, so choosing the trials that a table shows cannot change a
-    verdict.
-    """
-    # here, since SciPy is slow to import
-    from gsbench.analysis.comparison import compare
-
-    comparison = compare(experiment)
+def comparison_notes(comparison: Comparison) -> list[Note]:
+    """Notes on the compared arms: remarks and caveats."""
     by_arm = group_by(comparison.trials, lambda trial: trial.arm)
     between = [
         note
@@ -53,7 +75,7 @@ def comparison_notes(experiment: Experiment) -> list[Note]:
         for note in caveats([*by_arm[first], *by_arm[second]], first, second)
     ]
     both = comparison.trials, comparison.pairs
-    return [*comparison.notes(), *limit_notes(*both), *counts_notes(*both), *between]
+    return [*comparison.remarks, *limit_notes(*both), *counts_notes(*both), *between]
 
 
 def doubt_notes(trials: Sequence[TrialResult]) -> list[Note]:

@@ -1,4 +1,4 @@
-"""Ablation of a densifier: its switches, the runs of all combinations, and the verdicts on them.
+"""Ablation of a densifier: its switches, and the runs of all combinations.
 
 A switch turns one part of the densifier off by its ``off`` settings; as configured, all switches
 are on. The class (``SWITCHES``), the YAML file (``switches``) or the command line declares it. A
@@ -8,23 +8,15 @@ that differ only in such switches are trained once.
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
-from gsbench.analysis.quantities import asked_quantity
-from gsbench.analysis.results import TrialResult
-from gsbench.analysis.sentences import reason
-from gsbench.analysis.verdicts import Verdict, judge
 from gsbench.errors import InputError
-from gsbench.runs.commands import ERROR_RATE, Question
-from gsbench.runs.experiments import Arm
 from gsbench.settings import Switch, check_values
 from gsbench.words import did_you_mean, listed
 
 MAX_SWITCHES = 8
 
 Run = frozenset[str]  # the switches that are on
-TrialKeys = Mapping[str, str]  # scene -> folder of a run's trials, without the seed
 
 
 def declared_switches(
@@ -124,48 +116,3 @@ def run_name(run: Run, switches: Sequence[str]) -> str:
     """``without shrink``; ``with all of them`` if all switches are on."""
     off = [name for name in switches if name not in run]
     return f"without {listed(off)}" if off else "with all of them"
-
-
-def judge_runs(
-    trials: Sequence[TrialResult], runs: Mapping[Run, TrialKeys], metric: str
-) -> list[Verdict]:
-    """The verdicts on all ``runs`` against the run with all switches on; they share 5 %."""
-    quantity = asked_quantity(metric, trials)
-    full = max(runs, key=len)
-    named = [replace(trial, alias=trial.key) for trial in trials]
-    questions = []
-    for run, keys in runs.items():
-        if run == full:
-            continue
-        question = Question(
-            metric=metric,
-            sign=1 if quantity.direction >= 0 else -1,
-            least=quantity.worthwhile,
-            baseline=Arm("", run_name(full, sorted(full))),
-            idea=Arm("", run_name(run, sorted(full))),
-            digests={scene: (runs[full][scene], key) for scene, key in keys.items()},
-            seeds={scene: _seeds(named, runs[full][scene], key) for scene, key in keys.items()},
-            rule="ablation",
-            level=ERROR_RATE / (len(runs) - 1),
-        )
-        questions.append(question)
-    return [judge(named, question) for question in questions]
-
-
-def _seeds(trials: Sequence[TrialResult], one: str, two: str) -> tuple[int, ...]:
-    """The seeds of two runs on a scene."""
-    return tuple(sorted({trial.seed for trial in trials if trial.alias in (one, two)}))
-
-
-def markdown_table(verdicts: Sequence[Verdict]) -> list[str]:
-    """The verdicts as lines of a Markdown table."""
-    name = verdicts[0].quantity.name
-    lines = [
-        f"| run | difference in {name} from all parts | interval | verdict |",
-        "|---|---|---|---|",
-    ]
-    for verdict in verdicts:
-        mean = "–" if verdict.mean is None else verdict.shown(verdict.mean)
-        interval = "–" if verdict.interval is None else verdict.shown_interval(verdict.interval)
-        lines.append(f"| {verdict.question.idea} | {mean} | {interval} | {reason(verdict)} |")
-    return lines

@@ -346,7 +346,7 @@ def results_of(
     entries by stage. ``code`` maps the parts of gsbench's source that the steps used to their
     states. ``asked`` are the ids of the questions that covered the trial before its training.
     """
-    stages = keys.TRAIN, keys.EVALUATE
+    stages = keys.INIT, keys.TRAIN, keys.EVALUATE
     init, trained, evaluated = (entries[stage.name] for stage in stages)
     training = read_typed(trained.path / layout.TRAINING, Training)
     evaluation = read_typed(evaluated.path / layout.METRICS, Evaluation)

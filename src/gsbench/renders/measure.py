@@ -43,6 +43,36 @@ def measure_renders(options: argparse.Namespace, runs: Path) -> None:
         _measure(options, renders, photographs, runs)
 
 
+def measure_folders(
+    root: Path, truth: Path, settings: Sequence[str]
+) -> list[dict[str, str | float]]:
+    """The mean metrics of renders in ``root/METHOD/SCENE/SEED``, a row for each folder.
+
+    The photographs of a scene are in ``truth/SCENE``. Raises InputError for other folders, and for
+    pictures that do not match.
+    """
+    folders = sorted(folder for folder in root.glob("*/*/*") if folder.is_dir())
+    if not folders:
+        raise InputError(f"{root} has no folder METHOD/SCENE/SEED with pictures")
+    rows: list[dict[str, str | float]] = []
+    torch.set_num_threads(available_threads())
+    with progress("evaluate") as report:
+        for done, folder in enumerate(folders, 1):
+            method, scene, seed = folder.relative_to(root).parts
+            images = pictures_in(truth / scene, settings)
+            matching = match_pictures(list(images.photographs), list_images(folder))
+            pairs = [
+                PicturePair(view, path, folder / matching.pairs[view])
+                for view, path in images.photographs.items()
+            ]
+            check_pairs(pairs)
+            evaluator = _evaluator(images, None, settings)
+            means = summarize(measure(pairs, evaluator), evaluator.unavailable)
+            rows.append({"method": method, "scene": scene, "seed": seed} | means)
+            report("folders", done, len(folders))
+    return rows
+
+
 def _measure(
     options: argparse.Namespace, renders: Path, photographs: Path | None, runs: Path
 ) -> None:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gsbench.analysis.cells import swept_settings
-from gsbench.analysis.comparison import VERDICT, compare
+from gsbench.analysis.comparison import compare
 from gsbench.analysis.quantities import metric_keys
 from gsbench.analysis.results import Experiment, TrialResult, newest_code, read_experiment
 from gsbench.analysis.sentences import headline
@@ -86,17 +86,16 @@ def addresses(server: str, experiment_id: str, version: str) -> dict[str, str]:
 def description(experiment: Experiment) -> str:
     """Verdict, table and its notes in Markdown, cut to what a tag may hold."""
     comparison = compare(experiment)
-    verdicts = [f"- {line}" for line in comparison.sentences]
     try:
-        lines = to_markdown(build_table(experiment)).splitlines()
+        lines = to_markdown(build_table(experiment, comparison=comparison)).splitlines()
     except InputError as error:  # cells would average unlike trials
         lines = [f"No table: {error}"]
-    rest = [line for line in lines if not line.startswith((f"- {VERDICT}", "#"))]
+    rest = [line for line in lines if not line.startswith("#")]
     # The page shows only the first line until it is clicked: decided ideas come first there.
     ordered = sorted(comparison.answers, key=lambda one: one.verdict.outcome == UNDECIDED)
     answer = "; ".join(headline(one.verdict) for one in ordered) or NO_VERDICT
     end = f"\n\n{OWN_NOTE} {experiment.name}` shows more."
-    text = "\n".join([f"**{answer}**", "", *verdicts, "", *rest]).strip()
+    text = "\n".join([f"**{answer}**", "", *rest]).strip()
     if len(text) + len(end) > MAX_TAG:
         text = text[: MAX_TAG - len(end)].rpartition("\n")[0]
     return text + end

@@ -30,7 +30,7 @@ from gsbench.system.compile_clock import CLOCK
 from gsbench.system.install import own_checkout
 from gsbench.system.machine import describe_machine
 from gsbench.system.resources import peak_memory_mb, reset_peak_memory
-from gsbench.train.options import WITHOUT_EFFECT_ON_MODEL
+from gsbench.train.options import IDEAS, WITHOUT_EFFECT_ON_MODEL
 from gsbench.train.start import check_start
 from gsbench.train.trainer import Status, Trainer
 
@@ -50,8 +50,19 @@ def train_step(views: Views, parts: Parts) -> Step:
     assert isinstance(densifier, Densifier)
     device, snapshot_at, user = parts.device, parts.measured_earlier, parts.user_code
     effective = dataclasses.asdict(options)
-    for name in WITHOUT_EFFECT_ON_MODEL:
+    for name in (*WITHOUT_EFFECT_ON_MODEL, *IDEAS):
         del effective[name]
+    ideas = parts.ideas
+    effective |= {
+        name: options_of("train", part, user, f"train.{name}")
+        for name in ("loss", "schedule", "optimizer")
+        if (part := getattr(ideas, name)) is not None
+    }
+    if ideas.terms:
+        effective["terms"] = [
+            {"weight": one.weight} | options_of("train", one.term, user, f"train.terms.{number}")
+            for number, one in enumerate(ideas.terms)
+        ]
     inputs: dict[str, Any] = {
         "scene": views.inputs,
         "init": views.init.key,
@@ -69,7 +80,7 @@ def train_step(views: Views, parts: Parts) -> Step:
         _log_normalization(views.capture, densifier)
         points, colors = initial.means.double().cpu().numpy(), dc_to_bytes(initial.sh_dc)
         start = check_points(points, colors, views, parts)
-        trainer = Trainer(scene, initial, densifier, rasterizer, options, seed, snapshot_at)
+        trainer = Trainer(scene, initial, densifier, rasterizer, options, seed, snapshot_at, ideas)
         reset_peak_memory(device)
         with progress("train") as report:
 
