@@ -61,6 +61,7 @@ from gsbench.runs.trial_record import (
     Budget,
     Code,
     Evaluation,
+    Oddity,
     Training,
     TrialRecord,
     TwinViews,
@@ -68,6 +69,7 @@ from gsbench.runs.trial_record import (
 )
 from gsbench.runs.user_code import user_modules
 from gsbench.scene.colmap_files import model_files
+from gsbench.scene.rules import settle
 from gsbench.scene.types import Capture, Scene
 from gsbench.system.install import version_of
 from gsbench.system.locks import hold
@@ -351,6 +353,12 @@ def results_of(
     training = read_typed(trained.path / layout.TRAINING, Training)
     evaluation = read_typed(evaluated.path / layout.METRICS, Evaluation)
     manifest = read_manifest(evaluated.path)
+    init_report = read_json(init.path / REPORT_FILE)
+    of_model = [Oddity(**odd) for odd in init_report.get("oddities", ())]
+    oddities = [*capture.oddities, *scene.oddities, *of_model, *training.oddities]
+    # A stage of the store may have been made with a rule accepted that is not accepted here.
+    refused = [odd for odd in oddities if odd.refused]
+    settle(refused, f"scene {capture.name}", capture.accept)
     is_ready_made = training.trained_by is None and not training.iterations
     seconds = {"init": init.seconds, "train": training.seconds, "evaluate": evaluated.seconds}
     if is_ready_made:
@@ -375,6 +383,7 @@ def results_of(
         questions=asked,
         metric_facts=evaluation.facts,
         metrics_at=evaluation.at,
+        oddities=oddities,
         twins=TwinViews(
             left_out={**capture.left_out, **scene.twins.left_out}, near=dict(scene.twins.near)
         ),
@@ -391,7 +400,7 @@ def results_of(
         held_out=capture.held_out,
         resolution=max((view.camera.width, view.camera.height) for view in views),
         events=sum_events(read_rows(trained.path / layout.EVENTS)),
-        init_report=read_json(init.path / REPORT_FILE),
+        init_report=init_report,
         hashes={
             "config": config_hash(values),
             "arm": arm_hash(values),

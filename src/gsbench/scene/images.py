@@ -176,8 +176,6 @@ def resize_image(
     ``bicubic`` is Pillow's with a = -0.5, widened too. ``area`` is the mean over each new pixel's
     area.
     """
-    if resample not in _FILTERS:
-        raise InputError(f"scene.resample must be one of {', '.join(_FILTERS)}, got {resample!r}")
     if image.shape[:2] == (height, width):
         return image
     return np.array(Image.fromarray(image).resize((width, height), _FILTERS[resample]))
