@@ -147,10 +147,6 @@ SENTENCES: dict[str, str] = {
         "Renders of another program, measured as they are (its conditions are not known): "
         "{arms:list}."
     ),
-    "edited": (
-        "{module} was edited since: {trials:n trial} of {arms:few} came from the old code. Give "
-        "the command again to run the new one."
-    ),
     "machines": (
         "The trials ran on {kinds} kinds of machine: {trials:parts}. There equal settings give "
         "other last digits and, after thousands of iterations, other results."
