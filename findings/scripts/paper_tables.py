@@ -15,13 +15,16 @@ of 32 px by trial and view, `gsbench.analysis.regions`).
 from __future__ import annotations
 
 import csv
+import json
 import os
 import re
 import resource
 import subprocess
 import sys
+import zipfile
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +35,8 @@ from gsbench.analysis.regions import region_errors
 FINDINGS = Path(__file__).resolve().parents[1]
 LINE = re.compile(r"^(\w+) +(?P<scene>\S+?)/\S+-(?P<densify>\S+) seed (?P<seed>\d+) \(\w+\)")
 THRESHOLD = 0.03  # V_th of the paper
+PAGE = FINDINGS / "paper_tables.md"
+STATE, END = "<!-- state -->", "<!-- end -->"
 PICTURES = ("renders", "ground_truth")
 MEASURED = "measured_here.csv"  # in the experiment's folder: CPU time of each training
 FIELDS = ("trial", "cpu_seconds", "gaussians", "share_below_threshold")
@@ -134,6 +139,38 @@ def save(clone: Path, experiment: str) -> None:
         writer.writeheader()
         writer.writerows(rows.values())
     np.savez_compressed(maps, **regions)
+    PAGE.write_text(with_state(PAGE.read_text(encoding="utf-8"), experiment), encoding="utf-8")
+
+
+def state_table(experiment: str) -> str:
+    """The page's table of all trials in the archive."""
+    archives = FINDINGS / "archives"
+    with zipfile.ZipFile(archives / f"{experiment}.zip") as archive:
+        lines = archive.read("results.jsonl").splitlines()
+    with (archives / f"{experiment}.csv").open() as stream:
+        beside = {row["trial"]: row for row in csv.DictReader(stream)}
+    table = ["| trial | PSNR | SSIM | LPIPS VGG raw | Gaussians | volumes ≤ V_th | CPU-s |"]
+    table += ["|---|--:|--:|--:|--:|--:|--:|"]
+    for trial in sorted((json.loads(line)["results"] for line in lines), key=_order):
+        own = beside[f"{trial['scene']}-{trial['densify']}-{trial['seed']}"]
+        psnr, ssim, lpips = (trial["metrics"][key] for key in ("psnr", "ssim", "lpips_vgg_raw"))
+        share = 100 * float(own["share_below_threshold"])
+        table.append(
+            f"| {trial['scene']}, {trial['densify']}, seed {trial['seed']} | {psnr:.2f} | "
+            f"{ssim:.3f} | {lpips:.4f} | {trial['num_gaussians']:,} | {share:.2f} % | "
+            f"{own['cpu_seconds'] or '–'} |"
+        )
+    return "\n".join(table) + "\n"
+
+
+def _order(trial: dict[str, Any]) -> tuple[str, int, str]:
+    return trial["scene"], trial["seed"], trial["densify"]
+
+
+def with_state(page: str, experiment: str) -> str:
+    """The page with the table of the archive's trials between its marks."""
+    before, _, rest = page.partition(STATE)
+    return f"{before}{STATE}\n{state_table(experiment)}{END}{rest.partition(END)[2]}"
 
 
 if __name__ == "__main__":

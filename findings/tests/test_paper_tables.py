@@ -2,6 +2,7 @@
 
 import csv
 import json
+import sys
 import zipfile
 from pathlib import Path
 
@@ -9,7 +10,10 @@ import numpy as np
 
 from gsbench.analysis.regions import compare_regions, discoveries
 
-ARCHIVES = Path(__file__).parents[1] / "archives"
+FINDINGS = Path(__file__).parents[1]
+ARCHIVES = FINDINGS / "archives"
+sys.path.append(str(FINDINGS / "scripts"))
+import paper_tables  # noqa: E402
 
 
 def regions_of(file):
@@ -47,3 +51,8 @@ def test_what_lies_beside_the_archive_has_its_trials():
     for trial, row in rows.items():
         assert int(row["gaussians"]) == results[trial]["results"]["num_gaussians"]
         assert 0.5 < float(row["share_below_threshold"]) < 1
+
+
+def test_the_table_on_the_page_follows_from_the_archive():
+    page = paper_tables.PAGE.read_text(encoding="utf-8")
+    assert paper_tables.with_state(page, "paper_table1") == page

@@ -4,15 +4,13 @@ import os
 
 import pytest
 
-from gsbench.analysis.comparison import compare
 from gsbench.analysis.differences import find_superseded
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import read_experiment
 from gsbench.analysis.tables import build_table
 from gsbench.runs import freshness
-from gsbench.runs.user_code import module_digest
 from gsbench.verbs.results import explain_cell
-from tests.analysis.helpers import loaded, page_of, trials_of
+from tests.analysis.helpers import loaded, page_of
 from tests.trials import write_trial
 
 OLD, NEW = "1" * 64, "2" * 64
@@ -71,45 +69,30 @@ def test_choices_by_earlier_code_are_counted(tmp_path):
     assert said in page
 
 
-def test_trials_of_an_edited_gsbench_are_versions_and_an_update_is_none(tmp_path):
-    released, edited = ({**code(), "packages": {"train": v}} for v in ("released", "c" * 16))
-    finished_at(write_trial(tmp_path, psnr=27.0, _code=released), 1000)
-    finished_at(write_trial(tmp_path, 1, psnr=27.0, _code=edited), 2000)
+def test_settings_that_were_last_trained_with_other_code_are_folded(tmp_path):
+    write_trial(tmp_path, 0, "aaaaaaaa", MINE | {"densify.views": 5}, psnr=27.0, _code=code(OLD))
+    write_trial(tmp_path, 0, "bbbbbbbb", MINE | {"densify.views": 8}, psnr=28.0, _code=code(NEW))
+    experiment = loaded(tmp_path)
+    assert (len(experiment.trials), len(experiment.older), len(experiment.warnings)) == (1, 1, 1)
+
+
+@pytest.mark.parametrize(
+    "old, new, part",
+    [
+        ({"_code": code()}, {"_code": code(train=2)}, "stage train"),
+        (
+            {"_code": {**code(), "packages": {"train": "released"}}},
+            {"_code": {**code(), "packages": {"train": "c" * 16}}},
+            "gsbench's train",
+        ),
+    ],
+)
+def test_older_trials_of_gsbench_are_left_out(tmp_path, old, new, part):
+    finished_at(write_trial(tmp_path, psnr=27.0, **old), 1000)
+    finished_at(write_trial(tmp_path, 1, psnr=27.0, **new), 2000)
     experiment = loaded(tmp_path)
     assert [trial.seed for trial in experiment.trials] == [1]
-    assert "made by earlier versions of gsbench's train: " in experiment.warnings[0]
-    finished_at(write_trial(tmp_path / "b", psnr=27.0, _code=code()), 1000)
-    finished_at(write_trial(tmp_path / "b", 1, psnr=27.0, _code=code(train=2)), 2000)
-    assert len(loaded(tmp_path / "b").trials) == 2
-
-
-def test_the_code_of_the_newest_question_counts_wherever_one_stands(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "patient.py").write_text("x = 1\n")
-    here = module_digest("patient", str(tmp_path))
-    for number, (name, digest) in enumerate((("aaaaaaaa", here), ("bbbbbbbb", NEW))):
-        made = {"sources": {"patient": digest}, "stages": STAGES}
-        path = write_trial(tmp_path, 0, name, MINE, psnr=27.0 + number, _code=made)
-        finished_at(path, 1000 + number)
-    assert trials_of(tmp_path)[0].metrics["psnr"] == 28.0  # without a question, what ended last
-    (tmp_path / "elsewhere").mkdir()
-    monkeypatch.chdir(tmp_path / "elsewhere")
-    assert trials_of(tmp_path)[0].metrics["psnr"] == 28.0
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "patient.py").write_text("x = 2\n")
-    table = table_of(tmp_path)
-    assert table.rows[0].entries[0].text == "28.00"
-    line = (
-        "patient was edited since: 1 trial of sfm-adc came from the old code. Give the command again "
-        "to run the new one."
-    )
-    assert line in table.notes
-    experiment = loaded(tmp_path)
-    comparison = compare(experiment)
-    # the sweep's end, plan and site have the remarks
-    assert [*map(str, comparison.remarks)] == [line]
-    assert comparison.to_json()["left_out"][0] == line
-    assert line in build_report(experiment)
+    assert f"made by earlier versions of {part}: " in experiment.warnings[0]
 
 
 @pytest.mark.parametrize(

@@ -18,8 +18,7 @@ from gsbench.runs.trial_record import (
     FROM_MODEL,
     FROM_RENDERS,
     ExternalTrainer,
-    InitialCloud,
-    TwinViews,
+    Oddity,
 )
 from tests.analysis.helpers import ADC, VOLUMETRIC, loaded, page_of, table_of
 from tests.helpers import read_json, write
@@ -208,14 +207,14 @@ def test_pictures_of_two_filters_are_noted(tmp_path, folders, downscales, noted)
 
 def test_results_that_are_worth_little_or_may_surprise_are_noted_once(tmp_path):
     made = trials_of(tmp_path, seeds=(0, 1), scenes=("garden",), densifiers=("adc",))
-    cloud = InitialCloud(
-        seen=1.0, color_agreement=None, identical=0.0, far=0, spread=1.0, warnings=["a", "b"]
-    )
+    odd = [
+        Oddity(rule="near-twins", line="1 of 6 test views have a near twin", value=1.0),
+        Oddity(rule="panorama", line="3 photographs are panoramas", value=3.0, refused=True),
+    ]
     changes = {
         "one_color_psnr": made[0].metrics["psnr"],
         "raster_passed_over": ["raster=triton is not used: alpha is off"],
-        "twins": TwinViews(near={"1.png": "2.png"}, left_out={"3.png": "4.png", "5.png": "4.png"}),
-        "initial_cloud": cloud,
+        "oddities": odd,
     }
     psnr = f"{made[0].metrics['psnr']:.2f}"
     second = with_record(made[1], **{**changes, "one_color_psnr": made[1].metrics["psnr"] - 0.1})
@@ -223,10 +222,8 @@ def test_results_that_are_worth_little_or_may_surprise_are_noted_once(tmp_path):
         f"(!) {made[0].label} is not better than one colour: PSNR {psnr} dB, the training views' "
         f"mean colour has {psnr}.",
         "raster=triton is not used: alpha is off.",
-        "garden: training has near twins of 1 of 6 test views, which so measure memory too.",
-        "garden: 2 photographs left out: another one has the same name or content.",
-        "Before training, garden sfm: a.",
-        "Before training, garden sfm: b.",
+        "garden sfm: 1 of 6 test views have a near twin.",
+        "garden sfm, accepted by scene.accept=[panorama]: 3 photographs are panoramas.",
     ]
     assert doubt_notes(made) == []
 

@@ -11,7 +11,7 @@ from gsbench.app.command import one_trial_per_scene, summarize
 from gsbench.app.sweep import Ended, check_sweep_settings
 from gsbench.config.compose import Trial
 from gsbench.errors import GsbenchError, InputError
-from gsbench.launch.jobs import Outcome
+from gsbench.launch.outcomes import Outcome
 from gsbench.runs.trial_folder import TrialFolder
 from tests.app.stand_ins import trial
 from tests.helpers import refusal
@@ -51,6 +51,8 @@ def test_settings_of_a_sweep_need_a_sweep(changes, multirun, said):
 
 # ---- the end of a command
 
+CHANGE = "change what the lines above name, then give the command again"
+
 
 @pytest.mark.parametrize(
     "ends, code, advice",
@@ -59,17 +61,24 @@ def test_settings_of_a_sweep_need_a_sweep(changes, multirun, said):
         ("d", 0, "1 of 1 trials done; the table: gsbench tables x; renders and model: "),
         ("df", 1, "1 of 2 trials done; again: gsbench retry x"),
         ("bf", 1, "0 of 2 trials done; again: gsbench retry x"),
-        ("bb", 2, "0 of 2 trials done; again: gsbench retry x"),
+        ("bb", 2, f"0 of 2 trials done; {CHANGE}"),
+        ("fr", 1, f"0 of 2 trials done; {CHANGE}"),
         ("dq", 0, "1 of 2 trials done; how far the others are: gsbench status x"),
         ("bq", 1, "0 of 2 trials done; how far the others are: gsbench status x"),
     ],
 )
 def test_the_end_of_a_command_tells_what_to_do_next(tmp_path, caplog, capsys, ends, code, advice):
     caplog.set_level(logging.INFO, "gsbench")
-    status = {"d": "done", "q": "queued", "f": "failed", "b": "failed"}
+    status = {"d": "done", "q": "queued"}
     trials = [trial(tmp_path, seed) for seed in range(len(ends))]
     outcomes = [
-        Outcome(one.folder, status[end], "why", end == "b")
+        Outcome(
+            one.folder,
+            status.get(end, "failed"),
+            "why",
+            end == "b",
+            "densify.x" if end == "r" else "",  # repeats another failure, so it was not started
+        )
         for one, end in zip(trials, ends, strict=True)
     ]
     first = Trial(trials[0].values | {"name": "tuning"}, ())
@@ -80,8 +89,11 @@ def test_the_end_of_a_command_tells_what_to_do_next(tmp_path, caplog, capsys, en
     assert said == [
         f"gsbench: failed: {TrialFolder(one.folder).label}: why"
         for one in outcomes
-        if one.status == "failed"
-    ]
+        if one.status == "failed" and not one.change
+    ] + [
+        "gsbench: not started: 1 trial would fail in the same way: change densify.x, then give "
+        "the command again"
+    ] * ends.count("r")
 
 
 def test_the_failure_of_a_single_trial_is_raised(tmp_path):

@@ -21,24 +21,35 @@ from gsbench.app.hydra_app import (
     words_without_sweeper,
 )
 from gsbench.errors import GsbenchError, InputError
-from gsbench.launch.jobs import Outcome
+from gsbench.launch.outcomes import Outcome
 from tests.app.stand_ins import done, trial
 from tests.helpers import refusal
 from tests.trials import write_results
 
 GRID = "hydra._internal.core_plugins.basic_sweeper.BasicSweeper"
+
+
+class Trials(list):
+    """Trials that ran, and whether their commands asked questions."""
+
+    def __init__(self):
+        super().__init__()
+        self.asks = set()
+
+
 QUICK = split("-m init=random tracking=none name=x")
 
 
 @pytest.fixture
 def ran(runs, monkeypatch):
     """The trials that commands run; each gets a result, or fails if its seed is 13."""
-    ran = []
+    ran = Trials()
 
-    def run(trials):
+    def run(trials, asks=True):
         outcomes = []
         for one in trials:
             ran.append(one)
+            ran.asks.add(asks)
             psnr = 20.0 + one.values["seed"] + one.values["densify"].get("interval", 0) / 100
             write_results(one.folder, one.values, metrics={"psnr": psnr, "lpips_vgg": 1 / psnr})
             failed = one.values["seed"] == 13
@@ -46,7 +57,7 @@ def ran(runs, monkeypatch):
         return outcomes[::-1]
 
     monkeypatch.setattr(command, "run_batch", run)
-    monkeypatch.setattr(hydra_app, "begin_for_another_launcher", lambda trials: None)
+    monkeypatch.setattr(hydra_app, "begin_for_another_launcher", lambda trials, asks: None)
     return ran
 
 
@@ -90,7 +101,8 @@ def test_a_search_sees_validation_views_only_and_has_an_experiment_of_its_own(
     for one in ran:
         assert one.values["name"] == "x-tune"
         assert one.values["scene"]["validation"] is True
-        assert one.values["eval"]["primary"] is None  # no question is written
+        assert one.values["eval"]["primary"] is None
+    assert ran.asks == {False}  # no question is written
     said = (
         "best: densify.interval=200, psnr 24 of validation views (2 seeds, in x-tune); to train it"
     )

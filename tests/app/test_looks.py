@@ -10,7 +10,7 @@ import pytest
 from gsbench import cli
 from gsbench.analysis.results import read_experiment
 from gsbench.analysis.verdicts import judge
-from gsbench.launch.jobs import Outcome, outcome_of_results
+from gsbench.launch.outcomes import Outcome, outcome_of_results
 from gsbench.launch.record import record
 from gsbench.runs.commands import digest_of, read_history
 from gsbench.runs.keys import CODE_OF_STAGE

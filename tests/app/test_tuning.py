@@ -13,7 +13,7 @@ from gsbench.analysis.report.build import build_report, search_summary
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.tables import build_table
 from gsbench.errors import GsbenchError
-from gsbench.launch.jobs import outcome_of_error, outcome_of_results
+from gsbench.launch.outcomes import outcome_of_error, outcome_of_results
 from gsbench.launch.record import add_to_plan, declare
 from gsbench.parsing import read_typed
 from gsbench.runs.experiments import Arm, TuningRecord

@@ -19,7 +19,7 @@ from gsbench.files import DiskFullError
 from gsbench.launch import dry_run, jobs
 from gsbench.launch.batch import run_batch
 from gsbench.launch.dry_run import FinishedTrials, describe_plan
-from gsbench.launch.jobs import Outcome
+from gsbench.launch.outcomes import Outcome
 from gsbench.launch.record import record
 from gsbench.launch.states import states_of_experiment
 from gsbench.logs import set_up_logging
@@ -339,7 +339,7 @@ def fake_trial(monkeypatch):
             raise error
         folder = TrialFolder.of(trial.values).path
         if error is not None and not isinstance(error, BusyError):
-            from gsbench.launch.jobs import outcome_of_error
+            from gsbench.launch.outcomes import outcome_of_error
 
             return outcome_of_error(folder, error)
         finish(trial.values)

@@ -8,6 +8,7 @@ gsbench's own sweeper (`gsbench.app.grids`), or by what of Hydra's the command a
 import logging
 import os
 import sys
+from collections import Counter
 from collections.abc import Sequence
 
 from gsbench.analysis.quantities import COSTS
@@ -22,9 +23,9 @@ from gsbench.errors import GsbenchError, InputError
 from gsbench.eval.options import EvalConfig
 from gsbench.launch.batch import check_parts, missing_folders, need_no_check, run_batch
 from gsbench.launch.dry_run import describe_plan
-from gsbench.launch.jobs import Outcome
+from gsbench.launch.outcomes import Outcome
 from gsbench.logs import set_up_logging
-from gsbench.words import command
+from gsbench.words import command, counted
 
 log = logging.getLogger(__name__)
 
@@ -156,11 +157,22 @@ def summarize(outcomes: Sequence[Outcome], trials: Sequence[Trial]) -> int:
     if failed and len(outcomes) == 1:
         raise (InputError if failed[0].bad_input else GsbenchError)(failed[0].message)
     for outcome in failed:
-        print(f"gsbench: failed: {outcome.label}: {outcome.message}", file=sys.stderr)
+        if not outcome.change:
+            print(f"gsbench: failed: {outcome.label}: {outcome.message}", file=sys.stderr)
+    changes = Counter(outcome.change for outcome in failed if outcome.change)
+    for setting, count in changes.items():
+        print(
+            f"gsbench: not started: {counted(count, 'trial')} would fail in the same way: change "
+            f"{setting}, then give the command again",
+            file=sys.stderr,
+        )
     name = trials[-1].values["name"]  # the last one's: a tuning runs before, in its own experiments
     done = sum(outcome.status == "done" for outcome in outcomes)
+    must_change = changes or all(outcome.bad_input for outcome in failed)
     if any(outcome.status == "queued" for outcome in outcomes):
         advice = f"how far the others are: {command('status', name)}"
+    elif failed and must_change:  # a retry would fail again
+        advice = "change what the lines above name, then give the command again"
     else:
         advice = command("retry" if failed else "tables", name)
         advice = f"{'again' if failed else 'the table'}: {advice}"

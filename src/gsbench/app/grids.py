@@ -152,8 +152,8 @@ def words_of_grids(
 ) -> list[list[str]]:
     """The words of each grid: its own, the shared ``params``, and those ``given`` for it.
 
-    If two words set one key, the later one counts. Trials are in the order of the grids; the shared
-    settings vary fastest.
+    If two words set one key, the later one counts, with the plus of a grid's own word. Trials are
+    in the order of the grids; the shared settings vary fastest.
     """
     listed = set(map(bare_key, itertools.chain(*grids)))
     jobs = []
@@ -161,8 +161,15 @@ def words_of_grids(
         of_grid = set(map(bare_key, grid))
         shared = {key: value for key, value in params.items() if bare_key(key) not in of_grid}
         words = [f"{key}={value}" for key, value in (*grid.items(), *shared.items())]
-        jobs.append([*words, *(word for word in given if key_of(word) not in listed - of_grid)])
+        signs = {bare_key(key): key[: len(key) - len(bare_key(key))] for key in (*grid, *shared)}
+        own = (word for word in given if key_of(word) not in listed - of_grid)
+        jobs.append([*words, *(_signed(word, signs.get(key_of(word), "")) for word in own)])
     return jobs
+
+
+def _signed(word: str, sign: str) -> str:
+    """A word that sets a value, with the ``sign`` (``+``) if it has none."""
+    return word if word.startswith(("+", "~")) else f"{sign}{word}"
 
 
 def _advise_grids(sweep: Sweep, typed: Mapping[str, Override]) -> str:

@@ -40,7 +40,8 @@ from gsbench.config.trust import HYDRAS_CALLBACKS, load_callbacks
 from gsbench.errors import GsbenchError, InputError
 from gsbench.files import checked_runs_folder
 from gsbench.launch.batch import begin_for_another_launcher
-from gsbench.launch.jobs import Outcome, check_job_links, outcome_of_error
+from gsbench.launch.jobs import check_job_links
+from gsbench.launch.outcomes import Outcome, outcome_of_error
 from gsbench.logs import set_up_logging
 from gsbench.runs.experiments import metric_and_question
 from gsbench.runs.nested import targets_in
@@ -59,7 +60,7 @@ HYDRAS_LINE = "Error executing job with overrides"
 WHITELIST: Callable[[Sequence[str]], AbstractContextManager[Any]] = getattr(
     hydra.utils, "execution_whitelist", lambda names: nullcontext()
 )
-RunBatch = Callable[[Sequence[Trial]], list[Outcome]]
+RunBatch = Callable[..., list[Outcome]]  # `gsbench.launch.batch.run_batch`
 
 log = logging.getLogger(__name__)
 
@@ -81,7 +82,8 @@ class Job:
 
     def __call__(self, config: DictConfig) -> None:
         """Run the trial of a composed configuration; raises what made it fail."""
-        (outcome,) = self.run([self.trial(config)])
+        # its command has written the questions down
+        (outcome,) = self.run([self.trial(config)], asks=False)
         if outcome.status == "failed":  # the launcher passes on what is raised
             raise _error(outcome)
 
@@ -125,7 +127,7 @@ class HydraApp:
     def run_sweep(self, context: HydraContext, config: DictConfig) -> None:
         """Run gsbench's own sweep, for its sweeper among Hydra's plug-ins."""
         set_up_logging(config.hydra.verbose)
-        run_sweep(self.sweep, lambda trials: self._launch(trials, context, config))
+        run_sweep(self.sweep, lambda trials: self._launch(trials, context, config, asks=True))
 
     def run_jobs(
         self, jobs: Sequence[Sequence[str]], context: HydraContext, config: DictConfig
@@ -133,7 +135,9 @@ class HydraApp:
         """Run the jobs of another sweeper, for gsbench's launcher; returns their values."""
         of_jobs = [self.goal.jobs_of(job) if self.goal else [list(job)] for job in jobs]
         trials = self.sweep.composer.trials([words for of_job in of_jobs for words in of_job])
-        by_folder = {outcome.folder: outcome for outcome in self._launch(trials, context, config)}
+        # a search writes no question
+        outcomes = self._launch(trials, context, config, asks=self.goal is None)
+        by_folder = {outcome.folder: outcome for outcome in outcomes}
         # where sweepers write what they found
         Path(config.hydra.sweep.dir).mkdir(parents=True, exist_ok=True)
         rest, returned = iter(trials), []
@@ -151,18 +155,21 @@ class HydraApp:
         return returned
 
     def _launch(
-        self, trials: Sequence[Trial], context: HydraContext, config: DictConfig
+        self, trials: Sequence[Trial], context: HydraContext, config: DictConfig, asks: bool
     ) -> list[Outcome]:
         """Run trials, which are checked, by the chosen launcher."""
         name = chosen_launcher(self.sweep)
-        outcomes = self.run(trials) if name == OWN else self._by(name, trials, context, config)
+        if name == OWN:
+            outcomes = self.run(trials, asks=asks)
+        else:
+            begin_for_another_launcher(trials, asks)
+            outcomes = self._by(name, trials, context, config)
         self.ended.add(trials, outcomes)
         return outcomes
 
     def _by(
         self, name: str, trials: Sequence[Trial], context: HydraContext, config: DictConfig
     ) -> list[Outcome]:
-        begin_for_another_launcher(trials)
         own = self.sweep.config.hydra
         is_typed = own.runtime.choices["hydra/launcher"] == name
         config.hydra.launcher = (

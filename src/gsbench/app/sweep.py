@@ -18,7 +18,7 @@ from gsbench.config.explain import explained
 from gsbench.config.hydra_setup import config_loader, hydra_config, hydra_ready
 from gsbench.config.overrides import is_sweep, parse_word, task_words
 from gsbench.errors import InputError
-from gsbench.launch.jobs import Outcome
+from gsbench.launch.outcomes import Outcome
 from gsbench.pipeline.metric_facts import facts_for
 
 OWN = "gsbench"  # the name of the launcher and of the sweeper in Hydra

@@ -11,7 +11,8 @@ from gsbench.config.schema import COMPONENTS
 from gsbench.errors import InputError
 from gsbench.files import FORBIDDEN, checked_runs_folder, make_runs_folder, storage_errors
 from gsbench.launch.dry_run import unavailable_now
-from gsbench.launch.jobs import Outcome, outcome_of_results, run_local, run_serial
+from gsbench.launch.jobs import run_local, run_serial
+from gsbench.launch.outcomes import Outcome, outcome_of_results
 from gsbench.launch.record import asked_metrics, record
 from gsbench.launch.slurm import run_slurm
 from gsbench.runs.freshness import Change
@@ -22,7 +23,7 @@ from gsbench.runs.store import Store
 from gsbench.runs.user_code import PERMISSIONS
 from gsbench.system.stopping import stop_on_signals
 from gsbench.tracking import Mirror
-from gsbench.tracking.tracker_run import make_sink
+from gsbench.tracking.sync import make_sink
 
 log = logging.getLogger(__name__)
 
@@ -48,10 +49,10 @@ def run_batch(trials: Sequence[Trial], asks: bool = True) -> list[Outcome]:
         return outcomes
 
 
-def begin_for_another_launcher(trials: Sequence[Trial]) -> None:
+def begin_for_another_launcher(trials: Sequence[Trial], asks: bool = True) -> None:
     """Check, plan and declare trials that a Hydra plug-in will run, perhaps several at once."""
     with storage_errors(checked_runs_folder(trials[0].values["runs"])):
-        _begin(trials, [trial for trial in trials if _why_not_done(trial)])
+        _begin(trials, [trial for trial in trials if _why_not_done(trial)], asks)
 
 
 def _begin(trials: Sequence[Trial], unfinished: Sequence[Trial], asks: bool = True) -> None:

@@ -31,8 +31,9 @@ from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS
 from gsbench.runs.user_code import PERMISSIONS
 from gsbench.system.own_modules import allow_modules
-from gsbench.tracking.tracker_run import MirrorError
-from gsbench.tracking.tracker_run import sync as send_missing
+from gsbench.tracking.beside import end_with
+from gsbench.tracking.sync import MirrorError
+from gsbench.tracking.sync import sync as send_missing
 from gsbench.verbs.arguments import ArgumentParser
 from gsbench.words import counted, readable_time
 
@@ -295,18 +296,31 @@ def sync(argv: Sequence[str], runs: Path) -> int:
         "--uri",
         help="such as http://127.0.0.1:5000; default: $MLFLOW_TRACKING_URI, or the runs folder's",
     )
+    parser.add_argument(
+        "--trial",
+        action="append",
+        metavar="SCENE/ARM/FOLDER",
+        help="only this trial of the experiment (repeatable)",
+    )
+    parser.add_argument(
+        "--beside", type=int, metavar="PID", help="end soon after this process has ended"
+    )
     options = parser.parse_args(argv)
     words = [options.experiment or "", *options.permissions]
     experiment = "" if "=" in words[0] else words.pop(0)
     if unread := [word for word in words if key_of(word) != PERMISSIONS]:
         raise InputError(f"sync reads only {PERMISSIONS}, not {unread[0]}")
     allow_modules(allowed := typed_permissions(words))
+    if options.beside:
+        end_with(options.beside)
     names = [experiment] if experiment else list_experiments(runs)
     homes = [experiment_home(runs, name) for name in names]
     try:
         folders: list[TrialFolder] = []
         for home in homes:
-            folders += [TrialFolder(Path(place)) for place in sorted(trial_folders(home))]
+            places = [TrialFolder(Path(place)) for place in sorted(trial_folders(home))]
+            wanted = {str(home / trial) for trial in options.trial or ()}
+            folders += [one for one in places if not wanted or str(one.path) in wanted]
         for line in send_missing(folders, options.uri, allowed):
             print(line, flush=True)
     except (MirrorError, OSError) as error:
