@@ -73,6 +73,7 @@ from gsbench.scene.rules import settle
 from gsbench.scene.types import Capture, Scene
 from gsbench.system.install import version_of
 from gsbench.system.locks import hold
+from gsbench.system.resources import lacks_memory
 from gsbench.system.stopping import reinstall_handlers
 from gsbench.train.kernels import compiled_beside
 from gsbench.train.proof import Proven
@@ -182,10 +183,13 @@ def _recorded_failures(values: dict[str, Any], folder: TrialFolder) -> Iterator[
                     "returning"
                 )
                 raise TrainingError(text) from ended
-            except torch.OutOfMemoryError as error:
+            except (RuntimeError, MemoryError) as error:
+                if not lacks_memory(error):
+                    raise
                 raise TrainingError(
-                    f"the memory of device={values['device']} is full: lower scene.max_size or the "
-                    "number of trials at once (launch.parallel), or end other programs there"
+                    f"device={values['device']} has no memory left: lower scene.max_size, "
+                    "densify.max_gaussians or the number of trials at once (launch.parallel), or "
+                    "end other programs there"
                 ) from error
     except Exception as error:
         log.debug("the trial failed", exc_info=True)
