@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gsbench.errors import InputError
+from gsbench.launch.states import states_now
 from gsbench.runs.cleaning import Stored, free, stored
 from gsbench.runs.experiments import experiment_home, list_experiments, trial_folders
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import is_held
 from gsbench.verbs.arguments import ArgumentParser
-from gsbench.verbs.trials import progress_with_superseded
 from gsbench.words import counted, readable_bytes
 
 UNITS = {"h": 3600.0, "d": 86_400.0, "w": 7 * 86_400.0}
@@ -41,7 +41,7 @@ def clean(argv: Sequence[str], runs: Path) -> int:
     ]
     let_go = set[Path]()
     if options.experiment is not None:
-        states = progress_with_superseded(experiment_home(runs, options.experiment))
+        states = states_now(experiment_home(runs, options.experiment))
         let_go = {trial.folder for trial in states if trial.state in LET_GO}
     if running := [place for place in trials if is_held(TrialFolder(place).lock)]:
         raise InputError(
