@@ -29,6 +29,7 @@ PACKAGE = Path(__file__).resolve().parents[1]
 SOURCES = (
     "raster/cpu",
     "raster/base.py",
+    "raster/formulas.py",
     "raster/staged.py",
     "gaussians/model.py",
     "eval/ssim.py",
