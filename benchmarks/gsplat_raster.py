@@ -247,7 +247,8 @@ def _square_radii(conics: Tensor, seen: Tensor) -> Tensor:
     half_trace = 0.5 * (a + c) * determinant
     root = (half_trace * half_trace - determinant).clamp_min(CONSTANTS.eigenvalue_floor).sqrt()
     radii = (CONSTANTS.sigma_extent * (half_trace + root).sqrt()).ceil()
-    return torch.where(seen, radii.nan_to_num(0, 0, 0).clamp(0, CONSTANTS.max_radius), 0.0).to(torch.int32)
+    radii = radii.nan_to_num(0, 0, 0).clamp(0, CONSTANTS.max_radius)
+    return torch.where(seen, radii, 0.0).to(torch.int32)
 
 
 def _reaches_image(means: Tensor, radii: Tensor, width: int, height: int) -> Tensor:

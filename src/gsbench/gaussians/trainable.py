@@ -12,11 +12,8 @@ from torch import Tensor
 from torch.optim.adam import adam
 
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
-from gsbench.gaussians.paper_values import LearningRates
+from gsbench.gaussians.paper_values import ADAM_BETAS, ADAM_EPSILON, LearningRates
 from gsbench.words import attributes_of, no_such
-
-ADAM_BETAS = (0.9, 0.999)  # torch's defaults, as in 3DGS
-ADAM_EPSILON = 1e-15  # 3DGS
 
 
 @dataclass
@@ -27,6 +24,15 @@ class AdamState:
     step: int
     first: Tensor
     second: Tensor
+
+    @property
+    def factors(self) -> tuple[float, float]:
+        """The factors (a, b) of this step t: it is a m / (b sqrt(v) + eps), with the moments m, v.
+
+        With m' = m / (1 - b1^t) and v' = v / (1 - b2^t), it is rate m' / (sqrt(v') + eps).
+        """
+        beta1, beta2 = ADAM_BETAS
+        return self.rate / (1 - beta1**self.step), (1 - beta2**self.step) ** -0.5
 
 
 class Update(NamedTuple):
@@ -164,9 +170,16 @@ class TrainableGaussians:
         for name, parameter in self.values.tensors().items():
             if parameter.grad is not None:
                 self.adam[name].step += 1
-                updates.append(Update(parameter, parameter.grad, self.adam[name]))
+                active = 3 * ((sh_degree + 1) ** 2 - 1) if name == "sh_rest" else None
+                updates.append(Update(parameter, parameter.grad, self.adam[name], active))
                 parameter.grad = None
         self.step_all(updates, None, visible)
+
+    def count_step(self) -> list[AdamState]:
+        """Count a step of all parameters, which the caller makes; return their states in order."""
+        for state in self.adam.values():
+            state.step += 1
+        return [*self.adam.values()]
 
     def advance(self, known: KnownGradients) -> list[AdamState | None]:
         """Count a step with ``known`` gradients; return the state of each parameter to update.
@@ -252,11 +265,14 @@ class TrainableGaussians:
 def torch_adam(
     updates: Sequence[Update], seen: Tensor | None = None, visible: Tensor | None = None
 ) -> None:
-    """Apply Adam (Kingma and Ba 2015), to whole parameters by torch's fused kernel."""
+    """Apply Adam (Kingma and Ba 2015), to whole parameters by torch's fused kernel.
+
+    Gradients must be defined everywhere, as autograd's are.
+    """
     index = None if visible is None else visible.nonzero().squeeze(-1)  # [V]
     for update in updates:
-        parameter, gradient, state, active, further = update
-        if any(known is not None for known in (seen, active, further)):
+        parameter, gradient, state, _, further = update
+        if seen is not None or further is not None:
             raise NotImplementedError("torch_adam: a gradient is one tensor, defined everywhere")
         if index is not None:
             _step_rows(update, index)

@@ -32,6 +32,7 @@ SOURCES = (
     "raster/formulas.py",
     "raster/staged.py",
     "gaussians/model.py",
+    "gaussians/paper_values.py",
     "eval/ssim.py",
     "train/loss_cpu.py",
     "scene/courtyard",

@@ -10,6 +10,7 @@ import numpy as np
 
 from gsbench.raster.base import CONSTANTS
 from gsbench.raster.cpu import layout as at
+from gsbench.raster.cpu.adam import step_all
 from gsbench.raster.cpu.geometry import (
     F0,
     LOG2_E,
@@ -311,7 +312,7 @@ def _take_rows(record, count, past, v, record_ints, tile_shard, rows, indices, s
 
 @kernel
 def backproject_shards(
-    memory, first, past, edges, visible, gaussians, degree, frame, rows, outputs
+    memory, first, past, edges, visible, gaussians, degree, frame, rows, outputs, adam
 ):
     """Write the gradients of the shards ``first`` to ``past`` and clear their ``rows``.
 
@@ -319,30 +320,52 @@ def backproject_shards(
     records. ``rows`` is [shards of tiles * N * 16]. ``outputs`` are the gradients by the
     parameters, by the screen points [N, 2], the absolute ones [N, 2] and the extra output
     [N, C]; the last two are empty if not requested.
+
+    If ``adam`` has factors, the parameters are stepped, too, `layout.CHUNK` Gaussians at a time.
+    The gradients by the parameters then have the rows of one chunk only, which stay in the cache.
     """
+    steps = len(adam.factors) > 0
     for shard in range(first, past):
         begin, end = edges[shard], edges[shard + 1]
-        _clear_unseen(begin, end, visible[shard], frame.record_ints, outputs)
-        for record in range(begin, begin + visible[shard], LANES):
-            _backproject(
-                memory, record, begin + visible[shard], gaussians, degree, frame, rows, outputs
-            )
+        record, last = begin, begin + visible[shard]
+        for start in range(begin, end, at.CHUNK):
+            stop, origin = min(start + at.CHUNK, end), start if steps else 0
+            past_record = record
+            while past_record < last and _gaussian(frame.record_ints, past_record) < stop:
+                past_record += 1
+            _clear_unseen(start, stop, origin, record, past_record, frame.record_ints, outputs)
+            for sixteen in range(record, past_record, LANES):
+                _backproject(
+                    memory, sixteen, past_record, origin, gaussians, degree, frame, rows, outputs
+                )
+            record = past_record
+            if steps:
+                step_all(gaussians, adam, outputs[0], start, stop, memory[0])
 
 
 @inlined
-def _clear_unseen(begin, end, visible, record_ints, outputs):
-    """Set the gradients of a shard's Gaussians without a record to 0."""
+def _gaussian(record_ints, record):
+    return record_ints[record * at.RECORD + at.INDEX]
+
+
+@inlined
+def _clear_unseen(begin, end, origin, record, past_record, record_ints, outputs):
+    """Set the gradients of the Gaussians from ``begin`` to ``end`` without a record to 0.
+
+    Those with one have the records ``record`` to before ``past_record``. Row 0 of the gradients by
+    the parameters is that of the Gaussian ``origin``.
+    """
     gradients, g_screen, g_absolute, g_extra = outputs
     unseen = begin  # the first Gaussian whose gradients are not written yet
-    for record in range(begin, begin + visible + 1):
-        past = end if record == begin + visible else record_ints[record * at.RECORD + at.INDEX]
+    for own in range(record, past_record + 1):
+        past = end if own == past_record else _gaussian(record_ints, own)
         if past > unseen:
-            _clear(gradients.means, unseen, past)
-            _clear(gradients.log_scales, unseen, past)
-            _clear(gradients.quaternions, unseen, past)
-            _clear(gradients.logits, unseen, past)
-            _clear(gradients.sh_dc, unseen, past)
-            _clear(gradients.sh_rest, unseen, past)
+            _clear(gradients.means, unseen - origin, past - origin)
+            _clear(gradients.log_scales, unseen - origin, past - origin)
+            _clear(gradients.quaternions, unseen - origin, past - origin)
+            _clear(gradients.logits, unseen - origin, past - origin)
+            _clear(gradients.sh_dc, unseen - origin, past - origin)
+            _clear(gradients.sh_rest, unseen - origin, past - origin)
             _clear(g_screen, unseen, past)
             if len(g_absolute) > 0:
                 _clear(g_absolute, unseen, past)
@@ -352,14 +375,20 @@ def _clear_unseen(begin, end, visible, record_ints, outputs):
 
 
 @inlined
-def _backproject(memory, record, past, gaussians, degree, frame, rows, outputs):
-    """Write the gradients of up to 16 Gaussians: those of the records ``record`` to ``past``."""
+def _backproject(memory, record, past, origin, gaussians, degree, frame, rows, outputs):
+    """Write the gradients of up to 16 Gaussians: those of the records ``record`` to ``past``.
+
+    Row 0 of the gradients by the parameters is that of the Gaussian ``origin``.
+    """
     gradients, g_screen, g_absolute, g_extra = outputs
     v, record_ints = frame.camera, frame.record_ints
     floats, indices = memory
+    own = indices[LANES:]  # rows of the gradients by the parameters
     sums, colors = floats[:MATRIX], floats[3 * MATRIX :]
     count = min(LANES, past - record)
     _take_rows(record, count, past, v, record_ints, frame.tile_shard, rows, indices, sums)
+    for lane in range(LANES):
+        own[lane] = indices[lane] - origin
     mean = gather_vectors(gaussians.means, indices)
     log_scale = gather_vectors(gaussians.log_scales, indices)
     offset = from_camera(mean, v)
@@ -367,9 +396,9 @@ def _backproject(memory, record, past, gaussians, degree, frame, rows, outputs):
     # Colour. A channel below 0 was clamped and has no gradient.
     to, inverse_distance = normalized(offset)
     rgb = _unclamped(record, count, record_ints, sums, colors)
-    scatter_vectors(gradients.sh_dc, indices, stretched(rgb, F0))
+    scatter_vectors(gradients.sh_dc, own, stretched(rgb, F0))
     turned = _backproject_harmonics(
-        degree, to, indices, gaussians.sh_rest, gradients.sh_rest, floats[MATRIX:]
+        degree, to, indices, own, gaussians.sh_rest, gradients.sh_rest, floats[MATRIX:]
     )
 
     # Repeat the geometry of the forward pass.
@@ -404,28 +433,28 @@ def _backproject(memory, record, past, gaussians, degree, frame, rows, outputs):
         free = image_rows(free_x, free_y, inverse_z, v)
         scatter_splitting(g_extra, indices, q00 - a * h, q01, q11 - e * h, shear, free)
     g_scales, turn, s0, s1 = covariance_gradients(q00, q01, q11, n0, n1, shear, scales)
-    scatter_vectors(gradients.log_scales, indices, g_scales)
+    scatter_vectors(gradients.log_scales, own, g_scales)
     g_quaternion = quaternion_gradient(quaternion, turn, inverse_norm + inverse_norm)
-    scatter(gradients.quaternions, indices, 4, 0, g_quaternion[0])
-    scatter(gradients.quaternions, indices, 4, 1, g_quaternion[1])
-    scatter(gradients.quaternions, indices, 4, 2, g_quaternion[2])
-    scatter(gradients.quaternions, indices, 4, 3, g_quaternion[3])
+    scatter(gradients.quaternions, own, 4, 0, g_quaternion[0])
+    scatter(gradients.quaternions, own, 4, 1, g_quaternion[1])
+    scatter(gradients.quaternions, own, 4, 2, g_quaternion[2])
+    scatter(gradients.quaternions, own, 4, 3, g_quaternion[3])
 
     # Mean: through A = J W and the position on the image, and through the view direction of the
     # colour, whose gradient is projected to the tangent of the sphere.
     a0, a1 = through(matrix, s0), through(matrix, s1)
     position = position_gradient(a0, a1, g_column, g_row, free_x, free_y, inverse_z, v)
     tangent = stretched(plus(turned, -dot(turned, to), to), inverse_distance)
-    scatter_vectors(gradients.means, indices, plus(position, ONE, tangent))
+    scatter_vectors(gradients.means, own, plus(position, ONE, tangent))
 
     # d log(alpha) / d logit = 1 - opacity
     growth = exponential(gather(gaussians.logits, indices, 1, 0)) + ONE
-    scatter(gradients.logits, indices, 1, 0, h / growth)
+    scatter(gradients.logits, own, 1, 0, h / growth)
 
 
 @inlined
-def _backproject_harmonics(degree, to, indices, sh_rest, g_sh_rest, memory):
-    """Write the gradients by ``sh_rest``; return the gradient by the direction ``to``.
+def _backproject_harmonics(degree, to, indices, own, sh_rest, g_sh_rest, memory):
+    """Write the gradients by ``sh_rest`` to the rows ``own``; return that by the direction ``to``.
 
     ``memory`` has two 16x16 matrices for scratch, then the gradients by red, green and blue.
     """
@@ -433,14 +462,14 @@ def _backproject_harmonics(degree, to, indices, sh_rest, g_sh_rest, memory):
     if degree > 0:
         fill_basis(degree, to, basis)
     for lane in range(LANES):
-        own, place = indices[lane] * REST, lane * LANES
+        source, target, place = indices[lane] * REST, own[lane] * REST, lane * LANES
         if degree > 0:
             r, g, b = colors[lane], colors[LANES + lane], colors[2 * LANES + lane]
-            by_red, by_green, by_blue = by_channel(load_rest(sh_rest, own))
+            by_red, by_green, by_blue = by_channel(load_rest(sh_rest, source))
             store(pulled, place, by_red * r + by_green * g + by_blue * b)
-            store_rest(g_sh_rest, own, outer_rest(load(basis, place), r, g, b))
+            store_rest(g_sh_rest, target, outer_rest(load(basis, place), r, g, b))
         else:
-            store_rest(g_sh_rest, own, (splat(ZERO), splat(ZERO), splat(ZERO)))
+            store_rest(g_sh_rest, target, (splat(ZERO), splat(ZERO), splat(ZERO)))
     return direction_gradient(degree, to, pulled)
 
 
