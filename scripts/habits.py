@@ -16,9 +16,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from gsbench.analysis.questions import count_tries, level_of, look_shares
 from numpy.typing import NDArray
 
+from gsbench.analysis.questions import count_tries, level_of, look_shares
 from gsbench.analysis.thresholds import Region, evenness
 
 Array = NDArray[np.float64]

@@ -28,11 +28,11 @@ settings.load_profile("gsbench")
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def script(name):
+def script(name, folder="scripts"):
     """Load a file of scripts/ as a module; it may import others there."""
-    if str(ROOT / "scripts") not in sys.path:
-        sys.path.append(str(ROOT / "scripts"))
-    specification = importlib.util.spec_from_file_location(name, ROOT / f"scripts/{name}.py")
+    if str(ROOT / folder) not in sys.path:
+        sys.path.append(str(ROOT / folder))
+    specification = importlib.util.spec_from_file_location(name, ROOT / f"{folder}/{name}.py")
     assert specification is not None
     assert specification.loader is not None
     module = importlib.util.module_from_spec(specification)

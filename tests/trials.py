@@ -11,10 +11,15 @@ from hashlib import sha256
 
 import numpy as np
 
+from gsbench.analysis.cells import with_variants
+from gsbench.analysis.quantities import asked_quantity
+from gsbench.analysis.questions import Asked, ask, rows_of
+from gsbench.analysis.results import read_experiment
 from gsbench.config.compose import Trial
+from gsbench.runs.commands import Command, PlannedTrial, append
 from gsbench.runs.keys import INIT
 from gsbench.runs.trial_record import TrialRecord
-from tests.helpers import write, write_lines
+from tests.helpers import read_json, write, write_lines
 from tests.pictures import write_pictures, write_point_cloud
 
 METRICS = ("psnr", "ssim", "lpips_vgg_raw", "flip")
@@ -148,7 +153,7 @@ def write_trial(
         hashes={
             "config": HASH,
             "data": f"data-{scene}",
-            "train": f"t{seed}",
+            "train": f"t{seed} of {scene} {densify} {config_hash}",
             "init": INIT.key({"scene": scene, "init": init}),
         },
         versions={"gsbench": "0.1.0", "torch": "2.13.0", "pycolmap": "4.2.1"},
@@ -273,3 +278,39 @@ def write_arms(runs, arms, seeds=(0, 1, 2), scenes=("courtyard",), settings=None
         more = (settings or {}) | {"densify": {"name": name, **own}}
         paths.append(write_trial(runs, seed, config_hash, more, scene=scene, densify=name, **views))
     return paths
+
+
+def ask_about(runs, chosen=lambda trial: True, experiment="exp", metric="psnr", seen=None, **asked):
+    """Write the command that asks about these trials as if before they were trained.
+
+    ``seen`` are the trials measured before; by default those that an earlier command asked about.
+    Returns the questions.
+    """
+    home = runs / experiment
+    trials = read_experiment(home).trials
+    own = with_variants([trial for trial in trials if chosen(trial)])
+    quantity = asked_quantity(metric, own)
+    about = {"sign": quantity.direction, "least": quantity.worthwhile} | asked
+    known = [trial for trial in trials if (seen or (lambda one: one.asked))(trial)]
+    planned = {
+        trial.path.relative_to(home).as_posix(): PlannedTrial(words=("x",), digest=trial.digest)
+        for trial in own
+    }
+
+    def make(history):
+        found, shown = ask(rows_of(own), Asked(metric=metric, **about), rows_of(known), history)
+        return Command(
+            words=("-m",),
+            cwd="/",
+            time=1.0,
+            trials=planned,
+            questions=tuple(found),
+            shows=tuple(shown),
+        )
+
+    questions = append(home, make).questions
+    for trial in own:
+        names = [q.id for q in questions if q.has(trial.digest, trial.scene, trial.seed)]
+        record = read_json(trial.path / "results.json")
+        write(trial.path / "results.json", record | {"questions": trial.record.questions + names})
+    return questions

@@ -55,6 +55,8 @@ DAMAGE = (
     zipfile.BadZipFile,
     tarfile.TarError,
 )
+GIT_LFS = b"version https://git-lfs"  # the start of a pointer that stands for a file
+LFS_REMEDY = "a pointer of Git LFS (git lfs pull)"
 NEARLY_NOTHING = 64 * 1024  # free bytes; with less, any failed write counts as a full disk
 
 

@@ -5,7 +5,7 @@ import os
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any, Protocol, TextIO
 
@@ -248,6 +248,12 @@ def progress(title: str) -> Iterator[Progress]:
             )
 
         yield report
+
+
+def bar(title: str) -> AbstractContextManager[Progress]:
+    """`progress` on a terminal, with the time left; elsewhere nothing is shown."""
+    stream = getattr(sys.stderr, "raw", sys.stderr)
+    return progress(title) if Console(file=stream).is_terminal else nullcontext(no_progress)
 
 
 def _lines(title: str) -> Progress:

@@ -1,4 +1,4 @@
-"""Plug-ins by which Hydra hands trials to gsbench; ``gsbench.app.plugins`` does their work.
+"""Plug-ins by which Hydra hands trials to gsbench; ``gsbench.app.hydra_app`` does their work.
 
 Hydra imports this file whenever any Hydra app in the same environment starts, so it imports only
 Hydra.
@@ -18,21 +18,24 @@ from omegaconf import DictConfig
 
 
 class GsbenchLauncher(Launcher):
-    """Runs the jobs of another sweeper as the settings ``launch`` say.
+    """Runs the jobs of another sweeper as the settings ``launch`` say, or by another launcher.
 
     gsbench's own sweeper runs its trials itself.
     """
+
+    def __init__(self, **settings: Any) -> None:
+        pass
 
     def setup(
         self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
     ) -> None:
         self.task: Any = task_function
-        self.config = config
+        self.context, self.config = hydra_context, config
 
     def launch(
         self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int
     ) -> Sequence[JobReturn]:
-        returned: Sequence[JobReturn] = self.task.run_jobs(job_overrides, self.config)
+        returned: Sequence[JobReturn] = self.task.run_jobs(job_overrides, self.context, self.config)
         return returned
 
 

@@ -3,10 +3,9 @@
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.tables import build_table
-from gsbench.runs.experiments import Arm, record_text
+from gsbench.runs.experiments import Arm
 
 ADC, VOLUMETRIC = Arm("sfm", "adc"), Arm("sfm", "volumetric")
-EARLY, LATE = "2020-01-01T00:00:00Z", "2037-01-01T00:00:00Z"
 
 
 def loaded(runs):
@@ -29,7 +28,3 @@ def table_of(runs, *metrics, **how):
 def rows_of(table):
     """The texts of a table's entries by the first label of their row."""
     return {row.labels[0]: [entry.text for entry in row.entries] for row in table.rows}
-
-
-def write_declared(runs, *declarations, experiment="exp"):
-    (runs / f"{experiment}/declared.jsonl").write_text(record_text(declarations))

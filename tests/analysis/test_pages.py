@@ -9,12 +9,10 @@ from markupsafe import Markup
 
 from gsbench.analysis import table_formats
 from gsbench.analysis.report.build import build_report
-from gsbench.claims.check_page import to_html
 from gsbench.claims.export import write_archive
 from gsbench.cli import run
 from gsbench.view import page as model_page
 from tests.analysis.helpers import loaded
-from tests.claims.test_page import made, page_of
 from tests.markup import Page
 from tests.trials import write_runs
 from tests.view.browser import Browser
@@ -56,7 +54,6 @@ def pages(folder, monkeypatch):
         "report.html.j2": build_report(trials),
         "site.html.j2": (folder / "site/index.html").read_text(),
         "table_page.html.j2": table.read_text(),
-        "page.html.j2": to_html(page_of(made(folder / "claims", tuple("abcdef")))),
     }
 
 

@@ -252,7 +252,7 @@ def test_measured_values_are_shown_beside_the_printed_numbers(tmp_path, capsys):
     assert texts(table) == [
         ["garden", "sfm", "adc", "27.410", "+0.000 =", "0.868", "+0.032 ≠", "0.103", "+0.097 ≠"]
     ]
-    assert any(note.startswith("Read from github.com/nerfbaselines") for note in table.notes)
+    assert any("Read from github.com/nerfbaselines" in note for note in table.notes)
     assert (
         "Of 3 cells 1 are within rounding (=), 0 within our 95% t interval of the mean (≈), 2 "
         "differ" in table.notes[0]

@@ -12,7 +12,7 @@ from gsbench.analysis.ranks import Ranking, critical_difference, rank_arms
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.report.charts import rank_plot
 from gsbench.analysis.results import Experiment
-from gsbench.analysis.verdict_words import p_text
+from gsbench.analysis.sentences import p_text
 from gsbench.claims.export import write_archive
 from gsbench.cli import run
 from gsbench.runs.experiments import Arm

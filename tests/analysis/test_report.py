@@ -11,11 +11,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from gsbench.analysis.pairing import pair_trials
+from gsbench.analysis.verdict_words import by_scene_lines, sentence
 from PIL import Image
 from plyfile import PlyData
 
 from gsbench.analysis.images import _jpeg_uri, choose_views, read_compared, texture_energy
-from gsbench.analysis.pairing import pair_trials
 from gsbench.analysis.quantities import quantity
 from gsbench.analysis.report.build import _forest, build_report, search_summary, trial_figures
 from gsbench.analysis.report.charts import Axis, ForestRow, forest_plot, line_chart, short_number
@@ -29,7 +30,6 @@ from gsbench.analysis.report.volumes import (
 )
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.statistics import Interval
-from gsbench.analysis.verdict_words import by_scene_lines, sentence
 from gsbench.analysis.verdicts import judge_pairs
 from gsbench.runs.rows import Histogram
 from tests.analysis.helpers import ADC, VOLUMETRIC, loaded, page_of, rows_of, trials_of

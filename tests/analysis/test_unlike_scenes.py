@@ -1,15 +1,12 @@
 """An arm that has other settings or conditions on other scenes: no mean hides that."""
 
-from dataclasses import replace
-
 import pytest
 
 from gsbench.analysis.differences import between_scenes_notes, ingredients_between
 from gsbench.analysis.fairness import caveats, fairness_table
-from gsbench.analysis.judgement import judge
 from gsbench.analysis.notes import texts
-from gsbench.runs.experiments import Arm, Declaration, Question
-from tests.analysis.helpers import EARLY, page_of, rows_of, table_of, trials_of
+from gsbench.runs.experiments import Arm
+from tests.analysis.helpers import page_of, rows_of, table_of, trials_of
 from tests.helpers import refusal
 from tests.trials import write_trial
 
@@ -120,25 +117,6 @@ def test_resolution_and_data_are_those_of_a_scene(tmp_path):
     write(tmp_path, "park", _resolution=[400, 300])
     write(tmp_path, "room", _resolution=[300, 200])
     assert lines(tmp_path) == []
-
-
-def test_a_verdict_on_named_trials_says_how_the_scenes_differ(tmp_path):
-    arms, scenes = ("adc", "mcmc"), {}
-    for scene, iterations in (("park", 2000), ("room", 7000)):
-        for densify in arms:
-            write(tmp_path, scene, densify=densify, _iterations=iterations)
-        scenes[scene] = tuple(f"{scene}/sfm-{arm}/c0ffee00" for arm in arms)
-    asked = Question(metric="psnr", sign=1, scenes=scenes, seeds=(0, 1))
-    alone = replace(asked, scenes={"park": scenes["park"]})
-    both, one = (
-        judge(trials_of(tmp_path), Declaration(time=EARLY, questions=(question,)))[0]
-        for question in (asked, alone)
-    )
-    assert texts(both.notes) == [
-        "Scenes of sfm-adc and sfm-mcmc differ in more than the scene: iterations (2000 on park, "
-        "7000 on room)."
-    ]
-    assert one.notes == ()
 
 
 @pytest.fixture

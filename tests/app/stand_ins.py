@@ -1,6 +1,6 @@
 """Trials that are not composed, and their ends."""
 
-from gsbench.launch.jobs import Outcome
+from gsbench.launch.outcomes import Outcome
 from tests.trials import bare_trial
 
 

@@ -1,82 +1,20 @@
 """From a command line to trials and an exit code, with stand-ins for trials."""
 
-import copy
 import logging
 from types import SimpleNamespace
 
 import pytest
 from omegaconf import OmegaConf
 
-from gsbench.app import command, hydra_files
+from gsbench.app import command
 from gsbench.app.command import one_trial_per_scene, summarize
-from gsbench.app.hydra_files import words_for_hydras_files, words_for_new_folder
 from gsbench.app.sweep import Ended, check_sweep_settings
 from gsbench.config.compose import Trial
 from gsbench.errors import GsbenchError, InputError
-from gsbench.launch.jobs import Outcome
+from gsbench.launch.outcomes import Outcome
 from gsbench.runs.trial_folder import TrialFolder
 from tests.app.stand_ins import trial
 from tests.helpers import refusal
-
-OWN_FILES = {
-    "run": {"dir": "."},
-    "sweep": {"dir": ".", "subdir": "."},
-    "output_subdir": None,
-    "job_logging": {},
-}
-
-
-OF_A_TRIAL = (
-    "hydra.output_subdir=.hydra hydra/job_logging=default hydra.job_logging.root.handlers=[file]"
-)
-OF_JOBS = "hydra.run.dir=${runs}/.hydra hydra.sweep.subdir=${hydra.job.num} hydra/launcher=basic"
-
-
-@pytest.mark.parametrize(
-    "changes, typed, multirun, launch, added",
-    [
-        ({}, [], True, "serial", []),
-        ({"run": {"dir": "here"}}, [], False, "serial", OF_A_TRIAL.split()),
-        ({"output_subdir": "x", "job_logging": {"root": 1}}, [], True, "serial", OF_JOBS.split()),
-        (
-            {"sweep": {"dir": "a", "subdir": "b"}, "run": {"dir": "here"}},
-            ["hydra.output_subdir=null", "hydra/job_logging=none"],
-            True,
-            "local",
-            [],
-        ),
-    ],
-)
-def test_hydra_writes_its_files_if_one_is_asked_for(
-    monkeypatch, caplog, changes, typed, multirun, launch, added
-):
-    caplog.set_level(logging.INFO, "gsbench")
-    own = copy.deepcopy(OWN_FILES)
-    monkeypatch.setattr(hydra_files, "installed_nodes", lambda words: own)
-    runtime = {"choices": {"hydra/launcher": "gsbench"}}
-    config = OmegaConf.create(
-        {"hydra": OWN_FILES | changes | {"runtime": runtime}, "launch": {"name": launch}}
-    )
-    assert words_for_hydras_files(config, typed, multirun) == added
-    assert ("writes no files of Hydra's" in caplog.text) == (launch == "local")
-
-
-def test_another_launchers_jobs_get_a_folder_that_nobody_could_prepare(tmp_path):
-    launcher = {"submitit_folder": "${hydra.sweep.dir}/.submitit/%j", "timeout_min": 60}
-    own = {"hydra": {"sweep": {"dir": str(tmp_path)}, "launcher": launcher}}
-    config = OmegaConf.create(own | {"runs": str(tmp_path)})
-    config.hydra.runtime = {"choices": {"hydra/launcher": "submitit_local"}}
-    (first,), (second,) = (words_for_new_folder(config, ["seed=0"]) for _ in range(2))
-    assert first.startswith("hydra.sweep.dir=${runs}/.hydra/")
-    assert first != second
-    typed = [f"hydra.sweep.dir={tmp_path}"]
-    assert words_for_new_folder(config, typed) == []
-    (tmp_path / ".submitit").mkdir()
-    with refusal("results of jobs would be unpickled from it"):
-        words_for_new_folder(config, typed)
-    for name in ("basic", "gsbench"):
-        config.hydra.runtime.choices["hydra/launcher"] = name
-        assert words_for_new_folder(config, []) == []
 
 
 @pytest.mark.parametrize(
@@ -113,6 +51,8 @@ def test_settings_of_a_sweep_need_a_sweep(changes, multirun, said):
 
 # ---- the end of a command
 
+CHANGE = "change what the lines above name, then give the command again"
+
 
 @pytest.mark.parametrize(
     "ends, code, advice",
@@ -121,17 +61,24 @@ def test_settings_of_a_sweep_need_a_sweep(changes, multirun, said):
         ("d", 0, "1 of 1 trials done; the table: gsbench tables x; renders and model: "),
         ("df", 1, "1 of 2 trials done; again: gsbench retry x"),
         ("bf", 1, "0 of 2 trials done; again: gsbench retry x"),
-        ("bb", 2, "0 of 2 trials done; again: gsbench retry x"),
+        ("bb", 2, f"0 of 2 trials done; {CHANGE}"),
+        ("fr", 1, f"0 of 2 trials done; {CHANGE}"),
         ("dq", 0, "1 of 2 trials done; how far the others are: gsbench status x"),
         ("bq", 1, "0 of 2 trials done; how far the others are: gsbench status x"),
     ],
 )
 def test_the_end_of_a_command_tells_what_to_do_next(tmp_path, caplog, capsys, ends, code, advice):
     caplog.set_level(logging.INFO, "gsbench")
-    status = {"d": "done", "q": "queued", "f": "failed", "b": "failed"}
+    status = {"d": "done", "q": "queued"}
     trials = [trial(tmp_path, seed) for seed in range(len(ends))]
     outcomes = [
-        Outcome(one.folder, status[end], "why", end == "b")
+        Outcome(
+            one.folder,
+            status.get(end, "failed"),
+            "why",
+            end == "b",
+            "densify.x" if end == "r" else "",  # repeats another failure, so it was not started
+        )
         for one, end in zip(trials, ends, strict=True)
     ]
     first = Trial(trials[0].values | {"name": "tuning"}, ())
@@ -142,8 +89,11 @@ def test_the_end_of_a_command_tells_what_to_do_next(tmp_path, caplog, capsys, en
     assert said == [
         f"gsbench: failed: {TrialFolder(one.folder).label}: why"
         for one in outcomes
-        if one.status == "failed"
-    ]
+        if one.status == "failed" and not one.change
+    ] + [
+        "gsbench: not started: 1 trial would fail in the same way: change densify.x, then give "
+        "the command again"
+    ] * ends.count("r")
 
 
 def test_the_failure_of_a_single_trial_is_raised(tmp_path):
@@ -195,23 +145,27 @@ def test_a_dry_run_explains_a_reference_to_nothing(runs):
     [
         (["--dry-run"], "", 2, "dry_run", 0),
         (["--dry-run"], "optuna", 2, "dry_run", 0),
-        ([], "", 0, "own_sweep", 0),
-        ([], "", 2, "own_sweep", 1),
-        ([], "optuna", 2, "other_sweep", 1),
+        ([], "", 0, "own_path", 0),
+        ([], "", 2, "own_path", 1),
+        ([], "optuna", 2, "run_by_hydra", 1),
     ],
 )
 def test_only_trials_that_ran_are_summarized(
     tmp_path, monkeypatch, words, other, trials, did, code
 ):
     ended, done = Ended([trial(tmp_path, seed) for seed in range(trials)]), []
-    sweep = SimpleNamespace(other_sweeper=other)
+    job = SimpleNamespace(chdir=False)
+    sweep = SimpleNamespace(
+        other_sweeper=other, config=SimpleNamespace(hydra=SimpleNamespace(job=job))
+    )
     monkeypatch.setattr(command, "_read", lambda words, multirun: sweep)
-    for name, end in (("dry_run", 0), ("own_sweep", ended), ("other_sweep", ended)):
+    ends = (("dry_run", 0), ("own_path", ended), ("run_by_hydra", ended if other else None))
+    for name, end in ends:
         run = lambda asked, *_, did=(name, end): done.append((did[0], asked)) or did[1]  # noqa: E731
         monkeypatch.setattr(command, name, run)
     monkeypatch.setattr(command, "summarize", lambda outcomes, trials: int(trials is ended.trials))
     assert command.launch(words) == code
-    assert done == [(did, sweep)]
+    assert done[-1] == (did, sweep)
 
 
 def test_a_dry_run_shows_as_many_log_lines_as_the_run_would(runs, monkeypatch):

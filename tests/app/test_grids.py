@@ -8,8 +8,8 @@ from gsbench import cli
 from gsbench.app.command import compose_trials
 from gsbench.app.grids import checked_grids, words_of_grids
 from gsbench.config.compose import compose_one
-from gsbench.launch.record import add_to_plan
-from gsbench.runs.plan import read_plan
+from gsbench.launch.record import record
+from gsbench.runs.commands import read_history
 from gsbench.runs.trial_folder import TrialFolder
 from tests.helpers import refusal, write
 from tests.trials import write_results
@@ -114,9 +114,9 @@ def test_plan_dry_run_and_retry_see_one_experiment(runs, monkeypatch, capsys, sa
     words = split("+experiment=threshold densify.volume_threshold=0.5 seed=0")
     assert "2 trials: 2 missing" in said(*words, "--dry-run")
     trials = compose_trials(words)
-    add_to_plan(trials)
+    record(trials, asks=False)
     first, second = (TrialFolder.of(trial.values).path for trial in trials)
-    assert list(read_plan(runs / "threshold")) == [first, second]
+    assert list(read_history(runs / "threshold").planned) == [first, second]
     write(first / "config.yaml", trials[0].yaml)
     write_results(first, trials[0].values)
     ran = []
@@ -130,3 +130,19 @@ def test_plan_dry_run_and_retry_see_one_experiment(runs, monkeypatch, capsys, sa
     assert "2 trials: 1 done, 1 missing" in capsys.readouterr().out
     assert cli.run(["retry", "threshold"]) == 0
     assert ran == [second]
+
+
+def test_a_setting_that_a_files_grid_adds_is_given_without_a_plus(tmp_path, monkeypatch):
+    """The file's class has it, and the choices of the command line do not."""
+    monkeypatch.chdir(tmp_path)
+    mine = "from dataclasses import dataclass\nfrom gsbench.densify import ADC\n"
+    write(tmp_path / "mine.py", f"{mine}@dataclass\nclass Mine(ADC):\n    decay: float = 0.5\n")
+    grid = "{densify: adc, densify._target_: mine.Mine, densify.name: mine, +densify.decay: '.7'}"
+    node = f"hydra: {{mode: MULTIRUN, sweeper: {{grids: [{{densify: volumetric}}, {grid}]}}}}\n"
+    write(tmp_path / "conf/experiment/e.yaml", f"# @package _global_\n{node}")
+    words = ["hydra.searchpath=[conf]", "+experiment=e", "allow_targets=[mine]"]
+    for typed, decays in (([], [0.7]), (["=0.1"], [0.1]), (["=0.1,0.2"], [0.1, 0.2])):
+        given = [f"densify.decay{value}" for value in typed]
+        trials = compose_trials([*words, *given], multirun=True)
+        found = [trial.values["densify"].get("decay") for trial in trials]
+        assert found == [None, *decays]

@@ -13,14 +13,14 @@ from gsbench.analysis.report.build import build_report, search_summary
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.tables import build_table
 from gsbench.errors import GsbenchError
-from gsbench.launch.jobs import outcome_of_error, outcome_of_results
+from gsbench.launch.outcomes import outcome_of_error, outcome_of_results
 from gsbench.launch.record import add_to_plan, declare
 from gsbench.parsing import read_typed
 from gsbench.runs.experiments import Arm, TuningRecord
 from gsbench.runs.layout import RESULTS, TUNING
 from gsbench.runs.trial_record import record_from
 from tests.helpers import read_json, write
-from tests.launch.test_declare import TINY
+from tests.launch.test_record import TINY
 from tests.trials import write_as
 
 optuna = pytest.importorskip("optuna", reason="needs Optuna (extra search)")

@@ -1,17 +1,16 @@
-"""Switches of densifiers: which are on, which runs they make, and verdicts on known gains."""
+"""Switches of densifiers: which are on, which runs they make, and the experiment of these."""
 
 from dataclasses import MISSING, fields
 from shlex import split
 
-import numpy as np
 import pytest
+import yaml
 
+from gsbench.app.command import compose_trials
 from gsbench.claims.ablation import (
     choose_switches,
     declared_switches,
     effective_run,
-    judge_runs,
-    markdown_table,
     off_settings,
     runs_to_train,
 )
@@ -21,10 +20,8 @@ from gsbench.config.groups import options
 from gsbench.densify.volumetric import Volumetric
 from gsbench.runs.config_hash import config_hash
 from gsbench.settings import Switch
-from tests.analysis.helpers import trials_of
 from tests.helpers import refusal
-from tests.launch.test_declare import TINY
-from tests.trials import write_trial
+from tests.launch.test_record import TINY
 
 NESTED = {
     "rule": Switch({"stop": 0}),
@@ -121,49 +118,31 @@ def test_an_unknown_switch_is_refused_with_the_nearest_name():
     assert list(choose_switches(NESTED, ["once"], "x")) == ["once"]
 
 
-def write_ablation(runs, gains, seeds=3):
-    """Write trials in which each part of `NESTED` that acts adds its gain in PSNR.
-
-    Returns their folders by run and scene.
-    """
-    keys = {}
-    for number, chosen in enumerate(runs_to_train(NESTED)):
-        for seed in range(seeds):
-            noise = 0.001 * np.random.default_rng([number, seed]).normal()
-            psnr = 26 + sum(gains[name] for name in chosen) + noise
-            place = {"scene": "courtyard", "densify": "volumetric"}
-            write_trial(runs, seed, f"{number:08x}", **place, psnr=psnr)
-        keys[chosen] = {"courtyard": f"courtyard/sfm-volumetric/{number:08x}"}
-    return keys
+ABLATE = split("scene=courtyard init=random tracking=none eval.lpips=[] seed=0,1,2,3")
+SWITCH = split("+densify.switches.size.off.split_size=0.5 --switches size")
 
 
-def test_each_combination_is_judged_against_the_run_with_all_parts(tmp_path):
-    keys = write_ablation(tmp_path, {"rule": 1.0, "shrink": 0.4, "once": 0.0})
-    verdicts = judge_runs(trials_of(tmp_path), keys, "psnr")
-    found = {str(one.question.arm): (round(one.mean or 0.0, 2), one.outcome) for one in verdicts}
-    assert found == {
-        "without shrink": (-0.4, "refuted"),
-        "without once": (0.0, "too small to matter"),
-        "without once and shrink": (-0.4, "refuted"),
-        "without once, rule and shrink": (-1.4, "refuted"),
-    }
-    assert verdicts[0].family == 4
-    lines = markdown_table(verdicts)
-    assert lines[0] == "| run | difference in PSNR (dB) from all parts | interval | verdict |"
-    assert lines[2].startswith("| without once | ") or lines[2].startswith(
-        "| without shrink | −0.4"
-    )
+def test_ablate_writes_an_experiment_with_a_grid_for_each_combination(runs, said, tmp_path):
+    file = tmp_path / "conf/experiment/parts.yaml"
+    words = ["ablate", *ABLATE, "densify=volumetric_once", "name=parts"]
+    assert said(*words, "--out", file) == f"{file}: 20 trials of gsbench +experiment=parts\n"
+    assert said(*words) == file.read_text()
+    trials = compose_trials([f"hydra.searchpath=['file://{file.parents[1]}']", "+experiment=parts"])
+    assert len(trials) == 20
+    assert {trial.values["eval"]["baseline"] for trial in trials} == {"volumetric_once"}
+    off = [
+        {key: trial.values["densify"][key] for key in ("condition_of", "split_isotropic")}
+        | {"rule": trial.values["densify"]["volume_stop"] != 0}
+        for trial in trials[::4]
+    ]
+    as_configured = dict(off[0])
+    assert [sum(one[key] != as_configured[key] for key in one) for one in off] == [0, 1, 1, 2, 3]
 
 
-def test_a_combination_whose_trials_are_missing_has_no_verdict(tmp_path):
-    keys = write_ablation(tmp_path, {"rule": 1.0, "shrink": 0.4, "once": -0.2})
-    last = list(keys)[-1]
-    for path in (tmp_path / "exp").glob(f"{keys[last]['courtyard']}-seed*/results.json"):
-        path.unlink()
-    verdicts = judge_runs(trials_of(tmp_path), keys, "psnr")
-    assert verdicts[-1].answer is None
-    assert markdown_table(verdicts)[-1].endswith("| – | – | courtyard: seed 0 has no partner |")
-    assert len(markdown_table(verdicts[-1:])) == 3
+def test_ablate_takes_switches_that_the_command_names(runs, said):
+    content = yaml.safe_load(said("ablate", *ABLATE, "densify=adc", *SWITCH))
+    grids = content["hydra"]["sweeper"]["grids"]
+    assert grids == [{"densify": "adc"}, {"densify": "adc", "densify.split_size": "0.5"}]
 
 
 @pytest.mark.parametrize(
@@ -176,9 +155,11 @@ def test_a_combination_whose_trials_are_missing_has_no_verdict(tmp_path):
         ("densify=adc --switches opacity_rest", "did you mean opacity_reset"),
         ("densify=adc +densify.switches.a.off.split_shrnk=2", "split_shrnk"),
         ("densify=adc --fast", "unrecognized arguments: --fast"),
+        ("+experiment=demo densify=adc", "plain KEY=VALUE"),
         (
-            "densify=adc launch.stop_when_decided=true eval.primary=psnr seed=0,1",
-            "stop_when_decided",
+            "densify=adc +densify.switches.a.off.split_size=.5 "
+            "+densify.switches.b.off.split_size=.5 --switches a,b",
+            "makes no other run",
         ),
     ],
 )

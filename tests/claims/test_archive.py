@@ -7,6 +7,7 @@ import re
 import shutil
 import zipfile
 from dataclasses import replace
+from pathlib import Path
 from shlex import split
 
 import pytest
@@ -20,25 +21,21 @@ from gsbench.analysis.table_formats import to_markdown
 from gsbench.claims.archive import unpack_archive
 from gsbench.claims.export import write_archive
 from gsbench.errors import InputError
-from gsbench.runs.experiments import Declaration, Question
-from tests.analysis.helpers import ADC, VOLUMETRIC, loaded, write_declared
+from tests.analysis.helpers import ADC, VOLUMETRIC, loaded
 from tests.helpers import read_json, refusal, write
-from tests.trials import search_record, write_runs
+from tests.trials import ask_about, search_record, write_runs
 
 # as many trials as Table 1 has
-UNSIGNED = ("archive.json", "ro-crate-metadata.json")
 MANY = {"scenes": [f"scene{k}" for k in range(9)], "seeds": range(3), "views": 25}
 
 
-def declare(runs, metric="psnr"):
-    asked = Question(metric=metric, sign=0)
-    write_declared(runs, Declaration(time="2026-01-01T00:00:00Z", questions=(asked,)))
+UNSIGNED = ("archive.json", "ro-crate-metadata.json")
 
 
 def export(tmp_path, **plan):
     runs = tmp_path / "runs"
     write_runs(runs, **plan)
-    declare(runs)
+    ask_about(runs)
     write_archive(loaded(runs), tmp_path / "exp.zip")
     return tmp_path / "exp.zip"
 
@@ -75,9 +72,34 @@ def test_results_settings_and_views_are_read_back(tmp_path):
         assert other.measured == int(one.measured)
         assert other.config == one.config
         assert read_views(other) == read_views(one)
-    assert (back.folder / "declared.jsonl").read_text() == (
-        there.folder / "declared.jsonl"
-    ).read_text()
+    (question,), (same,) = there.history.questions, back.history.questions
+    assert same == question
+    assert not back.history.faults
+    assert compare(back).sentences == compare(there).sentences
+
+
+def test_an_archive_is_a_runs_folder_with_a_list_of_checksums(tmp_path):
+    content = members(export(tmp_path, scenes=("yard",), seeds=(0,), densifiers=("adc",)))
+    manifest = json.loads(content["archive.json"])
+    (folder,) = (path.parent for path in (tmp_path / "runs").glob("exp/*/*/*/results.json"))
+    place = folder.relative_to(tmp_path / "runs").as_posix()
+    files = {f"{place}/{name}" for name in ("results.json", "config.yaml", "per_view.csv")}
+    assert set(manifest["sha256"]) == files | {"exp/commands.jsonl"}
+    assert set(content) == set(manifest["sha256"]) | set(UNSIGNED)
+    assert content[f"{place}/per_view.csv"] == (folder / "per_view.csv").read_bytes()
+    assert all(
+        hashlib.sha256(content[name]).hexdigest() == digest
+        for name, digest in manifest["sha256"].items()
+    )
+
+
+def test_the_export_says_how_many_questions_are_open(runs, said):
+    paths = write_runs(runs)
+    ask_about(runs, lambda trial: trial.scene == "courtyard")
+    ask_about(runs)
+    assert "open" not in said("export --results exp")
+    shutil.rmtree(paths[-1])
+    assert said("export --results exp").endswith(", open: 1 of 2\n")
 
 
 def test_an_archive_is_small_and_equal_results_give_equal_archives(tmp_path):
@@ -135,9 +157,8 @@ def test_an_archive_is_an_ro_crate(tmp_path):
     assert root["@type"] == "Dataset"
     assert all(root[key] for key in ("name", "description", "datePublished"))
     parts = {entity["@id"] for entity in root["hasPart"]}
-    assert parts == content.keys() - {"ro-crate-metadata.json"}
+    assert parts == {"archive.json"} <= content.keys()
     assert all(by_id[part]["@type"] == "File" for part in parts)
-    assert all(int(by_id[part]["contentSize"]) == len(content[part]) for part in parts)
 
     def references(value):
         if isinstance(value, dict):
@@ -168,18 +189,31 @@ def resigned(name, old, new):
     return edit(name, old, new, resigned=True)
 
 
-def with_unfinished(folder):
-    """An archive by somebody who names this trial as failed."""
-    line = json.dumps({"folder": folder, "configuration": {}}).encode()
-    added = {"unfinished.jsonl": line}
-    return lambda file: rewrite(file, lambda content: content.update(added), resigned=True)
+def added(place, content):
+    """An archive by somebody who adds a file."""
+    more = {place: json.dumps(content).encode()}
+    return lambda file: rewrite(file, lambda content: content.update(more), resigned=True)
 
 
-def with_search(name, **changes):
-    """An archive by somebody who adds a search with this name."""
-    line = {"experiment": name, "search": search_record([]) | changes}
-    added = {"searches.jsonl": json.dumps(line).encode()}
-    return lambda file: rewrite(file, lambda content: content.update(added), resigned=True)
+def moved(old, new):
+    """An archive by somebody who renames files."""
+
+    def change(content):
+        for name in [name for name in content if old in name]:
+            content[name.replace(old, new)] = content.pop(name)
+
+    return lambda file: rewrite(file, change, resigned=True)
+
+
+def of_trial(name, old, new, resigned=True):
+    """A change of a file of the first trial."""
+
+    def change(content):
+        place = min(one for one in content if one.endswith(f"/{name}"))
+        assert old in content[place]
+        content[place] = content[place].replace(old, new, 1)
+
+    return lambda file: rewrite(file, change, resigned)
 
 
 def flip_a_bit(file):
@@ -197,40 +231,31 @@ def flip_a_bit(file):
         (lambda file: file.write_text("results"), "not a complete zip"),
         (lambda file: file.unlink(), "no such file"),
         (
-            edit("results.jsonl", b'"psnr":2', b'"psnr":3'),
-            "results.jsonl was changed after the export",
+            of_trial("results.json", b'"psnr": 2', b'"psnr": 3', resigned=False),
+            "results.json was changed after the export",
         ),
-        (edit("per_view.csv", b"view000", b"view00x"), "per_view.csv was changed"),
-        (edit("archive.json", b'"version": 1', b'"version": 2'), "of version 2 of the archive"),
+        (of_trial("per_view.csv", b"view000", b"view00x", resigned=False), "was changed"),
+        (edit("archive.json", b'"version": 2', b'"version": 3'), "of version 3 of the archive"),
         (edit("archive.json", b"gsbench results", b"other"), "not one of gsbench"),
         (edit("archive.json", b'"sha256"', b'"sha255"'), "not that of an archive"),
         (edit("archive.json", b"{", b"["), "not JSON"),
         (drop("archive.json"), "lacks archive.json"),
-        (drop("configurations.jsonl"), "lacks configurations.jsonl"),
-        (
-            resigned("results.jsonl", b'"folder":"courtyard/', b'"folder":"../../../tmp/'),
-            "cannot be the folder of a trial",
-        ),
-        (resigned("results.jsonl", b'"folder":"courtyard/', b'"folder":"room/'), "foreign"),
-        (resigned("results.jsonl", b'"status":"complete"', b'"status":"well"'), "unfinished"),
-        (resigned("results.jsonl", b"{", b"["), "not that of an archive"),
-        (resigned("results.jsonl", b"{", b"[" * 200_000), "not that of an archive"),
-        (resigned("results.jsonl", b"-seed1", b"-seed0"), "is in it twice"),
-        (
-            resigned("configurations.jsonl", b'"name":"adc"', b'"name":"volumetric"'),
-            "says densify volumetric",
-        ),
-        (
-            resigned("configurations.jsonl", b"-seed1", b"-seed0"),
-            "configuration says seed 1, its results 0",
-        ),
-        (resigned("per_view.csv", b"-seed1,", b"-seed9,"), "per_view.csv"),
+        (moved("/config.yaml", "/config.txt"), "cannot be a file of an archive"),
+        (drop("exp/commands.jsonl"), "lacks exp/commands.jsonl"),
+        (moved("exp/courtyard", "exp/../../tmp"), "cannot be a file of an archive"),
+        (moved("exp/courtyard", "exp//tmp"), "cannot be a file of an archive"),
+        (moved("exp/courtyard", "/exp/courtyard"), "cannot be a file of an archive"),
+        (moved("exp/courtyard/", "other/courtyard/"), "cannot be a file of an archive"),
+        (moved("exp/courtyard/", "exp/room/"), "foreign"),
+        (of_trial("results.json", b'"status": "complete"', b'"status": "well"'), "unfinished"),
+        (of_trial("results.json", b"{", b"["), "not JSON"),
+        (of_trial("config.yaml", b"name: adc", b"name: volumetric"), "says densify volumetric"),
+        (of_trial("config.yaml", b"seed: 0", b"seed: 1"), "says seed 1, its results 0"),
+        (of_trial("per_view.csv", b"view000,", b"view009,2"), "per_view.csv"),
         (edit("archive.json", b"{", b"[" * 200_000), "not JSON"),
-        (with_search("../up"), "cannot be the name of an experiment"),
-        (with_search("up", points=3), "searches.jsonl is damaged: points is 3"),
-        (with_unfinished("../../up"), "cannot be the folder of a trial"),
-        (with_unfinished("yard/sfm-adc/strange"), "strange: unfinished"),
-        (with_unfinished("x"), "cannot be the folder of a trial"),
+        (added("../up/tuning.json", {}), "cannot be a file of an archive"),
+        (added("up/tuning.json", search_record([]) | {"points": 3}), "points is 3"),
+        (added("exp/x/config.yaml", {}), "cannot be a file of an archive"),
         (
             edit("archive.json", b'"experiment": "exp"', b'"experiment": "../up"'),
             "cannot be the name of an experiment",
@@ -282,9 +307,9 @@ def test_a_damaged_trial_is_left_out_by_name_and_the_rest_is_exported(
 def test_a_trial_that_failed_forbids_the_same_verdict_in_the_archive(tmp_path, config):
     runs = tmp_path / "runs"
     *_, failed = write_runs(runs, effect={"psnr": 3.0})
-    declare(runs)
+    ask_about(runs)
     (failed / "results.json").unlink()
-    (failed / "failed.json").write_text('{"reason": "out of memory in /home/me/x"}')
+    (failed / "failed.json").write_text('{"message": "out of memory in /home/me/x"}')
     if config == "unreadable":
         (failed / "config.yaml").write_text("[1")
     there = loaded(runs)
@@ -292,7 +317,7 @@ def test_a_trial_that_failed_forbids_the_same_verdict_in_the_archive(tmp_path, c
     back = unpack_archive(tmp_path / "exp.zip", tmp_path / "other")
     assert compare(back).sentences == compare(there).sentences
     assert "1 trial of one arm alone failed, stopped" in compare(back).sentences[0]
-    assert "unfinished" in back.warnings[0]
+    assert "failed, out of memory in x" in back.warnings[0]
     assert b"/home/me" not in b"".join(members(tmp_path / "exp.zip").values())
 
 
@@ -300,7 +325,7 @@ def test_what_a_question_asks_of_pictures_comes_with_the_results(tmp_path, monke
     """Pictures themselves stay out; a trial whose pictures are gone has no such number."""
     runs = tmp_path / "runs"
     first, *_ = write_runs(runs, scenes=("yard",), seeds=(0,), pictures=True)
-    declare(runs, "error_textured")
+    ask_about(runs, metric="error_textured")
     there = {one.key: textured_error(one) for one in loaded(runs).trials}
     (first / "from_pixels.json").unlink(missing_ok=True)
     shutil.rmtree(first / "renders")
@@ -316,9 +341,20 @@ def test_trials_without_a_sound_configuration_are_left_out(tmp_path):
     first, second, *others = write_runs(runs, scenes=("yard",))
     (first / "config.yaml").unlink()
     (second / "config.yaml").write_text("[1]")
-    left_out = write_archive(loaded(runs), tmp_path / "exp.zip")
+    left_out, _ = write_archive(loaded(runs), tmp_path / "exp.zip")
     assert len(unpack_archive(tmp_path / "exp.zip", tmp_path / "other").trials) == len(others)
     assert len(left_out) == 2
+
+
+def test_archives_of_the_first_version_are_read(tmp_path):
+    file = Path(__file__).parents[2] / "findings/archives/schedule.zip"
+    back = unpack_archive(file, tmp_path)
+    assert len(back.trials) == 12
+    assert {trial.scene for trial in back.trials} == {"horns", "lewis"}
+    lines = (json.loads(line) for line in members(file)["results.jsonl"].splitlines())
+    stored = {line["folder"]: line["results"]["metrics"]["psnr"] for line in lines}
+    assert {"/".join(t.path.parts[-3:]): t.metrics["psnr"] for t in back.trials} == stored
+    assert all(len(read_views(trial)) > 1 and trial.config for trial in back.trials)
 
 
 def test_a_pipe_is_no_archive(tmp_path):

@@ -6,11 +6,11 @@ from shlex import split
 import numpy as np
 import pytest
 
-from gsbench.analysis.judgement import Verdict
-from gsbench.analysis.pairing import Pairs
+from gsbench.analysis.pairs import Pairs
 from gsbench.analysis.quantities import asked_quantity
 from gsbench.analysis.results import load_experiment
-from gsbench.analysis.statistics import Answer, StudentT
+from gsbench.analysis.statistics import StudentT
+from gsbench.analysis.verdicts import Verdict
 from gsbench.claims.export import write_archive
 from gsbench.claims.gate import (
     NOT_DECIDED,
@@ -30,17 +30,14 @@ from tests.helpers import refusal
 from tests.trials import write_as, write_runs, write_trial
 
 VALUES = {"eval": {"extra": {}}}
-SCENES = dict.fromkeys(("courtyard", "garden"), ("sfm-adc", "sfm-adc"))
+SCENES = ("courtyard", "garden")
 
 
-def asked(metric="psnr", least="0.1", seeds=4, **scenes):
-    return replace(
-        declare_gate(metric, least, scenes or SCENES, range(seeds), VALUES),
-        time="2020-01-01T00:00:00Z",
-    )
+def asked(metric="psnr", least="0.1", seeds=4):
+    return declare_gate(metric, least, SCENES, range(seeds), VALUES)
 
 
-def trials(runs, effect, noise, seeds=4, scenes=tuple(SCENES)):
+def trials(runs, effect, noise, seeds=4, scenes=SCENES):
     """Trials of one version, whose PSNR is 26 + ``effect`` with that noise (dB)."""
     for scene in scenes:
         for seed in range(seeds):
@@ -56,7 +53,7 @@ def gate(tmp_path, effect, noise, declared=None):
     most = [0]
 
     def run_them(planned):
-        most[0] = max(seed for _, seed in planned) + 1
+        most[0] = max(seed for *_, seed in planned) + 1
 
     found = ask_gate(
         declared or asked(), lambda: old, lambda: [one for one in new if one.seed < most[0]]
@@ -71,7 +68,7 @@ def gate(tmp_path, effect, noise, declared=None):
         (-1.0, 0.01, WORSE, "worse: worse in PSNR (dB) on these scenes: −0.99", 2),
         (1.0, 0.01, PASSED, "passed: better in PSNR", 2),
         (0.01, 0.002, PASSED, "passed: too small to matter in PSNR (dB)", 2),
-        (-0.3, 1.0, NOT_DECIDED, "with 4 of at most 4 seeds", 4),
+        (-0.3, 1.0, NOT_DECIDED, "undecided in PSNR", 4),
         (0.0, 1.0, PASSED, "equal to the last bit in all 4 pairs of trials", 2),
     ],
 )
@@ -84,11 +81,10 @@ def test_the_gate_passes_fails_or_stays_undecided_by_effect_and_noise(
 
 
 def test_a_version_that_is_shown_not_to_be_worse_passes_even_if_undecided(tmp_path):
-    verdict, most = gate(tmp_path, 0.25, 0.02, asked(least="0.35"))
+    verdict, most = gate(tmp_path, 0.05, 0.05, asked(least="0.35"))
     assert (verdict.outcome, result_of(verdict)) == ("undecided", PASSED)
-    assert "not worse by 0.35 in PSNR" in describe(verdict)
+    assert "not worse by 0.35" in describe(verdict)
     assert most < 4
-    assert result_of(replace(verdict, rests_on_outlying=True)) == NOT_DECIDED
 
 
 @pytest.mark.parametrize(
@@ -102,9 +98,8 @@ def test_a_version_that_is_shown_not_to_be_worse_passes_even_if_undecided(tmp_pa
     ],
 )
 def test_an_interval_that_reaches_the_least_loss_that_matters_does_not_pass(sign, mean, result):
-    question = replace(asked().questions[0], sign=sign)
-    answer = Answer(mean, StudentT(mean, 0.0, 3.0), 0.05, 0.05, 0.05)
-    undecided = Verdict(question, asked_quantity("psnr"), Pairs(()), answer=answer)
+    question, test = replace(asked(), sign=sign), StudentT(mean, 0.0, 3.0)
+    undecided = Verdict(question, asked_quantity("psnr"), Pairs(()), "answered", 0.05, test=test)
     assert result_of(undecided) == result
 
 
@@ -114,7 +109,6 @@ def test_a_look_waits_for_every_scene_even_if_the_first_is_equal(tmp_path):
     (verdict,) = ask_gate(asked(), lambda: old, lambda: garden).verdicts()
     assert not verdict.final
     assert result_of(verdict) == NOT_DECIDED
-    assert "trials are missing" in describe(verdict)
 
 
 def test_the_code_may_differ_and_the_baseline_may_be_older_than_the_question(tmp_path):
@@ -125,12 +119,10 @@ def test_the_code_may_differ_and_the_baseline_may_be_older_than_the_question(tmp
     old = made_by(trials(tmp_path / "a", 0, 0.01), "one", 2019)
     new = made_by(trials(tmp_path / "b", -1, 0.01), "two", 2021)
     (verdict,) = ask_gate(asked(), lambda: old, lambda: new).verdicts()
-    assert (result_of(verdict), verdict.seen) == (WORSE, ())
-    (other,) = ask_gate(asked(), lambda: new, lambda: old).verdicts()
-    assert len(other.seen) == 8
+    assert result_of(verdict) == WORSE
     mixed = [*new[:1], *made_by(new[1:], "three", 2021)]
     (refused,) = ask_gate(asked(), lambda: old, lambda: mixed).verdicts()
-    assert "different versions" in str(refused.notes[0])
+    assert "different versions" in str(refused.untestable)
     assert result_of(refused) == NOT_DECIDED
 
 
@@ -162,8 +154,8 @@ def test_questions_that_cannot_be_judged_are_refused():
             asked(*words)
     with refusal("needs at least 2 seeds, and there is 1"):
         asked(seeds=1)
-    assert asked("gaussians", "10%").questions[0].sign == -1
-    assert asked(least=None).questions[0].least == 0.1
+    assert asked("gaussians", "10%").sign == -1
+    assert asked(least=None).least == 0.1
 
 
 @pytest.mark.parametrize(
@@ -198,7 +190,7 @@ def test_the_exit_code_of_gate_is_its_result(
 ):
     trained = []
 
-    def train(planned):
+    def train(planned, asks):
         for trial in planned:
             trained.append(trial.values["seed"])
             write_as(trial, psnr=26 + effect + 0.001 * trained[-1])
@@ -230,7 +222,7 @@ def test_the_exit_code_of_gate_is_its_result(
     ],
 )
 def test_exit_codes_under_git_bisect_run(runs, tmp_path, monkeypatch, words, effect, code):
-    def train(planned):
+    def train(planned, asks):
         if effect is None:
             raise InputError("densify._target_=mine.Mine cannot be imported")
         for trial in planned:

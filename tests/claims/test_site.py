@@ -12,25 +12,21 @@ from gsbench.claims.archive import unpack_archive
 from gsbench.claims.export import write_archive
 from gsbench.claims.site import _by_quantity, _unique_key
 from gsbench.cli import run
-from gsbench.runs.experiments import Question, declared_now
-from tests.analysis.helpers import loaded, trials_of, write_declared
+from tests.analysis.helpers import loaded, trials_of
 from tests.claims.test_archive import rewrite
 from tests.helpers import refusal
 from tests.markup import Page
-from tests.trials import write_runs
+from tests.trials import ask_about, write_runs
 from tests.view.browser import Browser
 
 HOSTILE = "<img src=x onerror=alert(1)>&\"'"
-CLAIM = {"courtyard": ("courtyard/sfm-adc/c0ffee00", "courtyard/sfm-volumetric/c0ffee00")}
 
 
-def archive(tmp_path, experiment="exp", claim="", **plan):
-    """The archive of made-up trials, with a declared claim of that name."""
+def archive(tmp_path, experiment="exp", **plan):
+    """The archive of made-up trials, with a question about them."""
     runs, file = tmp_path / f"runs-{experiment}", tmp_path / f"{experiment}.zip"
     write_runs(runs, experiment=experiment, **plan)
-    if claim:
-        question = Question(metric="psnr", least=0.1, scenes=CLAIM, seeds=(0, 1, 2), name=claim)
-        write_declared(runs, declared_now(questions=(question,)), experiment=experiment)
+    ask_about(runs, experiment=experiment)
     write_archive(load_experiment(runs, experiment), file, plan.get("pictures", False))
     return file
 
@@ -41,13 +37,13 @@ def site(tmp_path, *archives):
 
 
 def test_the_first_page_has_arms_scenes_claims_and_working_links(tmp_path):
-    files = archive(tmp_path, claim="sharper"), archive(tmp_path, "other", effect={"psnr": 2})
+    files = archive(tmp_path), archive(tmp_path, "other", effect={"psnr": 2})
     page = site(tmp_path, *files)
     found = Page(page)
     for words in (
         "PSNR (dB)",
         "better in",
-        *split("courtyard garden sfm volumetric sharper paper-1"),
+        *split("courtyard garden sfm volumetric paper-1"),
     ):
         assert words in found.text
     for _, attributes in found.elements:
@@ -113,7 +109,7 @@ def test_an_archive_of_too_many_bytes_is_neither_written_nor_read(tmp_path, monk
 
 def test_html_in_texts_of_a_stranger_is_escaped(tmp_path):
     def spoil(content):
-        for name in ("results.jsonl", "configurations.jsonl", "declared.jsonl"):
+        for name in ("results.jsonl", "configurations.jsonl"):
             lines = [json.loads(line) for line in content[name].splitlines()]
             for line in lines:
                 if "results" in line:
@@ -124,7 +120,7 @@ def test_html_in_texts_of_a_stranger_is_escaped(tmp_path):
                     line["configuration"]["densify"][HOSTILE] = HOSTILE
             content[name] = "".join(json.dumps(line) + "\n" for line in lines).encode()
 
-    file = archive(tmp_path, claim=HOSTILE)
+    file = archive(tmp_path)
     rewrite(file, spoil, resigned=True)
     page = site(tmp_path, file)
     pages = [page, (tmp_path / "site/reports/exp.html").read_text()]

@@ -19,7 +19,7 @@ from gsbench.config.overrides import value_text
 from gsbench.config.permissions import permission_advice
 from gsbench.config.trust import ADDRESS_VARIABLES, check_permissions, foreign_address
 from gsbench.errors import InputError
-from gsbench.launch.record import add_to_plan
+from gsbench.launch.record import record
 from gsbench.runs.ledger import Ended, Opened, Started, append, begin_ledger
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.install import conf_dir
@@ -102,19 +102,9 @@ def test_a_choice_that_leaves_its_groups_folder_is_refused(refused):
     assert "Parent traversal ('..')" in refused(f"+experiment={outside}")
 
 
-def _claims(settings):
-    """A stranger's file of claims, and the commands that read it."""
-    claim = {"id": "a", "says": "s", "where": "w", "baseline": "adc", "arm": "mcmc"}
-    claim |= {"metric": "psnr", "direction": "higher", "least": 1, "refuted_if": "not"}
-    file = {"name": "x", "paper": "p", "seeds": 4, "scenes": {"courtyard": {}}, "claims": [claim]}
-    file |= {"arms": {"adc": {}, "mcmc": {}}, "settings": settings}
-    Path("claims.yaml").write_text(yaml.safe_dump(file))
-    return [["check", "claims.yaml"], ["check", "claims.yaml", "--dry-run"]]
-
-
 def _plan(settings):
     (trial,) = compose_trials(["name=x"])
-    add_to_plan([Trial(trial.values, ("name=x", *_words(settings)))])
+    record([Trial(trial.values, ("name=x", *_words(settings)))], asks=False)
     return [["retry", "x"], ["retry", "x", "--dry-run"], ["retry", "x", "allow_targets=[other]"]]
 
 
@@ -148,7 +138,6 @@ def _experiment(settings):
 
 
 FILES = {
-    "claims": _claims,
     "plan": _plan,
     "ledger": _ledger,
     "config.yaml": _configuration,
@@ -182,7 +171,7 @@ def test_no_file_of_a_stranger_decides_what_runs_and_where_results_go(
     for variable in ADDRESS_VARIABLES:
         monkeypatch.delenv(variable, raising=False)
     settings, said = STRANGE[case]
-    for function in ("verbs.ledger.run_trials", "app.command.run_batch", "verbs.check.run_batch"):
+    for function in ("verbs.ledger.run_trials", "app.command.run_batch"):
         monkeypatch.setattr(f"gsbench.{function}", no_trial)
     commands = FILES[file](settings)
     for words in commands if case == "an address" else commands[:1]:
@@ -235,8 +224,8 @@ def test_a_plan_gives_no_permission_and_no_folder_of_modules(place, monkeypatch,
     theirs.mkdir()
     (theirs / "mine.py").write_text(f"open({str(place / 'exploded')!r}, 'w')\nclass Mine: ...\n")
     words = split("name=x densify=adc densify._target_=mine.Mine seed=0,1")
-    add_to_plan(compose_trials([*words, "allow_targets=[mine]"], multirun=True))
-    plan = place / "runs/x/plan.json"
+    record(compose_trials([*words, "allow_targets=[mine]"], multirun=True), asks=False)
+    plan = place / "runs/x/commands.jsonl"
     strange = plan.read_text().replace(f'"cwd": "{place}"', f'"cwd": "{theirs}"')
     assert str(theirs) in strange
     assert "allow_targets=[mine]" in strange
@@ -255,8 +244,8 @@ def test_a_plan_gives_no_permission_and_no_folder_of_modules(place, monkeypatch,
 
 
 def test_a_plan_reaches_no_other_experiment(place, refused):
-    add_to_plan(compose_trials(["name=x", "seed=0,1"], multirun=True))
-    plan = place / "runs/x/plan.json"
+    record(compose_trials(["name=x", "seed=0,1"], multirun=True), asks=False)
+    plan = place / "runs/x/commands.jsonl"
     plan.write_text(plan.read_text().replace("name=x", "name=mine"))
     for words in (["retry", "x"], ["retry", "x", "--dry-run"]):
         assert "is planned as a trial of mine, not of x" in refused(*words)
@@ -270,8 +259,8 @@ def test_a_plan_gives_no_folder_for_packages_of_settings(place, monkeypatch):
         (place / f"{folder}/conf_of_mine").mkdir(parents=True)
         (place / f"{folder}/conf_of_mine/__init__.py").write_text(line)
     monkeypatch.chdir(place)
-    add_to_plan(compose_trials(["name=x", "seed=0,1"], multirun=True))
-    plan = place / "runs/x/plan.json"
+    record(compose_trials(["name=x", "seed=0,1"], multirun=True), asks=False)
+    plan = place / "runs/x/commands.jsonl"
     content = read_json(plan)
     for planned in content["trials"].values():
         planned |= {

@@ -33,7 +33,7 @@ def test_a_composed_arm_has_each_option_of_its_class(cls):
 @pytest.mark.parametrize("path", FILES)
 def test_a_file_states_no_default_again(path):
     """Without a key that a file states, other values are composed, or the same by a reference."""
-    group, name = path.split("/")
+    group, _ = path.split("/")
     stated = _read(path)
     known = _known(group, stated.get("defaults", []))
     for key, value in stated.items():

@@ -4,19 +4,14 @@ import os
 import random
 import re
 import signal
-import subprocess
-import sys
 import time
 from shlex import split
 
 import pytest
-import yaml
 
-from tests.claims.test_check import content
 from tests.end_to_end.conftest import SMALL, SWEEP, results_of
-from tests.helpers import read_json, write
-from tests.launch.test_declare import TINY
-from tests.processes import bytes_written, completed
+from tests.helpers import read_json
+from tests.processes import bytes_written
 
 pytestmark = [
     pytest.mark.slow,
@@ -206,47 +201,3 @@ def test_a_killed_tuning_continues_and_its_values_are_trained(gsbench, start, tm
     sheet = gsbench("tables small --layout fairness")
     assert sheet.stdout.count("the best of 2 points by psnr of validation views") == 2
     assert "tuning was unequal" not in sheet.stdout
-
-
-def page_of(runs):
-    """The lines of the page without the time of the declaration, and without times and memory."""
-    lines = (runs / "check_it/claims.html").read_text().splitlines()
-    assert sum(" were declared " in line for line in lines) == 1
-    measured = (" were declared ", "seconds of training</th>", "memory (MB)</th>")
-    assert all(sum(words in line for line in lines) == 1 for words in measured)
-    return [line for line in lines if not any(words in line for words in measured)]
-
-
-def count_done(runs):
-    return len(list(runs.glob("check_it/*/*/*/results.json")))
-
-
-def test_a_killed_check_continues_and_ends_with_the_same_page(tmp_path):
-    words = dict(word.split("=", 1) for word in TINY)
-    settings = {key: yaml.safe_load(value) for key, value in words.items()}
-    claim = content()["claims"][0] | {"baseline": "few", "arm": "many"}
-    arms = {"few": {"init.count": 200}, "many": {"init.count": 300}}
-    claims = tmp_path / "claims.yaml"
-    write(claims, content() | {"settings": settings, "arms": arms, "claims": [claim], "seeds": 2})
-    whole, killed = tmp_path / "whole", tmp_path / "killed"
-    check = [sys.executable, "-m", "gsbench.cli", "check", str(claims)]
-
-    def complete(runs):
-        completed(check, env=os.environ | {"GSBENCH_RUNS": str(runs)}, timeout=2 * PATIENCE)
-
-    complete(whole)
-
-    for trials in (1, 3):  # in the middle of the first look, and once more before its last trial
-        process = subprocess.Popen(check, env=os.environ | {"GSBENCH_RUNS": str(killed)})
-        until = time.monotonic() + PATIENCE
-        while count_done(killed) < trials and time.monotonic() < until and process.poll() is None:
-            time.sleep(0.02)
-        process.kill()
-        assert process.wait() == -signal.SIGKILL
-        assert count_done(killed) >= trials
-        assert not (killed / "check_it/claims.html").exists()
-    before = {path: path.read_bytes() for path in killed.glob("check_it/*/*/*/results.json")}
-    complete(killed)
-    assert page_of(killed) == page_of(whole)
-    assert all(path.read_bytes() == content for path, content in before.items())  # done once
-    assert len((killed / "check_it/declared.jsonl").read_text().splitlines()) == 1

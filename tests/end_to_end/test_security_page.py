@@ -13,7 +13,6 @@ import torch
 
 from gsbench.cli import run
 from gsbench.errors import InputError
-from gsbench.runs.seen import seen_path
 from gsbench.runs.store import read_manifest
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.jit import cache_base
@@ -83,12 +82,11 @@ VERB_ROWS = {
         COMMIT,
         "config/test_trust.py::test_code_that_a_file_names_is_not_run",
     ),
-    "`check`, `ledger`, `retry`": (
-        [["check", str(CLAIMS), "--dry-run"], ["retry", FINISHED]],
+    "`ledger`, `retry`": (
+        [["retry", FINISHED]],
         COMMIT,
         "config/test_permissions.py::test_no_file_of_a_stranger_decides_what_runs_and_where_results_go",
     ),
-    "`check --from`": ([["check", "--from", "a.zip", str(CLAIMS)]], set(), ""),
     "`gate`": ([["export", "--results", "tiny"], GATE], COMMIT, ""),
     "`tables`, `report`, `explain`, `plan`, `site`": (
         [
@@ -293,13 +291,9 @@ def store(trial, shown):
 def plans(trial, shown):
     home = trial.parents[2]
     before = shown()
-    plan = json.loads((home / "plan.json").read_text())
-    for planned in plan["trials"].values():
-        planned["time"] = 1
-    (home / "plan.json").write_text(json.dumps(plan))
-    assert shown() == before
-    seen_path(home).write_text("")
-    assert shown()["tables"] == before["tables"]
+    lines = (home / "commands.jsonl").read_text().splitlines()
+    (home / "commands.jsonl").write_text("\n".join([lines[0].replace("cwd", "CWD"), *lines[1:]]))
+    assert "commands.jsonl" in shown()["tables"] or shown() != before
 
 
 # rows whose tests are where their files are made
@@ -312,7 +306,7 @@ HERE = {
     "`metrics.jsonl`, `events.jsonl`, `volume_histograms.jsonl`": curves,
     "pictures of a trial": pictures,
     "`store/`: results of stages and prepared views": store,
-    "`declared.jsonl`, `plan.json`, `tuning.json`, `.seen/`": plans,
+    "`commands.jsonl`, `tuning.json`": plans,
 }
 
 

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsbench.errors import InputError
-from gsbench.eval.pictures import match_by_order, match_pictures
+from gsbench.eval.matching import match_by_order, match_pictures
 from tests.helpers import refusal
 
 PHOTOGRAPHS = ["DSC08000.JPG", "DSC08008.JPG", "DSC08016.JPG"]
@@ -89,8 +89,10 @@ def test_missing_and_ambiguous_pictures_are_refused(photographs, pictures, words
 
 
 def test_matching_by_order_sorts_numbers_by_value():
-    found = match_by_order(["a1.png", "a2.png", "a10.png"], ["10.png", "0.png", "9.png"])
-    assert found.pairs == {"a1.png": "0.png", "a2.png": "9.png", "a10.png": "10.png"}
+    found = match_by_order(["a01.png", "a02.png", "a10.png"], ["10.png", "0.png", "9.png"])
+    assert found.pairs == {"a01.png": "0.png", "a02.png": "9.png", "a10.png": "10.png"}
+    with refusal("a1.png, a10.png, a2.png as text and a1.png, a2.png, a10.png by number"):
+        match_by_order(["a1.png", "a2.png", "a10.png"], ["0.png", "1.png", "2.png"])
     with refusal("2 pictures for 3 photographs"):
         match_by_order(["a", "b", "c"], ["1", "2"])
 

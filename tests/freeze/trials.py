@@ -144,10 +144,10 @@ def pairs_of(runs):
 
     found = {}
     for answer in compare(load_experiment(runs, "exp")).answers:
-        for verdict in answer.verdicts:
-            test = verdict.answer.test if verdict.answer else None
+        for verdict in (answer.verdict, *answer.metrics):
+            test = verdict.test
             pairs = verdict.pairs
-            name = f"{answer.second} - {answer.first}, {verdict.quantity.name}"
+            name = f"{answer.arm} - {answer.baseline}, {verdict.quantity.name}"
             found[name] = {
                 "shape": list(pairs.differences.shape),
                 "mean": rounded(verdict.mean),

@@ -33,8 +33,7 @@ from gsbench.launch import states
 from gsbench.launch.dry_run import FinishedTrials
 from gsbench.launch.states import states_of_experiment
 from gsbench.parsing import read_if_sound
-from gsbench.runs.experiments import read_declarations
-from gsbench.runs.plan import read_plan
+from gsbench.runs.commands import read_history
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.tracking.sinks import Run
 from gsbench.tracking.trial import TrackedTrial
@@ -50,6 +49,7 @@ NAMES = (
     "results.json",
     "config.yaml",
     "plan.json",
+    "commands.jsonl",
     "declared.jsonl",
     "metrics.jsonl",
     "events.jsonl",
@@ -177,11 +177,19 @@ def write_original(runs):
         },
     ]
     write_lines(home / "declared.jsonl", declared)
+    words = {"words": ["seed=0"], "cwd": str(runs), "time": 1.0}
+    write_lines(
+        home / "commands.jsonl",
+        [words | {"trials": {name: {"words": ["seed=0"]} for name in places}}],
+    )
     tuning = search_record([{"settings": {"densify.volume_threshold": 0.03}, "value": 20.0}])
     ranges = {"densify.volume_threshold": "0.01,0.03"}
     write(home / "tuning.json", tuning | {"sweep": home.name, "ranges": ranges})
     places_of = {name: done / name for name in NAMES}
-    places_of |= {name: home / name for name in ("plan.json", "declared.jsonl", "tuning.json")}
+    places_of |= {
+        name: home / name
+        for name in ("plan.json", "commands.jsonl", "declared.jsonl", "tuning.json")
+    }
     places_of |= {
         name: failed / name for name in ("failed.json", "building.json", ".submitted.json")
     }
@@ -285,9 +293,8 @@ def look(runs, places):
     attempt(tables)
     attempt(lambda: explain_cell(f"{EXPERIMENT}:courtyard:psnr:adc", runs))
     attempt(lambda: "\n".join(lines_of(states_of_experiment(home), with_done=True)).encode())
-    attempt(lambda: read_plan(home))
+    attempt(lambda: read_history(home))
     attempt(lambda: FinishedTrials(runs).estimate(values_of(runs, "adc", 0, 0.03)))
-    attempt(lambda: read_declarations(home))
     attempt(lambda: search_summary(home))
     for folder in {path.parent for path in places.values()} - {home}:
         attempt(lambda folder=folder: TrialFolder(folder).configuration())

@@ -12,7 +12,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from shlex import split
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import submitit
@@ -22,7 +21,6 @@ from gsbench.files import DiskFullError
 from gsbench.launch import jobs
 from gsbench.launch import slurm as slurm_jobs
 from gsbench.launch.jobs import (
-    Outcome,
     TrialJob,
     check_job_links,
     collect,
@@ -30,7 +28,9 @@ from gsbench.launch.jobs import (
     new_job_folder,
     run_one,
 )
+from gsbench.launch.outcomes import Outcome
 from gsbench.launch.states import QueuedJob, current_user, read_submission, record_submission
+from gsbench.runs.commands import digest_of
 from gsbench.runs.config_hash import config_hash
 from gsbench.system.locks import BusyError
 from gsbench.system.stopping import Stopped
@@ -57,7 +57,7 @@ class Mirrored:
     """Stands in for a `Mirror`, and keeps what it follows."""
 
     def __init__(self, idle=False):
-        self.idle, self.followed = idle, list[tuple[Path, Any]]()
+        self.idle, self.followed = idle, list[Path]()
 
     def __enter__(self):
         return self
@@ -65,8 +65,11 @@ class Mirrored:
     def __exit__(self, *error):
         pass
 
-    def follow(self, folder, settings):
-        self.followed.append((folder, settings))
+    def follow(self, folder, values):
+        self.followed.append(folder)
+
+    def trial_ended(self):
+        pass
 
 
 def job(folder, name):
@@ -103,7 +106,7 @@ def test_an_error_of_a_trial_becomes_its_outcome_unless_it_concerns_all(tmp_path
     ):
         outcome = run_one(failing, mirror, wait=True)
         assert outcome == Outcome(failing.folder, "failed", message, bad_input)
-    assert mirror.followed == [(failing.folder, {"sink": "of 0"})] * 3
+    assert mirror.followed == [failing.folder] * 3
     for raised in (BusyError("later"), DiskFullError("full"), KeyboardInterrupt()):
         with pytest.raises(type(raised)):
             run_one(failing, mirror, wait=True)
@@ -155,7 +158,7 @@ def test_the_files_of_a_trial_tell_how_its_job_ended(tmp_path):
     assert "; its last lines: RuntimeError: no luck; log:" in collected(tmp_path).message
     failure = json.dumps({"message": "no scene\nat all", "bad_input": True})
     outcome = collected(tmp_path, failure)
-    assert (outcome.message, outcome.bad_input) == (f"no scene; log: {log}", True)
+    assert (outcome.message, outcome.bad_input) == (rf"no scene\nat all; log: {log}", True)
     # what it lacks could not be computed a moment ago either
     assert collected(tmp_path, results="kept").status == "done"
     (trial(tmp_path).folder / "failed.json").unlink()
@@ -254,7 +257,9 @@ def test_a_job_gets_the_search_path_and_the_gpus_of_its_sweep(tmp_path, monkeypa
     monkeypatch.setattr(jobs, "allowed_modules", lambda: {"mine": "/there"})
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3")
     one = trial(tmp_path)
-    assert jobs.job_of(one) == TrialJob(one.values, ["a", "b"], {"mine": "/there"}, "3")
+    assert jobs.job_of(one) == TrialJob(
+        one.values, ["a", "b"], {"mine": "/there"}, "3", digest_of(one.values)
+    )
 
 
 class Jobs:
@@ -309,7 +314,7 @@ def test_local_jobs_run_as_many_at_once_as_asked(tmp_path, monkeypatch, caplog, 
     assert executor.most == 2
     assert pauses == [1.0]  # whenever none has ended
     assert [one.folder for one in outcomes] == [trials[k].folder for k in (2, 0, 1, 3)]
-    assert [settings["sink"] for _, settings in mirror.followed] == ["of 0", "of 2", "of 1", "of 3"]
+    assert [folder.name[-1] for folder in mirror.followed] == ["0", "2", "1", "3"]
     assert executor.parameters == {"timeout_min": limit}
     assert caplog.messages[0] == ("4 trials, 2 at once; to see how far they are: gsbench status x")
     assert caplog.messages[1].startswith(f"{trials[2].files.label}: the process ended without")

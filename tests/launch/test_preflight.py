@@ -15,9 +15,8 @@ from gsbench.launch.batch import (
     need_no_check,
     run_batch,
 )
-from gsbench.launch.jobs import Outcome
-from gsbench.runs.experiments import read_declarations
-from gsbench.runs.plan import read_plan
+from gsbench.launch.outcomes import Outcome
+from gsbench.runs.commands import read_history
 from tests.helpers import refusal
 from tests.launch.test_jobs import SLURM, Mirrored
 from tests.trials import LOCAL, bare_trial, write_results
@@ -96,9 +95,7 @@ def test_unfinished_trials_go_to_their_launcher_once_checked_and_planned(
     assert (done.folder, done.status, done.message) == (one.folder, "done", "psnr 20.5")
     assert (failed.folder, failed.status) == (two.folder, "failed")
     assert called == [("check_parts", [1], 0, launch is not SLURM), (launcher, [1], mirrors)]
-    assert set(read_plan(runs / "x")) == {one.folder, two.folder}
-    (declared,) = read_declarations(runs / "x")
-    assert list(declared.planned.values()) == [(0, 1)]
+    assert set(read_history(runs / "x").planned) == {one.folder, two.folder}
     assert not left.exists()
     called.clear()
     run_batch([one])
@@ -125,7 +122,7 @@ def test_what_is_missing_here_matters_unless_the_trials_run_elsewhere(tmp_path, 
     write_results(one.folder, one.values)
     with refusal("no such folder"):  # wrong even if all trials are done
         run_batch([one])
-    with refusal("declare eval"):
+    with refusal("name eval.primary"):
         run_batch([trial(tmp_path / "new", eval={"primary": name}) for name in ("psnr", "ssim")])
     assert not (tmp_path / "new").exists()
     called.clear()

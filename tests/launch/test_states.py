@@ -11,7 +11,7 @@ import pytest
 from gsbench.config.compose import Trial
 from gsbench.launch import states
 from gsbench.launch.dry_run import FinishedTrials, _determining, describe_plan
-from gsbench.launch.record import add_to_plan, remove
+from gsbench.launch.record import record, remove
 from gsbench.launch.states import (
     QueuedJob,
     current_user,
@@ -19,7 +19,7 @@ from gsbench.launch.states import (
     record_submission,
     states_of_experiment,
 )
-from gsbench.runs.plan import PlanFile, PlannedTrial, read_plan
+from gsbench.runs.commands import Command, PlannedTrial, append, read_history
 from gsbench.system.locks import hold
 from tests.helpers import read_json, refusal, write, write_lines
 from tests.tracking.helpers import options
@@ -97,9 +97,8 @@ def test_the_state_of_a_submitted_trial_is_that_of_its_job(
     (one.folder / "config.yaml").unlink()
     if state == "partial":  # it was only planned
         assert states_of_experiment(tmp_path / "x") == []
-        planned = PlannedTrial(overrides=("a=1",), cwd="", time=5)
-        record = PlanFile(trials={"/".join(one.folder.parts[-3:]): planned})
-        write(tmp_path / "x/plan.json", record.to_json())
+        trials = {"/".join(one.folder.parts[-3:]): PlannedTrial(words=("a=1",))}
+        append(tmp_path / "x", lambda _: Command(words=(), cwd="", time=5, trials=trials))
         (found,) = states_of_experiment(tmp_path / "x")
         assert (found.state, found.since) == ("missing", 5)
         assert found.note == "never started; Slurm job 7_1 has ended, log: a.log"
@@ -167,12 +166,15 @@ def test_a_failed_trial_is_superseded_by_one_with_its_settings_that_got_further(
 
 
 def test_removed_trials_leave_the_plan_and_links_stay(tmp_path):
-    gone, linked = (Trial(one.values, ("seed=1",)) for one in (begun(tmp_path), begun(tmp_path, 1)))
-    add_to_plan([gone, linked, begun(tmp_path, 2)])  # the last one has no overrides
-    assert set(read_plan(tmp_path / "x")) == {gone.folder, linked.folder}
+    gone, linked = (
+        Trial(one.values | {"eval": {}}, ("seed=1",))
+        for one in (begun(tmp_path), begun(tmp_path, 1))
+    )
+    record([gone, linked, begun(tmp_path, 2)], asks=False)  # the last one has no overrides
+    assert set(read_history(tmp_path / "x").planned) == {gone.folder, linked.folder}
     remove(tmp_path / "x", iter([gone.folder]))
     assert not gone.folder.exists()
-    assert list(read_plan(tmp_path / "x")) == [linked.folder]
+    assert list(read_history(tmp_path / "x").planned) == [linked.folder]
     elsewhere = linked.folder.rename(tmp_path / "elsewhere")
     linked.folder.symlink_to(elsewhere)
     with refusal("is a link"):
@@ -191,14 +193,6 @@ def test_a_trial_whose_removal_fails_does_not_look_finished(tmp_path, monkeypatc
         remove(tmp_path / "x", [trial.folder])
     assert trial.folder.is_dir()
     assert not (trial.folder / "results.json").exists()
-
-
-@pytest.mark.parametrize("name", ["scene/arm", "scene/arm/trial/more", "scene/../trial"])
-def test_a_plan_names_folders_of_trials_alone(tmp_path, caplog, name):
-    planned = {"overrides": [], "cwd": "", "time": 0}
-    write(tmp_path / "plan.json", {"trials": {name: planned}})
-    assert read_plan(tmp_path) == {}
-    assert "it is not a folder of a trial" in caplog.text
 
 
 def test_an_unfinished_trial_takes_the_rest_of_its_time(tmp_path):

@@ -19,13 +19,13 @@ from gsbench.files import DiskFullError
 from gsbench.launch import dry_run, jobs
 from gsbench.launch.batch import run_batch
 from gsbench.launch.dry_run import FinishedTrials, describe_plan
-from gsbench.launch.jobs import Outcome
-from gsbench.launch.record import add_to_plan
+from gsbench.launch.outcomes import Outcome
+from gsbench.launch.record import record
 from gsbench.launch.states import states_of_experiment
 from gsbench.logs import set_up_logging
+from gsbench.runs.commands import drop, read_history
 from gsbench.runs.config_hash import config_hash
 from gsbench.runs.keys import TRAIN, Step
-from gsbench.runs.plan import change_plan, read_plan
 from gsbench.runs.store import Store
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import BusyError, hold
@@ -275,11 +275,13 @@ def test_a_dry_run_checks_only_what_can_be_computed_now(runs, monkeypatch, missi
 
 def test_the_plan_keeps_requested_trials_and_status_lists_missing_ones(runs):
     trials = compose_trials(["name=x", "densify=adc", "seed=0,1,2,3"], multirun=True)
-    add_to_plan(trials[:2])
-    add_to_plan(trials)
+    record(trials[:2], asks=False)
+    record(trials, asks=False)
     folders = [TrialFolder.of(trial.values).path for trial in trials]
-    assert list(read_plan(runs / "x")) == folders
-    assert compose_one(read_plan(runs / "x")[folders[1]].overrides).values == trials[1].values
+    assert list(read_history(runs / "x").planned) == folders
+    assert (
+        compose_one(read_history(runs / "x").planned[folders[1]].words).values == trials[1].values
+    )
     finish(trials[0].values)
     for folder in folders[1:3]:
         write(folder / "config.yaml", "")
@@ -292,19 +294,8 @@ def test_the_plan_keeps_requested_trials_and_status_lists_missing_ones(runs):
     assert f"process {os.getpid()}" in states[2][1]
     assert states[3] == ("missing", "never started")
     assert states_of_experiment(runs / "x")[2].state == "partial"
-    change_plan(runs / "x", dropped=[folders[3]])
+    drop(runs / "x", [folders[3]])
     assert len(states_of_experiment(runs / "x")) == 3
-
-
-def test_a_damaged_plan_is_named_and_the_next_command_repairs_it(runs, caplog):
-    (runs / "x").mkdir(parents=True)
-    (runs / "x/plan.json").write_text("{")
-    assert read_plan(runs / "x") == {}
-    assert states_of_experiment(runs / "x") == []
-    assert "left out: " in caplog.text
-    add_to_plan([bare_trial(runs, words=["seed=0"])])
-    assert "plan.json is not JSON" in caplog.text
-    assert len(read_plan(runs / "x")) == 1
 
 
 def test_dry_run_tells_states_and_time(runs):
@@ -348,7 +339,7 @@ def fake_trial(monkeypatch):
             raise error
         folder = TrialFolder.of(trial.values).path
         if error is not None and not isinstance(error, BusyError):
-            from gsbench.launch.jobs import outcome_of_error
+            from gsbench.launch.outcomes import outcome_of_error
 
             return outcome_of_error(folder, error)
         finish(trial.values)
@@ -406,8 +397,8 @@ def test_verbs_that_write_report_storage_errors_in_one_line(number, runs, monkey
     def refuse(*arguments):
         raise OSError(number, os.strerror(number), str(runs / "x/plan.json"))
 
-    add_to_plan([bare_trial(runs, words=["seed=0"])])
-    monkeypatch.setattr("gsbench.runs.plan.write_json", refuse)
+    record([bare_trial(runs, words=["seed=0"])], asks=False)
+    monkeypatch.setattr("gsbench.runs.commands.append", refuse)
     said = refused("status", "x", "--forget")
     assert len(said.splitlines()) == 1
     assert "plan.json" in said
@@ -425,7 +416,7 @@ def test_finished_trials_are_found_in_a_read_only_folder(runs, monkeypatch):
     for name in (
         "gsbench.files.TemporaryDirectory",
         "gsbench.files.atomic",
-        "gsbench.launch.record.hold",
+        "gsbench.launch.record.append",
     ):
         monkeypatch.setattr(name, refuse)
     (outcome,) = run_batch(trials)

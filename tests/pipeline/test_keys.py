@@ -34,6 +34,8 @@ KEYS = [
 
 
 class BareSource(CaptureSource):
+    step = None
+
     def read(self, made):
         return BARE
 

@@ -11,11 +11,9 @@ from gsbench.config.compose import compose_one
 from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER, REPORT_FILE
 from gsbench.pipeline.trial import cloud_hash, results_of, source_files, versions
 from gsbench.raster.reference import ReferenceRasterizer
-from gsbench.runs.experiments import Declaration, Question, open_question, record_text
 from gsbench.runs.keys import EVALUATE, INIT, STAGES, TRAIN, Step
 from gsbench.runs.nested import sha256_of
 from gsbench.runs.store import Store
-from gsbench.runs.trial_folder import TrialFolder
 from gsbench.scene.types import Capture
 from gsbench.train.proof import Proven
 from tests.helpers import write
@@ -75,7 +73,9 @@ def made(tmp_path, tiny_scene):
         steps = [Step(stage, inputs, partial(write_all, own)) for stage, own in files.items()]
         entries = {step.stage.name: store.get(step) for step in steps}
         raster = Proven(ReferenceRasterizer())
-        return results_of(values, capture, scene, raster, entries, {"train": "2", "init": "1"})
+        return results_of(
+            values, capture, scene, raster, entries, {"train": "2", "init": "1"}, ["a"]
+        )
 
     make.values = values
     return make
@@ -108,7 +108,7 @@ def test_results_combine_the_results_of_the_steps(made):
         "causes": {"initial": 5},
         "evaluated_from": None,
         "trained_by": None,
-        "declared": None,
+        "questions": ["a"],
     }
     assert {name: getattr(found, name) for name in expected} == expected
     assert found.seconds.keys() == {"init", "train", "evaluate", "compile"}
@@ -136,19 +136,6 @@ def test_unknown_costs_are_unavailable(made, changes, evaluated_from, raster, un
     assert found.unavailable.keys() == {"flip"} | unknown
     assert ("train" in found.seconds) == timed
     assert (found.trained_by is None) == ("trained_by" not in changes)
-
-
-def test_results_repeat_the_newest_declaration_of_the_metric(made):
-    home = TrialFolder.of(made.values).home
-    home.mkdir(parents=True)
-    times = [f"2026-01-01T0{hour}:00:00Z" for hour in range(4)]
-    asked = [(open_question("psnr"),), (open_question("psnr"),), (open_question("ssim"),)]
-    claimed = Declaration(time=times[3], questions=(Question(metric="psnr", name="a claim"),))
-    declared = [
-        Declaration(time=when, questions=own) for when, own in zip(times[:3], asked, strict=True)
-    ]
-    (home / "declared.jsonl").write_text(record_text([*declared, claimed]))
-    assert made().declared == declared[1].summary()
 
 
 def test_the_hash_of_a_cloud_covers_its_model_and_its_gaussians(tmp_path):

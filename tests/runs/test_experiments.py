@@ -1,23 +1,15 @@
-"""The records of an experiment: its folder, the search for settings, and declarations."""
+"""The records of an experiment: its folder, and the search for settings."""
 
 import pytest
 
 from gsbench.parsing import DamagedError, read_typed
 from gsbench.runs.experiments import (
-    Declaration,
-    Question,
     TuningRecord,
     experiment_home,
-    latest_declaration,
     list_experiments,
     make_home,
-    merge_planned,
-    open_question,
-    read_declarations,
-    record_text,
     trial_folders,
 )
-from gsbench.runs.trial_record import Declared
 from tests.helpers import refusal, write
 from tests.trials import search_record
 
@@ -74,66 +66,3 @@ def test_a_record_of_an_impossible_search_is_damaged(tmp_path, points, fault):
         tuning(tmp_path, points=points)
     if "above" in fault:
         assert tuning(tmp_path, points=points, log=[]).points
-
-
-def declared(hour, *metrics, **values):
-    questions = tuple(open_question(metric) for metric in metrics)
-    return Declaration(time=f"1970-01-01T{hour:02d}:00:00Z", questions=questions, **values)
-
-
-def test_a_declaration_knows_its_time_and_its_metric():
-    one = declared(2, "psnr@extrapolation", "ssim")
-    assert one.moment == 7200
-    assert one.when == "1970-01-01 02:00 UTC"
-    assert one.primary == "psnr@extrapolation"
-    assert one.summary() == Declared(metric="psnr@extrapolation", time=one.time)
-    asked = [(question.metric, question.sign) for question in one.questions]
-    assert asked == [("psnr", 0), ("ssim", 0)]
-    assert Question(metric="psnr").sign == 1
-    with pytest.raises(ValueError, match="time is not a time"):
-        Declaration(time="yesterday")
-
-
-def test_planned_trials_are_those_of_the_declaration_and_of_its_questions():
-    asked = Question(metric="psnr", scenes={"garden": ("garden/a/1", "garden/b/2")}, seeds=(1, 0))
-    both = Declaration(
-        time=declared(1).time, questions=(asked,), trials={"garden/a/1": (2,), "room/a/1": (0,)}
-    )
-    assert both.planned == {"garden/a/1": (0, 1, 2), "garden/b/2": (0, 1), "room/a/1": (0,)}
-    assert merge_planned({}, both.planned) == both.planned
-    named = [
-        declared(1),
-        declared(1, trials={}),
-        declared(1, "psnr"),
-        Declaration(time=both.time, questions=(asked,)),
-    ]
-    assert [one.names_trials for one in named] == [False, True, False, True]
-
-
-def test_a_repeated_declaration_is_in_force_since_its_first_time(tmp_path):
-    first, second = declared(1, "psnr"), declared(2, "psnr")
-    third = declared(3, "psnr", missing={"a": ["b"]})
-    other, last = declared(2, "ssim"), declared(4, "ssim")
-    assert latest_declaration([first]) is first
-    assert latest_declaration([first, second]) is first
-    # what could not be tested does not change the questions
-    assert latest_declaration([first, second, third]) is first
-    assert latest_declaration([first, other, third]) is third
-    assert latest_declaration([first, second, last]) is last
-    assert latest_declaration([other, first, second, third]) is first
-
-
-def test_declarations_are_kept_in_the_order_of_time(tmp_path):
-    first, second = declared(1, "psnr"), declared(2, "ssim", looks=(2, 3))
-    assert read_declarations(tmp_path) == []
-    text = record_text([second, first])
-    assert text.endswith("}\n")
-    # a declaration without questions
-    (tmp_path / "declared.jsonl").write_text(text + '{"time": "1970-01-01T03:00:00Z"}\n')
-    assert read_declarations(tmp_path) == [first, second]
-    repeated = [first.summary(), None, Declared(metric="lpips_vgg", time="1970-01-01T00:00:00Z")]
-    assert read_declarations(tmp_path, [*repeated, Declared(metric="psnr", time="?")]) == [
-        declared(0, "lpips_vgg"),
-        first,
-        second,
-    ]

@@ -2,22 +2,20 @@
 
 import os
 from contextlib import suppress
-from types import SimpleNamespace
 
 import pytest
 
 from gsbench.analysis.results import read_experiment
 from gsbench.errors import InputError
 from gsbench.files import remove_special_files, require_no_links
-from gsbench.launch.record import declare, remove
+from gsbench.launch.record import remove
 from gsbench.launch.states import states_of_experiment
 from gsbench.logs import log_to
 from gsbench.parsing import DamagedError, read_bytes
+from gsbench.runs.commands import remember_result
 from gsbench.runs.experiments import list_experiments
 from gsbench.runs.keys import Step
-from gsbench.runs.plan import change_plan
 from gsbench.runs.store import Store
-from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import describe_holder, hold, is_held
 from tests.helpers import refusal
 from tests.runs.toy import TOY, build, toy_inputs
@@ -53,15 +51,8 @@ def _hold(folder):
         pass
 
 
-def _forget(folder):
-    change_plan(folder.parents[2])
-
-
-def _declare(folder):
-    trial = SimpleNamespace(
-        files=TrialFolder(folder), values={"seed": 0, "eval": {"primary": "psnr"}}
-    )
-    declare([trial])
+def _remember(folder):
+    remember_result(folder.parents[2], folder, "a-b/01234567")
 
 
 # The file in a trial's folder that is a link, and the function that writes it.
@@ -69,9 +60,8 @@ WRITERS = {
     "the log": ("log.txt", _log),
     "a lock": (".lock", _hold),
     "a lock's holder": (".lock.holder", _hold),
-    "the plan's holder": ("../../../.plan.json.lock.holder", _forget),
-    "the plan": ("../../../plan.json", _forget),
-    "the declarations": ("../../../declared.jsonl", _declare),
+    "the commands' holder": ("../../../.commands.jsonl.lock.holder", _remember),
+    "the commands": ("../../../commands.jsonl", _remember),
 }
 
 

@@ -8,18 +8,22 @@ import torch
 from torch.optim.adam import adam
 
 from gsbench.densify import NoDensifier, Volumetric
-from gsbench.gaussians.trainable import AdamState, Update
+from gsbench.gaussians.trainable import ParameterState, Update
 from gsbench.raster.cpu.layout import CHUNK
 from gsbench.train import trainer
 from gsbench.train.adam_cpu import CpuAdam, FusedStep
 from tests.train.lab import EVENTS, STATEFUL, same, small
 
 
+def moments(rate, shape):
+    return ParameterState(rate, 1, {"first": torch.zeros(shape), "second": torch.zeros(shape)})
+
+
 @pytest.mark.parametrize("shape", [(1, 3), (37,), (50, 4), (700, 15, 3)])
 def test_steps_are_those_of_adam_in_float64(shape):
     draw = torch.Generator().manual_seed(1)
     parameter = torch.randn(shape, generator=draw)
-    state = AdamState(0.01, 0, torch.zeros(shape), torch.zeros(shape))
+    state = moments(0.01, shape)
     expected, first, second = (t.double().clone() for t in (parameter, state.first, state.second))
     count = torch.zeros(())
     for step in range(1, 6):
@@ -41,7 +45,7 @@ def test_numbers_without_a_gradient_yet_keep_their_bits(active):
     results = []
     for columns in (active, None):
         parameter = torch.arange(33 * 45.0).view(33, 15, 3).clone()
-        state = AdamState(0.1, 1, torch.zeros(33, 15, 3), torch.zeros(33, 15, 3))
+        state = moments(0.1, (33, 15, 3))
         CpuAdam(1)([Update(parameter, gradient, state, columns)])
         results.append((parameter, state.first, state.second))
     for one, other in zip(*results, strict=True):

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from gsbench.densify import NoDensifier
-from gsbench.gaussians.trainable import AdamState, Update
+from gsbench.gaussians.trainable import ParameterState, Update
 from gsbench.raster.cpu import CpuRasterizer, executor
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.system.compile_clock import CLOCK, CompileClock
@@ -41,7 +41,7 @@ def test_the_signatures_are_those_of_a_training_step(monkeypatch):
     image = CpuRasterizer(1).render(gaussians, case.camera(), 1, torch.zeros(3)).image
     loss, _, _ = PhotometricLoss(threads=1)(image, torch.zeros(17, 33, 3, dtype=torch.uint8))
     loss.backward()
-    state = AdamState(0.1, 1, *torch.zeros(2, 30, 3))
+    state = ParameterState(0.1, 1, {key: torch.zeros(30, 3) for key in ("first", "second")})
     adam_cpu.CpuAdam(1)([Update(gaussians.means, gaussians.means.grad, state)])
     assert called == listed
 

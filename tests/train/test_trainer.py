@@ -183,6 +183,10 @@ def test_defaults_are_those_of_3dgs():
         "checkpoint_every": 1000,
         "checkpoint_minutes": 10.0,
         "steps_scaler": 1.0,
+        "loss": {},
+        "terms": [],
+        "schedule": {},
+        "optimizer": {},
     }
     assert asdict(TrainConfig(name="paper")) == published | others
 

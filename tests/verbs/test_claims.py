@@ -1,4 +1,4 @@
-"""``gsbench plan`` and ``ablate``, with made-up results."""
+"""``gsbench plan``, with made-up results."""
 
 import json
 import re
@@ -6,10 +6,9 @@ from shlex import split
 
 import pytest
 
-from gsbench.verbs import ablate
 from gsbench.verbs.plan import PLANNED, plan
 from tests.helpers import change_json, refusal
-from tests.trials import write_results, write_runs, write_trial
+from tests.trials import write_runs, write_trial
 
 
 @pytest.fixture
@@ -33,14 +32,14 @@ def test_plan_names_designs_that_suffice(pilots, capsys):
 
 def test_plan_answers_for_the_command_given(pilots, capsys):
     trials = {}
-    for words in (("sweep",), ("looks",), ("check", "--questions", "4"), ("ledger",)):
+    for words in (("sweep",), ("looks",), ("gate", "--questions", "4"), ("ledger",)):
         assert plan(["exp", "--difference", "0.5", "--for", *words], pilots) == 0
         out = capsys.readouterr().out
         trials[words[0]] = int(re.search(r"on these scenes.*?\((\d+) trials", out)[1])
         assert "seeds that the pilot does not have (it has 0, 1, 2), under another name" in out
         assert PLANNED[words[0]].partition(" {")[0] in out
         assert re.search(r"only within 0\.\d+ to 1\.\d+ times \(80 % of pilots\)", out)
-    assert trials["sweep"] < trials["looks"] < trials["check"] < trials["ledger"]
+    assert trials["sweep"] < trials["looks"] < trials["gate"] < trials["ledger"]
 
 
 def test_arms_that_cannot_be_planned_for_are_named_beside_the_others(pilots, capsys):
@@ -71,7 +70,7 @@ def test_json_has_the_facts_of_the_text(pilots, capsys, experiment):
     text, start, rest = capsys.readouterr().out.partition("{\n")
     found = json.loads(start + rest)
     assert [found[key] for key in ("metric", "difference", "for")] == ["ssim", 0.02, "sweep"]
-    assert [pair["sentence"] in text for pair in found["pairs"]] == [True]
+    assert [answer["sentence"] in text for answer in found["answers"]] == [True]
     assert all(line in text for line in found["left_out"])
     (one,) = found["plans"]
     assert (one["arm"], one["baseline"]) == ("sfm-volumetric", "sfm-adc")
@@ -108,69 +107,3 @@ def test_json_has_the_facts_of_the_text(pilots, capsys, experiment):
 def test_bad_input_of_plan_is_refused(pilots, words, message):
     with refusal(message):
         plan(split(words), pilots)
-
-
-# ---- ablate
-
-
-ABLATE = split("scene=courtyard init=random tracking=none eval.lpips=[] seed=0,1,2,3")
-SWITCH = split("+densify.switches.size.off.split_size=0.5 --switches size")
-
-
-@pytest.fixture
-def trained(runs, monkeypatch):
-    """The trials that ``ablate`` would train; their results are made up."""
-    trained = []
-
-    def run_trials(trials):
-        for trial in trials:
-            trained.append(trial)
-            off = trial.values["densify"]["split_size"] == 0.5
-            psnr = 20 - 3 * off + 0.1 * trial.values["seed"]
-            write_results(trial.folder, trial.values, metrics={"psnr": psnr, "ssim": psnr / 100})
-            (trial.folder / "config.yaml").write_text(trial.yaml)
-        return 0
-
-    monkeypatch.setattr(ablate, "run_trials", run_trials)
-    return trained
-
-
-def test_ablate_trains_every_run_and_prints_the_verdicts(runs, trained, said):
-    lines = said("ablate", *ABLATE, "densify=adc", *SWITCH).splitlines()
-    assert lines[0] == "adc: 1 part (size), 2 runs, 8 trials"
-    hashes = [line.split(":")[0].strip() for line in lines[1:3]]
-    assert [line.split(": ")[1] for line in lines[1:3]] == ["with all of them", "without size"]
-    assert [trial.folder.name.partition("-")[0] for trial in trained[::4]] == hashes
-    assert lines[-4].startswith("| run | difference in PSNR (dB) from all parts |")
-    assert lines[-2].startswith("| without size | −3.000 |")
-    assert lines[-2].endswith(" worse |")
-    assert lines[-1] == "all metrics and pictures: gsbench report ablate_adc"
-    again = said("ablate", *ABLATE, "densify=adc", *SWITCH, "--metric", "ssim")
-    assert "difference in SSIM from all parts" in again
-
-
-def test_a_dry_run_of_ablate_trains_nothing(trained, said):
-    words = [*ABLATE, "densify=adc", "name=parts", *SWITCH, "--dry-run"]
-    assert "8 trials: 8 missing" in said("ablate", *words)
-    assert trained == []
-
-
-def test_failed_trials_of_ablate_are_not_judged(runs, monkeypatch, capsys):
-    monkeypatch.setattr(ablate, "run_trials", lambda trials: 1)
-    assert ablate.ablate([*ABLATE, "densify=adc", *SWITCH], runs) == 1
-    assert "| run |" not in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    "words, name",
-    [(["densify=adc", "densify=taming/mine"], "ablate_taming_mine"), (["seed=1"], "ablate")],
-)
-def test_the_experiment_is_named_after_the_chosen_densifier(words, name):
-    assert ablate._default_name(words) == name
-
-
-def test_a_switch_that_changes_no_setting_is_refused(runs, refused):
-    words = [*ABLATE, "densify=adc", "+densify.switches.a.off.split_size=0.5"]
-    line = refused("ablate", *words, "+densify.switches.b.off.split_size=0.5")
-    assert "switching " in line
-    assert " changes no setting: give another VALUE" in line

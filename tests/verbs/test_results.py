@@ -7,7 +7,6 @@ from types import SimpleNamespace
 
 import pytest
 
-from gsbench.runs.freshness import Change
 from gsbench.runs.package_code import AS_RELEASED
 from gsbench.verbs.results import _origin, explain, explain_cell, report, tables
 from tests.helpers import refusal
@@ -214,13 +213,11 @@ def test_an_origin_names_program_machine_and_code():
     assert _origin(trial)["Gaussians"] == "its own renders"
     record.trained_by = SimpleNamespace(version="brush 1", command=["brush", "a"])
     trial.machine, trial.code_texts = "a CPU", ["code of mine ffff", "stage train 2"]
-    trial.edits = [Change("code", "mine", "f" * 64, "e" * 64)]
     record.code.commit, record.code.edited = "abc", True
     found = _origin(trial)
     assert found["program"] == "brush 1: brush a"
     assert found["machine"] == "a CPU"
     assert found["code"] == "code of mine ffff, stage train 2"
-    assert found["since"] == "mine was ffffffff, it is now eeeeeeee"
     assert found["commit"] == "abc, edited"
     assert "edited" not in found
     record.code.packages["eval"] = "1" * 64

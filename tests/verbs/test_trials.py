@@ -13,12 +13,12 @@ from rich.console import Console
 from gsbench.config.compose import compose_one
 from gsbench.errors import GsbenchError
 from gsbench.launch.progress import Progress
-from gsbench.launch.record import add_to_plan
+from gsbench.launch.record import record
 from gsbench.launch.states import TrialState
-from gsbench.runs.plan import read_plan
+from gsbench.runs.commands import read_history
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.own_modules import allowed_modules
-from gsbench.tracking.tracker_run import MirrorError
+from gsbench.tracking.sync import MirrorError
 from gsbench.verbs import trials
 from tests.composed import composed
 from tests.helpers import refusal, write
@@ -37,7 +37,7 @@ def begin(trial):
 def folders(runs):
     """Three planned trials: the first is done, the second failed, the third never started."""
     planned = composed(split("name=x densify=adc seed=0,1,2"))
-    add_to_plan(planned)
+    record(planned, asks=False)
     write_results(begin(planned[0]), planned[0].values)
     write(begin(planned[1]) / "failed.json", {"message": "the loss became nan"})
     return [trial.folder for trial in planned]
@@ -123,7 +123,7 @@ def test_superseded_trials_are_shown_and_deleted_on_demand(folders, monkeypatch,
     lines = said("status x --forget-superseded").splitlines()
     assert lines == [f"removed {done}: helper was 1, it is now 2", "1 superseded trial removed"]
     assert not done.exists()
-    assert [*read_plan(done.parents[2])] == folders[1:]
+    assert [*read_history(done.parents[2]).planned] == folders[1:]
 
 
 def test_user_modules_are_looked_up_where_the_command_of_each_trial_was_given(
@@ -212,7 +212,7 @@ def test_retry_refuses_a_setting_that_makes_other_trials(folders, ran, refused):
 
 def test_planned_settings_of_a_launcher_go_with_it_unless_it_stays(runs, ran, said):
     words = split("name=x densify=adc launch=local launch.parallel=2")
-    add_to_plan(composed(words))
+    record(composed(words), asks=False)
     said("retry x launch=local")
     said("retry x launch=serial")
     assert [(one.values["launch"]["name"], one.values["launch"]["parallel"]) for one in ran] == [
@@ -232,7 +232,7 @@ def test_a_trial_whose_configuration_has_changed_takes_the_place_of_the_old_one(
     said("retry x")
     assert {one.values["train"]["sh_interval"] for one in ran} == {2}
     assert caplog.text.count("its configuration has changed since; the new one is run") == 2
-    assert [*read_plan(folders[0].parents[2])] == folders[:1]
+    assert [*read_history(folders[0].parents[2]).planned] == folders[:1]
 
 
 def test_retry_of_a_trial_without_a_plan_uses_its_configuration(folders, runs):
@@ -260,7 +260,7 @@ def test_a_second_retry_without_a_plan_runs_the_same_trial(folders, runs, monkey
     ran = []
 
     def killed(given):
-        add_to_plan(given)
+        record(given, asks=False)
         ran.extend(trial.folder for trial in given)
         return 1
 

@@ -42,6 +42,7 @@ TRIAL_FIELDS = (
 )
 IDENTITY = ("experiment", "scene", "init", "densify", "seed")
 CONDITIONS = ("protocol", "raster", "iterations")
+OF_VIEWS = ("protocol", "resolution", "data", "split")  # conditions of the measured views
 MEASUREMENTS = (
     "num_init_points",
     "num_gaussians",
@@ -114,6 +115,40 @@ def select_trials(trials: Iterable[TrialResult], where: Mapping[str, str]) -> li
         asked = ", ".join(f"{key}={value}" for key, value in where.items())
         raise InputError(f"no trial has {asked}")
     return kept
+
+
+def side_by_side(first: Experiment, second: Experiment) -> tuple[Experiment, Experiment]:
+    """Two experiments, each with its trials on the scenes that both measured alike.
+
+    Raises ``InputError`` if there is no such scene.
+    """
+    by_scene = [group_by(one.trials, lambda trial: trial.scene) for one in (first, second)]
+    views = [
+        {
+            scene: {tuple(map(trial.conditions.get, OF_VIEWS)) for trial in own}
+            for scene, own in of_scenes.items()
+        }
+        for of_scenes in by_scene
+    ]
+    alike = {
+        scene
+        for scene in views[0].keys() & views[1].keys()
+        if len(views[0][scene] | views[1][scene]) == 1
+    }
+    if not alike:
+        raise InputError(
+            f"{first.name} and {second.name} have no scene with the same views and protocol"
+        )
+    one, two = (
+        replace(own, trials=tuple(trial for trial in own.trials if trial.scene in alike))
+        for own in (first, second)
+    )
+    return one, two
+
+
+def where_words(where: Mapping[str, str]) -> str:
+    """``--where seed=0,1``"""
+    return " ".join(f"--where {key}={values}" for key, values in where.items())
 
 
 def check_averageable(trials: Sequence[TrialResult], where: str) -> None:
@@ -198,19 +233,6 @@ def short_reason(reason: str) -> str:
     return reason
 
 
-def best_cells(cells: Mapping[K, Cell], quantity: Quantity) -> set[K]:
-    """The keys of the best means after rounding; none if all are equal, or for a cost."""
-    merits = {
-        key: quantity.direction * round(cell.mean, quantity.decimals)
-        for key, cell in cells.items()
-        if cell.mean is not None
-    }
-    if quantity.cost or len(set(merits.values())) < 2:  # all merits are 0 without a direction
-        return set()
-    best = max(merits.values())
-    return {key for key, merit in merits.items() if merit == best}
-
-
 def _refusal(
     where: str, keys: Mapping[str, Sequence[str]], trials: Sequence[TrialResult]
 ) -> InputError:
@@ -229,6 +251,7 @@ def to_frame(trials: Experiment | Sequence[TrialResult]) -> pd.DataFrame:
     It has these columns:
 
     - ``experiment``, ``scene``, ``init``, ``densify``, ``seed``: the trial's identity;
+    - ``arm`` (``sfm-mine[growth=2]``) and ``idea`` (``sfm-mine``), as verdicts name them;
     - every setting in which trials of one scene, initialiser and densifier differ, by its dotted
       key, such as ``densify.max_gaussians``;
     - ``protocol``, ``raster``, ``iterations``, and ``width`` and ``height`` of the views in px;
@@ -249,9 +272,10 @@ def to_frame(trials: Experiment | Sequence[TrialResult]) -> pd.DataFrame:
     chosen = list(trials.trials if isinstance(trials, Experiment) else trials)
     swept, metrics = swept_settings(chosen), metric_keys(chosen)
     rows = []
-    for trial in chosen:
+    for trial in with_variants(chosen):
         record = trial.record
         row: dict[str, Any] = {name: getattr(record, name) for name in IDENTITY}
+        row |= {"arm": str(trial.arm), "idea": trial.arm.name}
         row |= {key: trial.config.get(key) for key in swept}
         row |= {name: getattr(record, name) for name in CONDITIONS}
         row["width"], row["height"] = record.resolution or (None, None)

@@ -1,241 +1,306 @@
 """All answers of an experiment, made once: every verb, table and page shows these.
 
-A `Comparison` has the trials that count, what was declared, the verdicts on each compared pair of
-arms, and a line for each arm and trial that no verdict uses.
+An idea has a row. Its verdict is that of its last answered question about the present code; its
+other questions stand below, and so do other metrics, which are not tested. What nobody asked
+beforehand has a mean and an interval.
 """
 
 import itertools
-import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
-from gsbench.analysis.attempts import measured_elsewhere
 from gsbench.analysis.cells import with_variants
-from gsbench.analysis.declaration import ActiveDeclaration, active_declaration
-from gsbench.analysis.judgement import Verdict
 from gsbench.analysis.notes import Note, texts
-from gsbench.analysis.pairing import (
-    BASELINE,
-    are_equal,
-    baseline_settings,
-    choose_pairs,
-    controls_of,
-    pair_trials,
-    uncompared,
+from gsbench.analysis.old_declarations import all_questions
+from gsbench.analysis.pairs import are_equal
+from gsbench.analysis.quantities import choose_quantities
+from gsbench.analysis.questions import Asked, Row, choose_pairs, rows_of
+from gsbench.analysis.results import Arm, Experiment, TrialResult
+from gsbench.analysis.sentences import asked_words, badge, headline, risk, sentence
+from gsbench.analysis.statistics import REFUTED, SUPPORTED
+from gsbench.analysis.verdicts import (
+    ANSWERED,
+    NOT_ASKED,
+    NOT_TESTED,
+    Verdict,
+    interval_of,
+    judge,
 )
-from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by
-from gsbench.analysis.unfinished import unfinished
-from gsbench.analysis.verdict_words import sentence
-from gsbench.analysis.verdicts import PairVerdicts, judge_pairs
-from gsbench.runs.experiments import Question
-from gsbench.runs.layout import LEDGER, TUNING
-from gsbench.words import command
+from gsbench.runs.commands import Question, code_in
+from gsbench.runs.layout import TUNING
 
-VERDICT = Note.of("verdict", sentence="").sentence  # begins the notes that state verdicts
+DEFAULT_METRIC = "psnr"
 
 
 @dataclass(frozen=True)
-class Pairing:
-    """The arms of an experiment: ``trials`` with their variants, pairs, and arms without a pair.
+class Answer:
+    """What is known of an idea against a baseline.
 
-    A search has no pairs: its points were chosen by results, so no test of them is valid.
+    ``verdict`` is that of the last answered question about the present code; else of the last
+    question, or an interval that nobody asked for. ``others`` are the verdicts on its other
+    questions, the newest first; ``metrics`` the intervals of all other metrics.
     """
 
-    trials: tuple[TrialResult, ...]
-    pairs: tuple[tuple[Arm, Arm], ...]
-    uncompared: tuple[Note, ...]
+    baseline: Arm
+    arm: Arm
+    verdict: Verdict
+    others: tuple[Verdict, ...] = ()
+    metrics: tuple[Verdict, ...] = ()
 
+    @property
+    def badge(self) -> str:
+        return badge(self.verdict)
 
-def pair_arms(experiment: Experiment, baseline: str = BASELINE) -> Pairing:
-    """Choose the pairs of arms to compare; every arm is in one, or in a note with its reason."""
-    trials = tuple(with_variants(experiment.trials))
-    if (experiment.folder / TUNING).exists():
-        return Pairing(trials, (), ())
-    by_arm = group_by(trials, lambda trial: trial.arm)
-    arms, settings = sorted(by_arm), {arm: own[0].config for arm, own in by_arm.items()}
-    ages = {arm: min(trial.measured for trial in own) for arm, own in by_arm.items()}
-    # A sweep in looks declared its pairs before any trial began: its baseline stays the baseline,
-    # and other pairs of its arms are none, since it stopped by the results of its own.
-    planned = _pairs_in_looks(experiment)
-    keys = {arm: {trial.key for trial in own} for arm, own in by_arm.items()}
-    ages |= {arm: -math.inf for arm in arms if any(keys[arm] & first for first, _ in planned)}
-    in_looks = {arm for arm in arms if any(keys[arm] & (one | two) for one, two in planned)}
-    # The two arms may have no result on a common scene yet.
-    declared = {
-        (first, second)
-        for one, two in planned
-        for first in arms
-        if keys[first] & one
-        for second in arms
-        if keys[second] & two and second != first
-    }
-    pairs = choose_pairs(arms, baseline, controls_of(trials), settings, ages)
-    # with another baseline, a declared pair is not also asked the other way round
-    pairs = [(one, two) for one, two in pairs if (two, one) not in declared]
-    pairs += sorted(declared.difference(pairs))
-    pairs += [
-        (first, second)
-        for first, second in baseline_settings(arms, ages, baseline)
-        if (first, second) not in pairs
-        # settings under which no two trials can be paired, such as budgets, give no verdict
-        and pair_trials(trials, first, second)
-        and not {first, second} <= in_looks
-    ]
-    return Pairing(trials, tuple(pairs), tuple(uncompared(arms, pairs, baseline)))
+    @property
+    def sentence(self) -> str:
+        return sentence(self.verdict)
 
-
-def _pairs_in_looks(experiment: Experiment) -> list[tuple[set[str], set[str]]]:
-    """The questions of sweeps in looks: keys of the baseline's and of the arm's trials."""
-    return [
-        ({first for first, _ in both}, {second for _, second in both})
-        for declaration in experiment.declarations
-        if declaration.looks
-        for both in (question.scenes.values() for question in declaration.questions)
-    ]
+    @property
+    def line(self) -> str:
+        """``BETTER: sfm-mine against sfm-adc: better in PSNR (dB) on these scenes: +0.50 …``"""
+        return f"{self.badge}: {self.sentence}"
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """The answers of an experiment; see the head of this file."""
+    """The answers of an experiment; ``trials`` are those that count, with their variants."""
 
     experiment: Experiment
-    arms: Pairing
-    declared: ActiveDeclaration | None
-    answers: tuple[PairVerdicts, ...]
-
-    @property
-    def trials(self) -> tuple[TrialResult, ...]:
-        return self.arms.trials
+    trials: tuple[TrialResult, ...]
+    answers: tuple[Answer, ...]
 
     @property
     def pairs(self) -> tuple[tuple[Arm, Arm], ...]:
-        return self.arms.pairs
+        return tuple((answer.baseline, answer.arm) for answer in self.answers)
 
     @property
     def sentences(self) -> list[str]:
-        """The verdict on each compared pair of arms, in one sentence each."""
-        return [sentence(answer) for answer in self.answers]
-
-    @cached_property
-    def unused(self) -> list[Note]:
-        """A note with the reason for each arm and each trial that no verdict uses."""
-        verdicts = [verdict for answer in self.answers for verdict in answer.verdicts]
-        # Where an arm has no verdict at all, its sentence says why.
-        asked = {
-            arm
-            for answer in self.answers
-            if answer.verdicts
-            for arm in (answer.first, answer.second)
-        }
-        trials = [trial for trial in self.trials if trial.arm in asked]
-        return [*self.arms.uncompared, *unused_trials(trials, verdicts), *self._apart]
+        """The verdict on each idea, in a sentence or two each."""
+        return [answer.sentence for answer in self.answers]
 
     @property
-    def _apart(self) -> list[Note]:
-        """Notes on trials that some verdicts on their arm use, and others do not."""
-        used = {
-            (answer.first, answer.second): {
-                trial.path for verdict in answer.verdicts for trial in verdict.pairs.trials
-            }
-            for answer in self.answers
-            if answer.verdicts
-        }
-        anywhere = set().union(*used.values())
-        apart: dict[tuple[Arm, tuple[str, ...]], list[Arm]] = {}
-        for pair, own in used.items():
-            beside = [
-                trial for trial in self.trials if trial.arm in pair and trial.path in anywhere - own
-            ]
-            if beside:
-                labels = tuple(trial.label for trial in beside)
-                apart.setdefault((pair[0], labels), []).append(pair[1])
-        return [
-            Note.of("judged apart", arms=arms, baseline=first, trials=labels)
-            for (first, labels), arms in apart.items()
-        ]
+    def lines(self) -> list[str]:
+        """The badge and the verdict on each idea."""
+        return [answer.line for answer in self.answers]
+
+    @property
+    def headlines(self) -> list[str]:
+        """One line for each idea."""
+        return [headline(answer.verdict) for answer in self.answers]
+
+    @property
+    def risk(self) -> str:
+        """What a page with these answers risks; "" if it states no verdict."""
+        verdicts = itertools.chain(*((one.verdict, *one.others) for one in self.answers))
+        return risk([one for one in verdicts if one.state == ANSWERED])
 
     @cached_property
     def remarks(self) -> list[Note]:
-        """Notes that belong to the sentences, wherever they stand.
-
-        That is what no verdict uses, old code, code in other experiments, arms with the same bits,
-        and declared trials that are missing.
-        """
-        lacking = [
-            note
-            for answer in self.answers
-            for note in answer.notes
-            if note.kind in ("no direction", "valueless")
-        ]
-        early = [note for note in self._progress if note.kind == "early look"]
-        of_code = [*edited_notes(self.trials), *self._elsewhere, *same_bits_notes(self.trials)]
-        return [*self.unused, *dict.fromkeys(lacking), *of_code, *early]
-
-    @property
-    def _elsewhere(self) -> list[Note]:
-        """A note for each arm that other experiments measured by other code on its seeds."""
-        by_arm = group_by(self.trials, lambda trial: trial.arm)
-        compared = {second: by_arm[second] for _, second in self.pairs}
-        found = measured_elsewhere(self.experiment.folder, compared)
-        return [Note.of("elsewhere", arm=arm, experiments=own) for arm, own in found.items()]
-
-    @cached_property
-    def _progress(self) -> list[Note]:
-        return self.declared.progress(self.trials) if self.declared and self.answers else []
-
-    @cached_property
-    def declared_notes(self) -> list[Note]:
-        """Notes on what was declared, and on looks to come."""
-        if self.declared is None or not self.answers:
-            return []
-        notes, in_force = [], group_by(self.answers, lambda one: one.declared)
-        for metric, own in in_force.items():
-            if metric is not None and own[0].standing is not None:
-                doubted = any(not answer.beforehand for answer in own)
-                notes += own[0].standing.active.notes(metric.name, doubted)
-        known = [answer.standing.active.records for answer in self.answers if answer.standing]
-        unused = [
-            declaration
-            for declaration in self.declared.declared
-            if declaration not in itertools.chain(*known)
-        ]
-        notes += [
-            Note.of("replaced", metric=replaced.primary, when=replaced.when) for replaced in unused
-        ]
-        return [*notes, *(note for note in self._progress if note.kind == "looks to come")]
-
-    def notes(self) -> list[Note]:
-        """The notes below a table: verdicts, remarks, and what was declared."""
-        return [
-            *(Note.of("verdict", sentence=text) for text in self.sentences),
-            *self.remarks,
-            *self.declared_notes,
-        ]
+        """Notes that belong to the sentences, wherever they stand."""
+        compared = set(itertools.chain(*self.pairs))
+        alone = [arm for arm in dict.fromkeys(t.arm for t in self.trials) if arm not in compared]
+        notes = [Note.of("no partner", arm=arm) for arm in alone if self.answers or len(alone) > 1]
+        for answer in self.answers:
+            used = {trial.path for trial in answer.verdict.pairs.trials}
+            own = [trial for trial in self.trials if trial.arm in (answer.arm, answer.baseline)]
+            # the baseline may have more seeds and scenes: they cost nothing
+            unused = [t for t in own if t.arm == answer.arm and t.path not in used]
+            if unused and answer.verdict.state == ANSWERED:
+                labels = [trial.label for trial in unused]
+                notes.append(Note.of("unused", trials=labels, arm=answer.arm))
+            notes += [note for note in answer.verdict.notes if note.kind == "valueless"]
+        return [*notes, *same_bits_notes(self.trials)]
 
     def to_json(self) -> dict[str, Any]:
-        """The verdicts on each compared pair of arms and what is left out, for other programs."""
+        """The verdicts and what is left out, for other programs."""
         left_out = texts([*self.remarks, *self.experiment.warnings])
-        return {"pairs": [_as_json(answer) for answer in self.answers], "left_out": left_out}
+        return {
+            "answers": [_as_json(answer) for answer in self.answers],
+            "risk": self.risk,
+            "left_out": left_out,
+        }
 
 
-def edited_notes(trials: Sequence[TrialResult]) -> list[Note]:
-    """A note for each of the user's modules that was edited after it made some of the trials."""
-    of_module: dict[str, list[TrialResult]] = {}
-    # Trials of one version of the code have the same edits, and finding them reads the modules.
-    for own in group_by(trials, lambda trial: frozenset(trial.code.items())).values():
-        for edit in own[0].edits:
-            of_module.setdefault(edit.name, []).extend(own)
-    return [
-        Note.of(
-            "edited",
-            module=module,
-            trials=len(own),
-            arms=sorted({f"{trial.init}-{trial.densify}" for trial in own}),
-        )
-        for module, own in of_module.items()
+def _as_json(answer: Answer) -> dict[str, Any]:
+    return {
+        "arm": str(answer.arm),
+        "baseline": str(answer.baseline),
+        "badge": answer.badge,
+        "sentence": answer.sentence,
+        "notes": texts(answer.verdict.notes),
+        "verdicts": [
+            verdict_json(one) for one in (answer.verdict, *answer.others, *answer.metrics)
+        ],
+    }
+
+
+def verdict_json(verdict: Verdict) -> dict[str, Any]:
+    """A verdict for other programs."""
+    interval = verdict.interval
+    return {
+        "metric": verdict.question.metric,
+        "state": verdict.state,
+        "outcome": verdict.outcome,
+        "difference": verdict.mean,
+        "interval": None if interval is None else [interval.low, interval.high],
+        "p": verdict.p,
+        "level": verdict.level,
+        "n": verdict.question.n,
+        "question": verdict.question.id,
+        "asked": asked_words(verdict),
+        "trials": [trial.label for trial in verdict.pairs.trials],
+    }
+
+
+def compare(experiment: Experiment, baseline: str | None = None) -> Comparison:
+    """The answers of an experiment.
+
+    With ``baseline``, a densifier, each other arm is shown against it, with intervals alone: the
+    baseline was chosen after the results.
+    """
+    trials = tuple(with_variants(experiment.trials))
+    if (experiment.folder / TUNING).exists():
+        # the points of a search were chosen by results, so no test of them is valid
+        return Comparison(experiment, trials, ())
+    rows = rows_of(trials)
+    if baseline is not None:
+        pairs = choose_pairs(rows, Asked(metric=DEFAULT_METRIC, baseline=baseline))
+        known = {trial.arm for trial in trials}
+        answers = [
+            _with_metrics(_interval(trials, *pair, NOT_TESTED), trials, *pair)
+            for pair in pairs
+            if known.issuperset(pair)
+        ]
+        return Comparison(experiment, trials, tuple(answers))
+    return Comparison(experiment, trials, tuple(_answers(experiment, trials, rows)))
+
+
+def _answers(
+    experiment: Experiment, trials: Sequence[TrialResult], rows: Sequence[Row]
+) -> list[Answer]:
+    everything = [*trials, *experiment.older]
+    arms = {(trial.scene, trial.digest): trial.arm for trial in trials}
+    verdicts: dict[tuple[Arm, Arm], list[Verdict]] = {}
+    for question in all_questions(experiment):
+        question = _named(question, arms)
+        verdict = judge(everything, question, experiment.unfinished)
+        verdicts.setdefault((question.baseline, question.idea), []).append(verdict)
+    ideas = {idea for _, idea in verdicts}
+    unasked = [
+        pair
+        for pair in choose_pairs(rows, Asked(metric=DEFAULT_METRIC))
+        if pair[1] not in ideas and {trial.arm for trial in trials}.issuperset(pair)
     ]
+    answers = []
+    for pair, own in verdicts.items():
+        newest = own[-1].question
+        code = {code_in(second) for _, second in newest.digests.values()}
+        current = [
+            one
+            for one in own
+            if {code_in(second) for _, second in one.question.digests.values()} == code
+        ]
+        answered = [one for one in current if one.state == ANSWERED]
+        shown = (answered or current)[-1]
+        others = tuple(one for one in reversed(own) if one is not shown)
+        answers.append(_with_metrics(shown, trials, *pair, others))
+    for pair in unasked:
+        answers.append(_with_metrics(_interval(trials, *pair, NOT_ASKED), trials, *pair))
+    return answers
+
+
+def _named(question: Question, arms: Mapping[tuple[str, str], Arm]) -> Question:
+    """The question with the names that its arms have among all trials."""
+    sides = []
+    for side, name in enumerate((question.baseline, question.idea)):
+        found = (arms.get((scene, both[side])) for scene, both in question.digests.items())
+        sides.append(next(filter(None, found), name))
+    return replace(question, baseline=sides[0], idea=sides[1])
+
+
+def _interval(
+    trials: Sequence[TrialResult], baseline: Arm, arm: Arm, state: Any, metric: str = DEFAULT_METRIC
+) -> Verdict:
+    return interval_of(trials, baseline, arm, metric, state)
+
+
+def _with_metrics(
+    verdict: Verdict,
+    trials: Sequence[TrialResult],
+    baseline: Arm,
+    arm: Arm,
+    others: tuple[Verdict, ...] = (),
+) -> Answer:
+    own = [trial for trial in trials if trial.arm in (baseline, arm)]
+    metrics = tuple(
+        interval_of(own, baseline, arm, quantity.key)
+        for quantity in (choose_quantities(own) if own else ())
+        if quantity.direction and not quantity.cost and quantity.key != verdict.quantity.key
+    )
+    return Answer(baseline, arm, verdict, others, tuple(m for m in metrics if m.pairs.rows))
+
+
+def joined(comparisons: Sequence[Comparison]) -> Comparison:
+    """The answers of several experiments as those of one, called ``A and B``."""
+    first, *others = comparisons
+    if not others:
+        return first
+    experiments = [one.experiment for one in comparisons]
+    both = replace(
+        first.experiment,
+        name=" and ".join(one.name for one in experiments),
+        trials=tuple(itertools.chain(*(one.trials for one in experiments))),
+        faults=tuple(itertools.chain(*(one.faults for one in experiments))),
+        older=tuple(itertools.chain(*(one.older for one in experiments))),
+        versions=tuple(itertools.chain(*(one.versions for one in experiments))),
+    )
+    trials = itertools.chain(*(one.trials for one in comparisons))
+    answers = itertools.chain(*(one.answers for one in comparisons))
+    return Comparison(both, tuple(trials), tuple(answers))
+
+
+def chosen(comparison: Comparison, trials: Sequence[TrialResult], where: str) -> Comparison:
+    """The answers about ``trials`` alone, which ``where`` chose among those of the comparison.
+
+    An answer that lost none of its trials stays; any other is an interval, since the choice may
+    have been made after seeing results. One without a pair of trials left goes.
+    """
+    kept = {trial.path for trial in trials}
+    own = [trial for trial in comparison.trials if trial.path in kept]
+    answers = []
+    for answer in comparison.answers:
+        used = {trial.path for trial in answer.verdict.pairs.trials}
+        if used and used <= kept:
+            answers.append(answer)
+        elif {answer.baseline, answer.arm} <= {trial.arm for trial in own}:
+            metric, why = answer.verdict.quantity.key, f"{where} chose its trials"
+            verdict = interval_of(own, answer.baseline, answer.arm, metric, NOT_TESTED, why)
+            answers.append(_with_metrics(verdict, own, answer.baseline, answer.arm))
+    return replace(comparison, trials=tuple(own), answers=tuple(answers))
+
+
+def winners(comparison: Comparison) -> dict[tuple[str, frozenset[str]], set[Arm]]:
+    """The arms that were shown to be better, by metric and scenes.
+
+    A baseline is one if all arms that are compared with it on these scenes are worse.
+    """
+    found: dict[tuple[str, frozenset[str]], tuple[set[Arm], set[Arm]]] = {}
+    for answer in comparison.answers:
+        verdict = answer.verdict
+        place = verdict.quantity.key, frozenset(verdict.question.seeds)
+        better, worse = found.setdefault(place, (set(), set()))
+        sides = answer.baseline, answer.arm
+        if verdict.state == ANSWERED and verdict.outcome in (SUPPORTED, REFUTED):
+            if verdict.question.sign != verdict.quantity.direction:
+                continue
+            sides = sides if verdict.outcome == SUPPORTED else sides[::-1]
+            worse.add(sides[0])
+            better.add(sides[1])
+        else:
+            worse.update(sides)
+    return {place: better - worse for place, (better, worse) in found.items()}
 
 
 def same_bits_notes(trials: Sequence[TrialResult]) -> list[Note]:
@@ -255,98 +320,3 @@ def same_bits_notes(trials: Sequence[TrialResult]) -> list[Note]:
         ):
             equal.setdefault(one, [one]).append(two)
     return [Note.of("same bits", arms=own) for own in equal.values()]
-
-
-def unused_trials(trials: Sequence[TrialResult], verdicts: Sequence[Verdict]) -> list[Note]:
-    """A note with the reasons for the trials of each arm that are in none of ``verdicts``."""
-    used = {trial.path for verdict in verdicts for trial in verdict.pairs.trials}
-    left_out = [trial for trial in trials if trial.path not in used]
-    found = []
-    for own in group_by(left_out, lambda trial: trial.arm).values():
-        asked = [
-            verdict for verdict in verdicts if any(_asks(verdict.question, trial) for trial in own)
-        ]
-        scenes = {trial.scene for trial in own}
-        reasons = [reason for verdict in asked for reason in _reasons(verdict, scenes)]
-        if not reasons:
-            reasons = [Note.of("not planned" if asked else "not asked").sentence]
-        labels = [trial.label for trial in own]
-        found.append(Note.of("unused", trials=labels, reasons=list(dict.fromkeys(reasons))))
-    return found
-
-
-def _asks(question: Question, trial: TrialResult) -> bool:
-    """Return whether a question is about a trial."""
-    if question.scenes:
-        return any(trial.key in keys for keys in question.scenes.values())
-    return trial.arm in (question.baseline, question.arm)
-
-
-def _reasons(verdict: Verdict, scenes: Collection[str]) -> list[str]:
-    """The reasons why a verdict leaves trials of its question on these scenes out."""
-    notes = [note for note in (verdict.untestable, *verdict.notes) if note]
-    reasons = [note.sentence for note in notes if dict(note.facts).get("scene") in (None, *scenes)]
-    if verdict.question.seeds and verdict.answer is not None and verdict.final:
-        reasons.append(Note.of("decided before", seeds=verdict.pairs.seeds).sentence)
-    if not reasons and verdict.question.seeds and verdict.answer is None:
-        reasons.append(Note.of("waits").sentence)
-    return reasons
-
-
-def _as_json(one: PairVerdicts) -> dict[str, Any]:
-    verdicts: Sequence[Mapping[str, Any]] = [
-        {
-            "metric": verdict.question.metric,
-            "role": one.role(verdict) or "exploratory",
-            "outcome": verdict.outcome,
-            "difference": verdict.mean,
-            "interval": None
-            if verdict.interval is None
-            else [verdict.interval.low, verdict.interval.high],
-            "p": verdict.p,
-            "error_rate": None if verdict.answer is None else verdict.answer.level,
-            "tests": verdict.family,
-            "trials": [trial.label for trial in verdict.pairs.trials],
-        }
-        for verdict in one.verdicts
-    ]
-    return {
-        "arm": str(one.second),
-        "baseline": str(one.first),
-        "sentence": sentence(one),
-        "versions": one.versions,
-        "verdicts": verdicts,
-        "notes": texts(one.notes),
-    }
-
-
-def compare(experiment: Experiment, baseline: str = BASELINE) -> Comparison:
-    """Answer all questions of an experiment: each of its arms against ``baseline``."""
-    arms = pair_arms(experiment, baseline)
-    declared = active_declaration(experiment)
-    usual = arms if baseline == BASELINE else pair_arms(experiment)
-    shown, known = ({frozenset(pair) for pair in one.pairs} for one in (arms, usual))
-    others = [pair for pair in arms.pairs if frozenset(pair) not in known]
-    turned = {(second, first) for first, second in usual.pairs}.difference(usual.pairs)
-    # A baseline that is chosen later frees no question of the others' share of the error rate.
-    pairs = [*arms.pairs, *(pair for pair in usual.pairs if frozenset(pair) not in shown)]
-    lacking, past = unfinished(experiment), (experiment.older, experiment.seen)
-    if declared is not None:
-        lacking += declared.missing(arms.trials)
-    answers = judge_pairs(arms.trials, pairs, declared, lacking, others, *past, turned)
-    answers = answers[: len(arms.pairs)]
-    if (experiment.folder / LEDGER).exists():
-        answers = [
-            replace(
-                answer,
-                undeclared=LEDGER_DECIDES.format(command("ledger", "show", experiment.name)),
-            )
-            for answer in answers
-        ]
-    elif any(one.kind == "claims" and one.looks for one in experiment.declarations):
-        answers = [replace(one, undeclared=CLAIMS_DECIDE) for one in answers]
-    return Comparison(experiment, arms, declared, tuple(answers))
-
-
-CLAIMS_DECIDE = "declared claims decide (gsbench check), and seeds came in looks until they did"
-LEDGER_DECIDES = "the ledger's tests decide ({}), and this is none of them"

@@ -31,13 +31,21 @@ class Components:
 
     ``between`` is the deviation of the effect over scenes: None for a single scene, 0 if scenes
     differ by no more than trainings explain. ``within`` is the deviation over trainings of a
-    scene.
+    scene, in the root mean square of the scenes; ``shares`` are the parts of its square that each
+    scene has, with a mean of 1.
     """
 
     between: float | None
     within: float
     scenes: int
     trials: int  # pairs
+    shares: tuple[float, ...] = (1.0,)
+
+    def shares_of(self, scenes: int) -> tuple[float, ...]:
+        """The shares of so many scenes like the pilot's: evenly spaced quantiles of its own."""
+        middles = (np.arange(scenes) + 0.5) / scenes
+        found = np.quantile(self.shares, middles, method="inverted_cdf")
+        return tuple(map(float, found / found.mean()))
 
 
 @dataclass(frozen=True)
@@ -65,15 +73,23 @@ def estimate_components(differences: Sequence[NDArray[np.float64]]) -> Component
     )
     counts = np.array([len(values) for values in differences], dtype=float)
     total = int(counts.sum())
-    between = None
+    between, shares = None, tuple[float, ...]([1.0])
     if len(differences) > 1:
+        shares = _shares(differences)
         means = np.array([values.mean() for values in differences])
         overall = float(np.concatenate(list(differences)).mean())
         # n_0 of unbalanced data
         pairs_per_scene = (total - float((counts**2).sum()) / total) / (len(counts) - 1)
         square = float((counts * (means - overall) ** 2).sum()) / (len(counts) - 1)
         between = math.sqrt(max(0.0, (square - within**2) / pairs_per_scene))
-    return Components(between, within, len(differences), total)
+    return Components(between, within, len(differences), total, shares)
+
+
+def _shares(differences: Sequence[NDArray[np.float64]]) -> tuple[float, ...]:
+    """The parts of the noise that scenes with two pairs and more have, with a mean of 1."""
+    variances = np.array([values.var(ddof=1) for values in differences if len(values) > 1])
+    mean = variances.mean()
+    return tuple(map(float, variances / mean)) if mean else (1.0,)
 
 
 def power(design: Design, difference: float, components: Components, like_these: bool) -> float:
@@ -83,7 +99,9 @@ def power(design: Design, difference: float, components: Components, like_these:
     test). Raises InputError for scenes like these if the pilot had only one scene.
     """
     if not like_these:
-        return power_of_mean(components.within, design, difference)
+        return power_of_mean(
+            components.within, design, difference, shares=components.shares_of(design.scenes)
+        )
     if components.between is None:
         raise InputError(
             "one scene cannot show how an effect differs between scenes: run pilot trials on two"
@@ -98,28 +116,34 @@ def power(design: Design, difference: float, components: Components, like_these:
 
 
 def power_of_mean(
-    deviation: float, design: Design, difference: float, level: float = ALPHA
+    deviation: float,
+    design: Design,
+    difference: float,
+    level: float = ALPHA,
+    shares: tuple[float, ...] = (),
 ) -> float:
     """The chance that the t test of these scenes sees ``difference`` at ``level``.
 
-    Trainings differ by ``deviation``. The test estimates each scene's variance and its own
-    degrees of freedom. Given these, the power is that of a normal mean; the result is its
+    Trainings differ by ``deviation``, in the root mean square of the scenes, which have these
+    ``shares`` of its square (equal ones by default). The test estimates each scene's variance and
+    its own degrees of freedom. Given these, the power is that of a normal mean; the result is its
     average over simulated variances. The far tail of the wrong sign is left out.
     """
     if deviation == 0:
         return 1.0 if difference else 0.0
     shift = abs(difference) / deviation * math.sqrt(design.scenes * design.seeds)
-    return float(special.ndtr(shift - _thresholds(design, level)).mean())
+    return float(special.ndtr(shift - _thresholds(design, level, shares)).mean())
 
 
 @cache
-def _thresholds(design: Design, level: float) -> NDArray[np.float64]:
+def _thresholds(design: Design, level: float, shares: tuple[float, ...]) -> NDArray[np.float64]:
     """The smallest means [DESIGN_DRAWS] that are significant, in true standard errors.
 
     Each belongs to one draw of simulated variances of the scenes.
     """
     freedom = design.seeds - 1
     variances = np.random.default_rng(0).chisquare(freedom, (DESIGN_DRAWS, design.scenes)) / freedom
+    variances *= shares or 1.0
     error = np.sqrt(variances.mean(axis=1))
     return Region(design.scenes, design.seeds, evenness(variances)).limits(level) * error
 

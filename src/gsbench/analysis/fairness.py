@@ -9,7 +9,7 @@ import statistics
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from typing import Any
 
-from gsbench.analysis.advice import Advice, equal_counts_command, start_smaller, train_longer
+from gsbench.analysis.advice import Advice, equal_counts_settings, start_smaller, train_longer
 from gsbench.analysis.differences import (
     between_scenes_notes,
     compared_trials,
@@ -20,7 +20,7 @@ from gsbench.analysis.differences import (
     is_mixed,
 )
 from gsbench.analysis.notes import Note
-from gsbench.analysis.pairing import pair_trials
+from gsbench.analysis.pairs import pair_trials
 from gsbench.analysis.quantities import COSTS, Reader, relative_change
 from gsbench.analysis.results import Arm, TrialResult, group_by, read_experiment, trials_of
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
@@ -56,7 +56,7 @@ def caveats(
 def counts_notes(
     trials: Sequence[TrialResult],
     pairs: Iterable[tuple[Arm, Arm]],
-    advise: Advice = equal_counts_command,
+    advise: Advice = equal_counts_settings,
 ) -> list[Note]:
     """A note for each baseline on the arms that have more Gaussians over common scenes, or fewer.
 

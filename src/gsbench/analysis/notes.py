@@ -45,43 +45,21 @@ SENTENCES: dict[str, str] = {
     "unlike": "{text}",  # the whole text of an error
     "conditions": "{scene}: the arms differ in {conditions:list}, so they are not compared",
     "same capture": "{scene} has the photographs of {other}, so it is no further scene",
-    "unpaired": "{scene}: seed {seed} has no partner",
     "valueless": "{places:few} not compared: {reason}",
-    "no direction": "in no verdict, {reason}",
     "uneven": (
         "{least:n seed} of each scene can count: there are no more of {scenes:few} (others have up "
         "to {most})"
     ),
-    "no pairs": "no trials of {baseline} and {arm} can be paired",
     "no value": "{reason}",
     # ---- questions that cannot be tested
     "equal": (
         "both arms of {pairs:n pair} of trials are equal to the last bit: the settings that differ "
         "had no effect at this size"
     ),
-    "as given": "{text}",  # a reason from a file of claims
-    "seen": (
-        "{trials:n trial} had been measured before this was declared. So the metric shares the "
-        "error rate with all metrics that could have been chosen"
-    ),
     # ---- arms and trials in no verdict
-    "no partner": "{arm} is not compared: there is no {partner}.",
-    "lone baseline": (
-        "{arm} is not compared: it has the baseline's densifier, and no other arm has its "
-        "initialiser."
-    ),
-    "far baseline": (
-        "{arm} is not compared: other arms have a baseline with settings nearer to theirs."
-    ),
-    "unused": "In no verdict: {trials:few} ({reasons:few}).",
-    "judged apart": (
-        "Judged without {trials:few}, which other verdicts and tables use: {arms:few} against "
-        "{baseline}."
-    ),
-    "not planned": "seeds after an undeclared or missing one do not count",
+    "no partner": "{arm} is not compared: nothing was trained to compare it with.",
+    "unused": "Not in the verdict on {arm}, whose question did not name them: {trials:few}.",
     "waits": "a look waits for all of its trials",
-    "decided before": "the question was decided with {seeds:n seed}",
-    "not asked": "in no declared question",
     # ---- arms that are unlike in more than was asked
     "scenes differ": "Scenes of {arms:all} differ in more than the scene: {differences}.",
     "unequal counts": (
@@ -112,34 +90,11 @@ SENTENCES: dict[str, str] = {
         "and all were measured on the test views that the verdict uses."
     ),
     # ---- verdicts, and what was declared
-    "verdict": "Verdict, {sentence}",
-    "declared beforehand": "{metric} was declared beforehand (eval.primary, {when}).",
-    "declared": "{metric} was declared (eval.primary, {when}).",
-    "doubted": (
-        "An arm whose metric or trials were declared after its first result is judged in all "
-        "metrics, adjusted for their number. To test {metric} alone, run other seeds under another "
-        "name, all by one command."
-    ),
-    "replaced": "Also declared, but in force for no arm: {metric} ({when}).",
-    "looks to come": (
-        "Seeds come in planned looks (launch.stop_when_decided). Not there yet: {missing} of the "
-        "{declared:n declared trial}."
-    ),
-    "early look": (
-        "Still missing: {missing} of the {declared:n declared trial}, so this is an early look. "
-        "Do not stop here because the result pleases: that finds effects that do not exist."
-    ),
-    "elsewhere": (
-        "Also measured by other code on these scenes and seeds: {arm}, in {experiments:all}. Each "
-        "name has an error rate of its own, so whoever reports the better version errs more often."
-    ),
     "same bits": (
         "The same bits in all trials of one scene and seed: {arms:all}. The settings in which they "
         "differ had no effect, so there is nothing to compare."
     ),
     # ---- claims, gates and ledgers of ideas
-    "least not shown": "by {effect} or more is not shown",
-    "look waits": "the next look waits for trials that are missing",
     "failed": "failed: {reasons:few}",
     "other machine": (
         "deviation: the baseline ran on another kind of machine ({baseline:all}) than the new "
@@ -153,14 +108,14 @@ SENTENCES: dict[str, str] = {
         "{idea}: the ledger says {recorded}, but its trials say {now}: one of them was edited"
     ),
     # ---- how to read a table
-    "one trial": "One trial per cell, so there is no deviation.",
-    "mean": "Mean over {trials:n trial}; ± is the deviation (n − 1) over {spread}.",
-    "bold": "Bold: best mean of a scene after rounding; this is not a test.",
+    "one trial": "One trial per cell, so there is no deviation. Protocol {protocols:list}.{bold}",
+    "mean": (
+        "Mean over {trials:n trial}; ± is the deviation (n − 1) over {spread}. Protocol "
+        "{protocols:list}.{bold}"
+    ),
     "few values": "(k/{trials}): k of {trials:n trial} with a value; —: none.",
-    "protocol": "Protocol {protocols:list}.",
     "not available": "n/a, {reason}.",
     "no mean": "No mean over the scenes is shown, since they differ in conditions or code.",
-    "no best": "{place}: not compared, no best marked: the arms differ in {conditions:list}.",
     "unusable": "Left out ({count}): {folders:few}.",
     "agreement": (
         "Metrics agree with people only in part. Their rank correlation with viewers' scores of "
@@ -173,13 +128,9 @@ SENTENCES: dict[str, str] = {
         "Pictures of scene.images and of scene.downscale were made by different filters: results "
         "on them differ by about 0.3 to 0.45 dB."
     ),
-    "near twins": (
-        "{scene}: training has near twins of {near} of {tested:n test view}, which so measure "
-        "memory too."
-    ),
-    "copies": "{scene}: {copies:n photograph} left out: another one has the same name or content.",
     "few rounds": FEW_ROUNDS,
-    "cloud": "Before training, {scene} {init}: {doubt}.",
+    "odd": "{scene} {init}: {doubt}.",
+    "accepted": "{scene} {init}, accepted by scene.accept=[{rule}]: {doubt}.",
     "program's model": (
         "Trained here by another program, its model rendered by gsbench (its time is that of the "
         "whole program, and it sets its own budget): {arms:list}."
@@ -195,10 +146,6 @@ SENTENCES: dict[str, str] = {
     "foreign renders": (
         "Renders of another program, measured as they are (its conditions are not known): "
         "{arms:list}."
-    ),
-    "edited": (
-        "{module} was edited since: {trials:n trial} of {arms:few} came from the old code. Give "
-        "the command again to run the new one."
     ),
     "machines": (
         "The trials ran on {kinds} kinds of machine: {trials:parts}. There equal settings give "

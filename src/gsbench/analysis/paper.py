@@ -1,11 +1,14 @@
 """Printed numbers of papers, their tables as measured, and the differences."""
 
+from __future__ import annotations
+
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
+from typing import TYPE_CHECKING
 
 import yaml
 
@@ -16,6 +19,9 @@ from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.analysis.tables import build_table
 from gsbench.errors import InputError
 from gsbench.words import did_you_mean, signed
+
+if TYPE_CHECKING:
+    from gsbench.analysis.comparison import Comparison
 
 # suffix of an experiment that repeats a table with each initialiser's own poses and gauge
 OWN = "_own"
@@ -128,6 +134,7 @@ def paper_tables(
     name: str,
     trials: Sequence[TrialResult] | None = None,
     metrics: Sequence[str] | None = None,
+    comparison: Comparison | None = None,
 ) -> list[Table]:
     """The measured table in the paper's layout, and that of differences from its numbers.
 
@@ -168,6 +175,7 @@ def paper_tables(
         metrics=metrics,
         title=f"{title}, measured (experiment {experiment.name})",
         order=([(scene,) for scene in scenes], [arm[-len(columns) :] for arm in shown]),
+        comparison=comparison,
         names=PRINTED_NAMES
         | {own: PRINTED_NAMES[of_paper] for of_paper, own in run_as.items() if own in STAND_FOR},
     )
@@ -265,7 +273,8 @@ def _differences(
         "so the spread of its own trials is not taken into account; a single trial has no interval."
     )
     headings = ("scene", "init", "densify")
-    return Table(title, headings, tuple(columns), tuple(rows), (legend, *notes, *setup_notes))
+    below = legend, " ".join(notes), " ".join(setup_notes)
+    return Table(title, headings, tuple(columns), tuple(rows), tuple(filter(None, below)))
 
 
 def _difference(

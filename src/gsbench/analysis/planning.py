@@ -1,13 +1,14 @@
 """Numbers of scenes and seeds that a command needs to show a difference.
 
 The commands differ in their error rate and in their looks, so the same trials have other chances.
-Trainings are simulated with equally noisy scenes, and decided by the thresholds of the judge.
+Trainings are simulated with the shares of noise that the pilot's scenes have, and decided by the
+thresholds of the judge.
 """
 
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import cache, partial
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,13 +25,12 @@ from gsbench.analysis.designs import (
     designs_needed,
     power_of_mean,
 )
-from gsbench.analysis.looks import look_levels, plan_looks
+from gsbench.analysis.questions import look_shares, plan_looks
 from gsbench.analysis.statistics import ALPHA
 from gsbench.analysis.thresholds import Region, evenness
 
-COMMANDS = ("sweep", "looks", "check", "gate", "ledger")
-LEVEL_DRAWS = 10_000  # for the levels of looks: fewer than in verdicts, since there are many plans
-# seeds and scenes of designs with looks, whose levels take a second each
+COMMANDS = ("sweep", "looks", "gate", "ledger")
+# seeds and scenes of designs with looks
 LOOK_SEEDS, LOOK_SCENES = 12, (1, 2, 3, 4, 5, 6, 8, 10, 13)
 UNSURE = 0.8  # of pilots have the real deviation within the stated range
 
@@ -49,19 +49,20 @@ class Purpose:
     give_up: float = 0.0
     screen: float = 0.0
 
-    def power(self, design: Design, difference: float, deviation: float) -> float:
-        """The chance that the command shows ``difference``; pairs differ by ``deviation``."""
+    def power(self, design: Design, difference: float, noise: Components) -> float:
+        """The chance that the command shows ``difference`` where pairs differ as in ``noise``."""
+        deviation, shares = noise.within, noise.shares_of(design.scenes)
         if deviation == 0:
             return 1.0 if difference else 0.0
         if self.screen:
             first, then = replace(self, rate=self.screen, screen=0.0), replace(self, screen=0.0)
-            return math.prod(test.power(design, difference, deviation) for test in (first, then))
+            return math.prod(test.power(design, difference, noise) for test in (first, then))
         if not self.looks:
-            return power_of_mean(deviation, design, difference, self.rate)
+            return power_of_mean(deviation, design, difference, self.rate, shares)
         shown = np.zeros(DESIGN_DRAWS, dtype=bool)
         open_ = ~shown
         size = abs(difference) / deviation
-        for mean, error, region, level in _looks(design, self.rate):
+        for mean, error, region, level in _looks(design, self.rate, shares):
             reach = region.limits(level) * error
             better = open_ & (size + mean > reach)
             shown |= better
@@ -71,7 +72,7 @@ class Purpose:
             open_ &= ~ends
         return float(shown.mean())
 
-    def designs(self, difference: float, deviation: float) -> list[Design]:
+    def designs(self, difference: float, noise: Components) -> list[Design]:
         """The designs with a power of `POWER`, one per number of scenes, with the fewest seeds.
 
         A number of scenes is left out if it needs no fewer seeds than fewer scenes do.
@@ -82,11 +83,11 @@ class Purpose:
                 2,
                 chosen[-1].seeds - 1 if chosen else LOOK_SEEDS if self.looks else MAX_SEEDS,
             )
-            if high < 2 or self.power(Design(scenes, high), difference, deviation) < POWER:
+            if high < 2 or self.power(Design(scenes, high), difference, noise) < POWER:
                 continue
             while low < high:  # the power rises with the number of seeds
                 middle = (low + high) // 2
-                enough = self.power(Design(scenes, middle), difference, deviation) >= POWER
+                enough = self.power(Design(scenes, middle), difference, noise) >= POWER
                 low, high = (low, middle) if enough else (middle + 1, high)
             chosen.append(Design(scenes, high))
         return chosen
@@ -129,14 +130,15 @@ def make_plan(components: Components, difference: float, purpose: Purpose, most:
     def fewest(designs: Sequence[Design]) -> tuple[Design, ...]:
         return tuple(sorted(designs, key=lambda design: (design.trials, design.scenes))[:most])
 
-    these, like_these = fewest(purpose.designs(difference, components.within)), None
+    these, like_these = fewest(purpose.designs(difference, components)), None
     if components.between is not None:
         like_these = fewest(designs_needed(difference, components, like_these=True))
     low, high = deviation_range(replace(components, within=1.0))
     powers = None
     if these:
         of_first = partial(purpose.power, these[0], difference)
-        powers = of_first(high * components.within), of_first(low * components.within)
+        ends = [replace(components, within=one * components.within) for one in (high, low)]
+        powers = of_first(ends[0]), of_first(ends[1])
     factors = low, high
     return Plan(components, these, like_these, factors, powers)
 
@@ -150,12 +152,13 @@ def deviation_range(components: Components) -> tuple[float, float]:
 
 
 def _looks(
-    design: Design, rate: float
+    design: Design, rate: float, shares: tuple[float, ...]
 ) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64], Region, float]]:
     """Means and standard errors [DESIGN_DRAWS] at each look, thresholds, and the level."""
     looks = plan_looks(design.seeds)
-    levels = _levels(design.scenes, looks, rate)
+    levels = [rate * share for share in look_shares(len(looks))]
     draws = np.random.default_rng(0).standard_normal((DESIGN_DRAWS, design.scenes, design.seeds))
+    draws *= np.sqrt(shares)[:, None]
     for seeds, level in zip(looks, levels, strict=True):
         pairs = draws[:, :, :seeds]
         variances = pairs.var(axis=2, ddof=1)
@@ -166,8 +169,3 @@ def _looks(
             Region(design.scenes, seeds, evenness(variances)),
             level,
         )
-
-
-@cache
-def _levels(scenes: int, looks: tuple[int, ...], rate: float) -> tuple[float, ...]:
-    return look_levels(scenes, looks, rate, LEVEL_DRAWS)

@@ -124,7 +124,8 @@ def choose_quantities(
     trials = list(trials)
     if names is None:
         wanted = {key for trial in trials for key in _lpips_asked_for(trial)}
-        names = [*metric_keys(trials, wanted), "gaussians", "train_time"]
+        costs = [key for key in ("gaussians", "train_time") if any(map(COSTS[key][1], trials))]
+        names = [*metric_keys(trials, wanted), *costs]
     return [quantity(name, trials) for name in names]
 
 
@@ -229,6 +230,8 @@ def _protocol_lpips(trial: TrialResult) -> str:
 
 def _lpips_asked_for(trial: TrialResult) -> list[str]:
     """The key of the protocol's LPIPS, or those of ``eval.lpips`` if it asks only for others."""
+    if trial.made_elsewhere and not trial.config:  # a row of a table
+        return []
     by_protocol, setting = _protocol_lpips(trial), trial.config.get("eval.lpips")
     asked = [f"{LPIPS}{variant}" for variant in setting] if isinstance(setting, list) else []
     return asked if asked and by_protocol not in asked else [by_protocol]

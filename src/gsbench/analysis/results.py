@@ -7,9 +7,8 @@ tables over thousands of trials start quickly.
 
 import math
 import re
-from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -18,12 +17,12 @@ from gsbench.analysis.trial_settings import Configurations, settings_text
 from gsbench.errors import InputError
 from gsbench.files import require_no_links
 from gsbench.parsing import DamagedError, one_line
+from gsbench.runs.commands import Digest, History, Question, code_in, read_history
 from gsbench.runs.experiments import Arm as Arm
-from gsbench.runs.experiments import Declaration, experiment_home, read_declarations, trial_folders
+from gsbench.runs.experiments import experiment_home, trial_folders
 from gsbench.runs.freshness import Change, code_changes
-from gsbench.runs.layout import CONFIG, FAILED, FORGOTTEN, PER_VIEW, RESULTS, SEED
+from gsbench.runs.layout import CONFIG, FAILED, PER_VIEW, RESULTS, SEED
 from gsbench.runs.nested import SHOWN
-from gsbench.runs.seen import SeenResult, read_seen
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import UnfinishedError
 from gsbench.words import command, counted, some_of
@@ -40,13 +39,55 @@ TrialPair = tuple[TrialResult, TrialResult]  # a trial of the baseline and one o
 
 
 @dataclass(frozen=True)
+class Unfinished:
+    """A trial without a usable result: it failed, runs, waits, was stopped, is damaged or gone.
+
+    Or (``failed``) it ended without the metric of a question.
+    """
+
+    path: Path
+    digest: Digest
+    failed: bool = False
+    running: bool = False
+
+    @classmethod
+    def of(cls, trial: TrialResult) -> "Unfinished":
+        """A finished trial that lacks what a question asks of it."""
+        return cls(trial.path, trial.digest, failed=True)
+
+    @property
+    def scene(self) -> str:
+        return self.path.parts[-3]
+
+    @property
+    def seed(self) -> int:
+        return int(self.path.name.partition(SEED)[2])
+
+    @property
+    def label(self) -> str:
+        return "/".join(self.path.parts[-4:])
+
+    @property
+    def by_key(self) -> "Unfinished":
+        """The same, with the trial's key in place of its digest, as a ledger names trials."""
+        return replace(self, digest=f"{self.scene}/{self.digest.partition('+')[0]}")
+
+    def is_of(self, question: Question, side: int | None = None) -> bool:
+        """Return whether a question is about it, as a trial of this side (1: the idea)."""
+        sides = question.digests.get(self.scene, ())
+        chosen = sides if side is None else sides[side : side + 1]
+        # without a digest, as in files of earlier versions, the code is not known
+        known = {digest.partition("+")[0] for digest in chosen} | set(chosen)
+        return self.digest in known and self.seed in question.seeds.get(self.scene, ())
+
+
+@dataclass(frozen=True)
 class Experiment:
     """The usable trials of an experiment, and ``faults``, a line for each folder without one.
 
     ``older`` are trials of earlier code that `newest_code` left out, of which ``versions`` has a
-    line for each part of the code, and those that were forgotten (``status --forget-superseded``).
-    ``lacking`` are the folders of trials without a usable result: they failed, were stopped, or
-    are damaged. ``seen`` is what was ever measured.
+    line for each part of the code. ``unfinished`` are the trials without a usable result.
+    ``history`` is what was asked.
     """
 
     name: str
@@ -55,13 +96,8 @@ class Experiment:
     faults: tuple[str, ...]
     older: tuple[TrialResult, ...] = ()
     versions: tuple[str, ...] = ()
-    lacking: tuple[Path, ...] = ()
-    seen: tuple[SeenResult, ...] = ()
-
-    @cached_property
-    def declarations(self) -> list[Declaration]:
-        """All declarations, the oldest first, also those that only the trials' results repeat."""
-        return read_declarations(self.folder, (trial.record.declared for trial in self.trials))
+    unfinished: tuple[Unfinished, ...] = ()
+    history: History = field(default_factory=lambda: History(Path()))
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -70,8 +106,7 @@ class Experiment:
 
     @property
     def left_out(self) -> int:
-        forgotten = sum(FORGOTTEN in trial.path.parts for trial in self.older)
-        return len(self.faults) + len(self.older) - forgotten
+        return len(self.faults) + len(self.older)
 
     @property
     def seeds(self) -> tuple[int, ...]:
@@ -137,83 +172,99 @@ def read_experiment(folder: Path) -> Experiment:
     usable.sort(
         key=lambda trial: (trial.scene, trial.init, trial.densify, trial.seed, trial.config_hash)
     )
-    known = {
-        (key, seed): declared.moment
-        for declared in reversed(read_declarations(folder))
-        for key, seeds in declared.known.items()
-        for seed in seeds
-    }
-    usable = [
-        replace(trial, known=known[trial.key, trial.seed])
-        if (trial.key, trial.seed) in known
-        else trial
-        for trial in usable
-    ]
-    forgotten, unread = _forgotten(folder, {trial.path for trial in usable})
+    history = read_history(folder)
     warnings = sorted(f"{path.relative_to(runs_dir)}: {fault}" for path, fault in faults.items())
-    lacking = tuple(
-        path
-        for path, fault in sorted(faults.items())
-        if TRIAL_FOLDER.fullmatch(path.name) and not fault.startswith(FOREIGN)
-    )
     return Experiment(
         folder.name,
         folder,
-        tuple(usable),
-        (*warnings, *unread),
-        forgotten,
-        lacking=lacking,
-        seen=read_seen(folder),
+        _with_askers(usable),
+        (*warnings, *history.faults),
+        unfinished=tuple(_unfinished(folder, faults, usable, history)),
+        history=history,
     )
 
 
-def _forgotten(home: Path, there: Collection[Path]) -> tuple[tuple[TrialResult, ...], list[str]]:
-    """The forgotten trials of an experiment that are not ``there`` again, and warnings."""
-    found, warnings, settings = list[TrialResult](), [], Configurations()
-    for path in map(Path, trial_folders(home / FORGOTTEN)) if (home / FORGOTTEN).is_dir() else ():
-        try:
-            trial = read_trial(path, home.parent, settings)
-        except UnusableError as reason:
-            if (path / RESULTS).exists():  # others failed, and showed nothing
-                warnings.append(f"{path.relative_to(home.parent)}: {one_line(str(reason))}")
-            continue
-        if home / path.relative_to(home / FORGOTTEN) not in there:
-            found.append(trial)
-    return tuple(sorted(found, key=lambda trial: trial.path)), warnings
+def _with_askers(trials: Sequence[TrialResult]) -> tuple[TrialResult, ...]:
+    """The trials; those that share a training are asked by the questions of any of them."""
+    by_training: dict[str, list[str]] = {}
+    for trial in trials:
+        if training := trial.record.hashes.get("train"):
+            by_training.setdefault(training, []).extend(trial.record.questions)
+    found = []
+    for trial in trials:
+        questions = by_training.get(trial.record.hashes.get("train", ""), [])
+        if questions and not trial.record.questions:
+            trial = replace(trial, record=replace(trial.record, questions=questions))
+        found.append(trial)
+    return tuple(found)
+
+
+def _unfinished(
+    home: Path, faults: Mapping[Path, str], usable: Sequence[TrialResult], history: History
+) -> Iterable[Unfinished]:
+    """The trials without a usable result, planned ones included."""
+    done = {trial.path for trial in usable}
+    begun = {path for path, fault in faults.items() if not fault.startswith(FOREIGN)}
+    for path in sorted((begun | history.planned.keys()) - done):
+        if TRIAL_FOLDER.fullmatch(path.name):
+            planned, folder = history.planned.get(path), TrialFolder(path)
+            digest = f"{path.parent.name}/{path.name.partition(SEED)[0]}"
+            state = folder.state() if path.is_dir() else "missing"
+            yield Unfinished(
+                path,
+                digest if planned is None else planned.digest or digest,
+                failed=state in ("failed", "damaged"),
+                running=state == "running",
+            )
 
 
 def newest_code(experiment: Experiment) -> Experiment:
-    """The experiment without trials that later code repeated.
+    """The experiment without trials of earlier code.
 
-    A warning for each part of the code names its earlier versions, with their numbers of trials.
-    Trials of one scene, arm and settings that differ only in their code are versions of one thing.
-    Those count whose user's code is what it is now, or else those that were finished last.
+    The code of an idea is that of its newest question; without one, that of the trial which was
+    finished last. A warning for each part of the code names the earlier versions.
     """
+    code: dict[str, str] = {}
+    for question in experiment.history.questions:
+        for arm, side in ((question.baseline, 0), (question.idea, 1)):
+            digests = [both[side] for both in question.digests.values() if both[side]]
+            if digests:
+                code[arm.name] = code_in(digests[-1])
     older: list[TrialResult] = []
     # {(part, version that counts): {earlier version: its trials}}
     replaced: dict[tuple[str, str], dict[str, list[TrialResult]]] = {}
-    for of_arm in group_by(experiment.trials, lambda t: (t.scene, t.init, t.densify)).values():
-        if len({frozenset(trial.code.items()) for trial in of_arm}) < 2:
-            continue
-        # eval.primary, switches and the place of the photographs do not tell trials apart
-        for same in group_by(of_arm, lambda trial: settings_text(trial.config)).values():
-            versions = group_by(same, lambda trial: frozenset(trial.code.items()))
-            newest = max(
-                versions.values(),
-                key=lambda made: (not made[0].edits, max(trial.finished for trial in made)),
-            )
-            for made in versions.values():
-                if made is not newest:
-                    older += made
-                    change = _change_of_code(made[0], newest[0])
-                    earlier = replaced.setdefault((change.name, change.now), {})
-                    earlier.setdefault(change.made, []).extend(made)
+
+    def fold(made: Sequence[TrialResult], now: Sequence[TrialResult], name: str) -> None:
+        older.extend(made)
+        change = _change_of_code(made[0], now[0]) if now else Change("code", name, now="newer")
+        earlier = replaced.setdefault((change.name, change.now), {})
+        earlier.setdefault(change.made, []).extend(made)
+
+    for name, own in group_by(experiment.trials, lambda t: f"{t.init}-{t.densify}").items():
+        versions = group_by(own, lambda trial: code_in(trial.digest))
+        newest = code.get(name, max(versions, key=lambda version: _last(versions[version])))
+        for version, made in versions.items():
+            if version != newest:
+                fold(made, versions.get(newest, []), name)
+        # an update of gsbench: the trials of a scene and settings that it repeated
+        same = group_by(versions.get(newest, []), lambda t: (t.scene, settings_text(t.config)))
+        for repeated in same.values():
+            stages = group_by(repeated, lambda trial: frozenset(trial.code.items()))
+            last = max(stages.values(), key=_last)
+            for made in stages.values():
+                if made is not last:
+                    fold(made, last, name)
     if not older:
         return experiment
     left_out = {trial.path for trial in older}
     kept = tuple(trial for trial in experiment.trials if trial.path not in left_out)
-    lines = tuple(_versions_line(*code, earlier) for code, earlier in replaced.items())
+    lines = tuple(_versions_line(*part, earlier) for part, earlier in replaced.items())
     return replace(experiment, trials=kept, older=(*experiment.older, *older), versions=lines)
+
+
+def _last(trials: Sequence[TrialResult]) -> float:
+    """When the last of the trials was finished."""
+    return max(trial.finished for trial in trials)
 
 
 def _change_of_code(made: TrialResult, newest: TrialResult) -> Change:

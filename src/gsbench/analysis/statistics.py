@@ -14,7 +14,6 @@ from the others.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -23,7 +22,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from gsbench.analysis.thresholds import Region, evenness
-from gsbench.runs.experiments import ERROR_RATE
+from gsbench.runs.commands import ERROR_RATE
 
 ALPHA = ERROR_RATE
 # for a statement about scenes like these: the fewest with which the sign test can reach 5 %
@@ -132,80 +131,6 @@ def favoured(outcome: Outcome, sign: int, direction: int) -> tuple[int, ...]:
         return ()
     toward = sign * direction * (1 if outcome == SUPPORTED else -1)
     return (0, 1) if outcome == TOO_SMALL or not toward else (int(toward > 0),)
-
-
-@dataclass(frozen=True)
-class Answer:
-    """A mean difference with its test, as a member of a family with the error rate ``level``.
-
-    ``p`` is adjusted for the family. ``interval`` has the adjusted error rate ``rate``: it excludes
-    0 exactly if ``p`` is below ``level``. "Too small to matter" is decided at ``equal_rate``, the
-    member's equal share of ``level``. A single pair has no test.
-    """
-
-    mean: float
-    test: StudentT | None
-    level: float
-    rate: float
-    equal_rate: float
-    p: float | None = None
-
-    @property
-    def interval(self) -> Interval | None:
-        return None if self.test is None or not self.rate else self.test.interval(self.rate)
-
-    def outcome(self, sign: int, least: float | None) -> Outcome:
-        if self.test is None or self.interval is None:
-            return "undecided"
-        at_equal_rate = outcome_of(self.test.interval(self.equal_rate), sign, least)
-        return (
-            at_equal_rate
-            if at_equal_rate == TOO_SMALL or not sign
-            else outcome_of(self.interval, sign, None)
-        )
-
-
-def answer_family(
-    members: Sequence[Array], level: float = ALPHA, others: Sequence[float] = ()
-) -> list[Answer]:
-    """Test each of ``members`` [S, K] as a member of one family, by Holm's method (1979).
-
-    ``others`` are the p of tests that belong to the family as well.
-
-    The chance that any stated sign is false is at most ``level``; so is the chance that any "too
-    small" is false.
-    """
-    tests = [t_test(member) for member in members]
-    p_values = [test.p for test in tests if test is not None]
-    factors = iter(holm_factors([*p_values, *others]))
-    equal_rate = level / max(1, len(p_values) + len(others))
-    answers = []
-    for member, test in zip(members, tests, strict=True):
-        if test is None:
-            answers.append(Answer(float(member.mean()), None, level, level, level))
-        else:
-            factor = next(factors)
-            answers.append(
-                Answer(
-                    test.mean, test, level, level / factor, equal_rate, min(1.0, factor * test.p)
-                )
-            )
-    return answers
-
-
-def holm_factors(p_values: Sequence[float]) -> list[float]:
-    """The factor (at least 1) by which Holm's method multiplies each p.
-
-    The smallest of m p is multiplied by m, the next by m - 1, and so on. A product below the one
-    before it is raised to that one.
-    """
-    factors = [0.0] * len(p_values)
-    running = 0.0
-    ascending = sorted((p, index) for index, p in enumerate(p_values))
-    for left, (p, index) in zip(range(len(p_values), 0, -1), ascending, strict=True):
-        running = max(running, left * p)
-        factors[index] = running / p if p > 0 else float(left)
-    return factors
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 TEMPLATES = "gsbench.analysis.report"
+MOST_NOTES = 5  # lines below a table, beside its verdicts
 
 
 @dataclass(frozen=True)
@@ -49,9 +50,10 @@ class Row:
 
 @dataclass(frozen=True)
 class Table:
-    """A titled table with notes below it.
+    """A titled table with the ``verdicts`` on its arms and notes below it.
 
-    The cells of a ``wrapped`` table may need several lines.
+    ``notes`` come in the order of their weight, and at most `MOST_NOTES` lines are shown. The cells
+    of a ``wrapped`` table may need several lines.
     """
 
     title: str
@@ -60,6 +62,15 @@ class Table:
     rows: tuple[Row, ...]
     notes: tuple[str, ...] = ()
     wrapped: bool = False
+    verdicts: tuple[str, ...] = ()
+
+    @property
+    def shown_notes(self) -> tuple[str, ...]:
+        """The first notes; the last line says how many others there are."""
+        if len(self.notes) <= MOST_NOTES:
+            return self.notes
+        first = self.notes[: MOST_NOTES - 1]
+        return (*first, f"{len(self.notes) - len(first)} more notes: in the report.")
 
     @property
     def groups(self) -> list[tuple[str, int]]:
@@ -126,7 +137,7 @@ def to_markdown(table: Table) -> str:
         " | ".join(markdown_text(text).replace("|", "\\|") for text in row)
         for row in (heads, rule, *rows)
     ]
-    notes = [f"- {markdown_text(note)}" for note in table.notes]
+    notes = [f"- {markdown_text(line)}" for line in (*table.verdicts, *table.shown_notes)]
     title = f"### {markdown_text(table.title)}"
     return "\n".join([title, "", *(f"| {line} |" for line in lines), "", *notes]).rstrip() + "\n"
 
@@ -183,11 +194,11 @@ def to_latex(table: Table) -> str:
         column_format="l" * len(table.row_headings) + columns,
         caption=escape_latex(table.title),
     ).replace("\\begin{table}\n", "\\begin{table}\n\\centering\n")
-    if table.notes:
-        notes = "\\\\\n".join(escape_latex(note) for note in table.notes)
+    if below := (*table.verdicts, *table.shown_notes):
+        notes = "\\\\\n".join(map(escape_latex, below))
         start = "\\par\\smallskip\\begin{minipage}{\\linewidth}\\footnotesize"
-        below = f"{start}\n{notes}\n\\end{{minipage}}\n"
-        text = text.replace("\\end{table}", f"{below}\\end{{table}}")
+        added = f"{start}\n{notes}\n\\end{{minipage}}\n"
+        text = text.replace("\\end{table}", f"{added}\\end{{table}}")
     return f"% needs \\usepackage{{booktabs{',array' if table.wrapped else ''}}}\n{text}"
 
 

@@ -1,16 +1,22 @@
 """The notes below a table: who trained, on what, doubts, and how else the compared arms differ."""
 
+from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from gsbench.analysis.fairness import caveats, counts_notes, limit_notes
 from gsbench.analysis.notes import Note
-from gsbench.analysis.results import Experiment, TrialResult, group_by, seeds_text
+from gsbench.analysis.results import TrialResult, group_by, seeds_text
 from gsbench.events import FEWEST_ROUNDS
 from gsbench.runs.layout import EVENTS
 from gsbench.runs.nested import SHOWN
-from gsbench.runs.trial_record import FROM_MODEL, FROM_RENDERS, TwinViews
+from gsbench.runs.trial_record import FROM_MODEL, FROM_RENDERS
 from gsbench.words import counted
+
+if TYPE_CHECKING:
+    from gsbench.analysis.comparison import Comparison
 
 LEARNT_NOTHING = "(!)"  # marks means over a trial that is not better than one colour
 # notes on arms that gsbench did not train: whether another program trained them here, and the
@@ -23,12 +29,36 @@ ORIGINS = {
 }
 
 
-def trials_notes(experiment: Experiment, trials: Sequence[TrialResult]) -> list[Note]:
+# Kinds of notes in the order of their weight; the others come after them.
+HEAVIEST = (
+    "one trial",
+    "mean",
+    "worthless",
+    "unusable",
+    "unused",
+    "edited",
+    "limit not reached",
+    "unequal counts",
+    "no partner",
+    "same bits",
+    "not available",
+    "few values",
+    "no mean",
+)
+
+
+def by_weight(notes: Sequence[Note]) -> list[Note]:
+    """The notes with the heaviest first, so that those are read."""
+    weights = {kind: weight for weight, kind in enumerate(HEAVIEST)}
+    return sorted(notes, key=lambda note: weights.get(note.kind, len(weights)))
+
+
+def trials_notes(comparison: Comparison, trials: Sequence[TrialResult]) -> list[Note]:
     """All notes on ``trials`` of an experiment and on its comparisons."""
     return [
         *doubt_notes(trials),
         *origin_notes(trials),
-        *comparison_notes(experiment),
+        *comparison_notes(comparison),
         *held_out_notes(trials),
         *points_notes(trials),
         *machine_notes(trials),
@@ -36,16 +66,8 @@ def trials_notes(experiment: Experiment, trials: Sequence[TrialResult]) -> list[
     ]
 
 
-def comparison_notes(experiment: Experiment) -> list[Note]:
-    """Notes on the compared arms: verdicts, remarks and caveats.
-
-    They are about the whole experiment, so choosing the trials that a table shows cannot change a
-    verdict.
-    """
-    # here, since SciPy is slow to import
-    from gsbench.analysis.comparison import compare
-
-    comparison = compare(experiment)
+def comparison_notes(comparison: Comparison) -> list[Note]:
+    """Notes on the compared arms: remarks and caveats."""
     by_arm = group_by(comparison.trials, lambda trial: trial.arm)
     between = [
         note
@@ -53,14 +75,14 @@ def comparison_notes(experiment: Experiment) -> list[Note]:
         for note in caveats([*by_arm[first], *by_arm[second]], first, second)
     ]
     both = comparison.trials, comparison.pairs
-    return [*comparison.notes(), *limit_notes(*both), *counts_notes(*both), *between]
+    return [*comparison.remarks, *limit_notes(*both), *counts_notes(*both), *between]
 
 
 def doubt_notes(trials: Sequence[TrialResult]) -> list[Note]:
     """Notes on results that are worth little or may surprise.
 
     They are about renders not better than one colour, executors that failed their proof, pictures
-    made by different filters, twins, and doubts about initial points.
+    made by different filters, and what rules found odd (`gsbench.scene.rules`).
     """
     notes = []
     for trial in trials:
@@ -72,19 +94,13 @@ def doubt_notes(trials: Sequence[TrialResult]) -> list[Note]:
     downscales = {config.get("scene.downscale") for config in known}
     if len(folders) > 1 and len(downscales) > 1:
         notes.append(Note.of("filters"))
-    for trial in trials:
-        twins, tested = trial.record.twins or TwinViews(), trial.record.test_views
-        if near := len(twins.near):
-            notes.append(Note.of("near twins", scene=trial.scene, near=near, tested=tested))
-        if copies := len(twins.left_out):
-            notes.append(Note.of("copies", scene=trial.scene, copies=copies))
     by_arm = group_by(trials, lambda trial: trial.key.partition("/")[2])  # of one schedule each
     notes += [note for own in by_arm.values() if (note := _rounds_note(own[0]))]
     for trial in trials:
-        cloud = trial.record.initial_cloud
-        doubts = [] if cloud is None else cloud.warnings
         place = {"scene": trial.scene, "init": trial.init}
-        notes += [Note.of("cloud", **place, doubt=line) for line in doubts]
+        for odd in trial.record.oddities:
+            kind = "accepted" if odd.refused else "odd"
+            notes.append(Note.of(kind, **place, rule=odd.rule, doubt=odd.line))
     return list(dict.fromkeys(notes))  # trials of one cloud have the same notes
 
 

@@ -1,13 +1,15 @@
-"""Tables of an experiment: mean and deviation over trials, best in bold, missing values marked."""
+"""Tables of an experiment: mean and deviation over trials, verdicts, missing values marked."""
+
+from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 from gsbench.analysis.cells import (
     Cell,
-    best_cells,
     check_averageable,
     check_fields,
     field_value,
@@ -19,15 +21,17 @@ from gsbench.analysis.differences import (
     between_scenes_notes,
     conditions_between_scenes,
     differing_code,
-    differing_conditions,
 )
 from gsbench.analysis.notes import Note
 from gsbench.analysis.quantities import Quantity, choose_quantities
-from gsbench.analysis.results import Experiment, TrialResult, group_by
+from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
-from gsbench.analysis.table_notes import LEARNT_NOTHING, trials_notes
+from gsbench.analysis.table_notes import LEARNT_NOTHING, by_weight, trials_notes
 from gsbench.eval.facts import find_metric
 from gsbench.words import counted
+
+if TYPE_CHECKING:
+    from gsbench.analysis.comparison import Comparison
 
 DEFAULT_ROWS = ("scene", "init", "densify")
 SIDE_BY_SIDE = ("scene.split", "scene.sector")
@@ -46,6 +50,7 @@ def build_table(
     title: str | None = None,
     order: tuple[Sequence[Labels], Sequence[Labels]] | None = None,
     names: Mapping[str, str] = MappingProxyType({}),
+    comparison: Comparison | None = None,
 ) -> Table:
     """Cross the values of ``rows`` with those of ``columns``; each combination shows every metric.
 
@@ -53,9 +58,15 @@ def build_table(
     all others: seeds as trials, scenes as means of scenes. By default, rows are scene, initialiser,
     densifier and every swept setting; swept splits are columns. ``order`` gives the rows and
     columns to show, even if nothing was run there. ``names`` replaces values in headings. Raises
-    ``InputError`` if a cell would average unlike trials.
+    ``InputError`` if a cell would average unlike trials. ``comparison`` has the verdicts on the
+    table's arms, by default those of the experiment. Bold is the best mean if it was shown to be
+    better.
     """
+    # here, since SciPy is slow to import
+    from gsbench.analysis.comparison import compare, winners
+
     trials = list(experiment.trials if trials is None else trials)
+    comparison = compare(experiment) if comparison is None else comparison
     if rows is None:
         swept = swept_settings(trials)
         # another split is another question about the same arms, so it gets a column
@@ -82,15 +93,17 @@ def build_table(
         cells[row, column, quantity.key] = make_cell(
             groups.get((*row, *column), []), quantity, own_scenes, expected
         )
-    bold, notes = _best(cells, quantities, scene_index)
-    shown = _rows(cells, bold, quantities)
     varied = with_variants(trials)
+    shown_best = winners(comparison)
+    bold = _best(cells, quantities, shown_best, varied)
+    shown, notes = _rows(cells, bold, quantities), list[Note]()
     if "scene" in rows and len(scenes) > 1 and _have_unlike_scenes(varied):
         notes.append(Note.of("no mean"))
     elif "scene" in rows and len(scenes) > 1:
         place = list(rows).index("scene")
         means = _means(groups, place, row_labels, column_labels, quantities, scenes, expected)
-        best = set() if notes else _best(means, quantities, None)[0]
+        best = _best(means, quantities, shown_best, varied)
+        bold |= best
         shown += _rows(means, best, quantities, ruled=True)
     headings = []
     for quantity, column in itertools.product(quantities, column_labels):
@@ -98,14 +111,21 @@ def build_table(
         if columns:
             above, text = text, " + ".join(names.get(value, value) for value in column)
         headings.append(Column(above, text, (quantity.key, "+".join(column))))
-    notes += _reading_notes(cells, quantities, expected, scene_index is not None)
+    notes += _reading_notes(cells, quantities, expected, scene_index is not None, bool(bold))
     notes += between_scenes_notes(varied)
-    notes += trials_notes(experiment, trials)
+    notes += trials_notes(comparison, trials)
     # the line on versions stands for many trials, so it comes before the folders that are cut off
     if lines := [*experiment.versions, *experiment.faults]:
         notes.append(Note.of("unusable", count=experiment.left_out, folders=lines))
     heading = title or f"Experiment {experiment.name}"
-    return Table(heading, tuple(rows), tuple(headings), tuple(shown), tuple(map(str, notes)))
+    return Table(
+        heading,
+        tuple(rows),
+        tuple(headings),
+        tuple(shown),
+        tuple(map(str, by_weight(notes))),
+        verdicts=tuple(filter(None, [*comparison.lines, comparison.risk])),
+    )
 
 
 def format_cell(cell: Cell, quantity: Quantity) -> str:
@@ -147,34 +167,34 @@ def _rows(
 
 
 def _best(
-    cells: Mapping[Position, Cell], quantities: Sequence[Quantity], scene_index: int | None
-) -> tuple[set[Position], list[Note]]:
-    """The best cells of each scene, and a note for each scene whose cells cannot be compared.
+    cells: Mapping[Position, Cell],
+    quantities: Sequence[Quantity],
+    winners: Mapping[tuple[str, frozenset[str]], set[Arm]],
+    trials: Sequence[TrialResult],
+) -> set[Position]:
+    """The cells with the best mean whose arm was shown to be better, on exactly these scenes.
 
-    ``scene_index`` is the index of the scene in the labels of row and column; None if all cells are
-    compared. Cells with different splits answer different questions, so they are not compared.
+    ``winners`` are such arms by metric and scenes; ``trials`` have their variants.
     """
+    arms = {trial.path: trial.arm for trial in trials}
+    direction = {quantity.key: quantity.direction for quantity in quantities}
 
-    def scene_and_split(position: Position) -> tuple[str, str]:
-        scene = "" if scene_index is None else (*position[0], *position[1])[scene_index]
-        return scene, next((trial.split for trial in cells[position].trials), "")
+    def rivals(place: Position) -> tuple[str, frozenset[str]]:
+        return place[2], frozenset(trial.scene for trial in cells[place].trials)
 
     bold: set[Position] = set()
-    notes: list[Note] = []
-    for quantity in quantities:
-        rivals = group_by(
-            (position for position in cells if position[2] == quantity.key), scene_and_split
-        )
-        for (scene, _), positions in rivals.items():
-            compared = {position: cells[position] for position in positions}
-            shown = itertools.chain(*(cell.trials for cell in compared.values()))
-            by_scene = group_by(shown, lambda trial: trial.scene).values()
-            differing = sorted(set().union(*map(differing_conditions, by_scene)))
-            if differing:
-                notes.append(Note.of("no best", place=scene or "arms", conditions=differing))
-            else:
-                bold |= best_cells(compared, quantity)
-    return bold, list(dict.fromkeys(notes))
+    for key, places in group_by(cells, rivals).items():
+        better = winners.get(key, set())
+        merits = {
+            place: direction[key[0]] * mean
+            for place in places
+            if (mean := cells[place].mean) is not None
+        }
+        for place, merit in merits.items():
+            own = {arms[trial.path] for trial in cells[place].trials}
+            if merit == max(merits.values()) and own <= better:
+                bold.add(place)
+    return bold
 
 
 def _means(
@@ -232,17 +252,26 @@ def _have_unlike_scenes(trials: Sequence[TrialResult]) -> bool:
 
 
 def _reading_notes(
-    cells: Mapping[Position, Cell], quantities: Sequence[Quantity], expected: int, by_scene: bool
+    cells: Mapping[Position, Cell],
+    quantities: Sequence[Quantity],
+    expected: int,
+    by_scene: bool,
+    has_bold: bool,
 ) -> list[Note]:
     """Notes on how to read the table's numbers and marks."""
     spread = "trials" if by_scene else "the trials' means of scenes"
-    one_each = expected == 1
-    notes = [Note.of("one trial") if one_each else Note.of("mean", trials=expected, spread=spread)]
-    notes.append(Note.of("bold"))
+    trials = list(itertools.chain(*(cell.trials for cell in cells.values())))
+    facts = {
+        "protocols": sorted({trial.record.protocol for trial in trials}),
+        "bold": " Bold: the best mean, and shown to be better." if has_bold else "",
+    }
+    notes = [
+        Note.of("one trial", **facts)
+        if expected == 1
+        else Note.of("mean", trials=expected, spread=spread, **facts)
+    ]
     if any(0 < cell.count < expected or not cell.trials for cell in cells.values()):
         notes.append(Note.of("few values", trials=expected))
-    trials = itertools.chain(*(cell.trials for cell in cells.values()))
-    notes.append(Note.of("protocol", protocols=sorted({t.record.protocol for t in trials})))
     for one in quantities:
         own = [cell for position, cell in cells.items() if position[2] == one.key]
         reasons = {cell.reason for cell in own if cell.trials and cell.reason}

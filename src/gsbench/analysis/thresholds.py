@@ -20,6 +20,9 @@ from scipy import special
 Array = NDArray[np.float64]
 
 TABLE = Path(__file__).with_name("thresholds.npz")
+# Below this level the tabulated thresholds are too low for some ratios of noise (their size at .5 %
+# is .58 %), so Student's threshold, which is larger, decides.
+LEAST_LEVEL = 0.005
 LEAST_P, MOST_P = 1e-12, 0.99  # the p between which thresholds are computed
 STEPS = 45  # of the bisection for p, which halve its relative error each
 
@@ -77,6 +80,8 @@ class Region:
         """The thresholds [D] at a level."""
         if self.scenes == 1:
             return np.full(self.even.shape, self._student(level))
+        if level < LEAST_LEVEL:
+            return np.full(self.even.shape, self._student(level))
         low, part = _place(level)
         curves = _curves(self.scenes, self.seeds)
         curve = curves[low] + part * (curves[low + 1] - curves[low])
@@ -96,6 +101,7 @@ class Region:
             level = np.exp(middle)
             row, part = _place(level)
             between = f[row, which] + part * (f[row + 1, which] - f[row, which])
+            between = np.where(level < LEAST_LEVEL, 0.0, between)
             significant = sizes > self._student(level) * np.exp(between * self._ratio(level))
             low, high = np.where(significant, low, middle), np.where(significant, middle, high)
         return np.exp(high)

@@ -1,20 +1,18 @@
 """A complete trial as tables and verdicts see it: its record, settings, code and conditions."""
 
-import math
-import os
 import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from gsbench.analysis.trial_settings import Configurations, canonical, config_if_readable
+from gsbench.runs.commands import Digest, make_digest
 from gsbench.runs.experiments import QUESTIONS, Arm, trial_key, unix_time
-from gsbench.runs.freshness import Change, Part, code_changes, code_of, present_version
+from gsbench.runs.freshness import Part, code_of
 from gsbench.runs.layout import RESULTS
 from gsbench.runs.nested import SHOWN
-from gsbench.runs.seen import SeenResult
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS, TrialRecord, split_text
 from gsbench.system.machine import kind_of_machine
@@ -25,8 +23,7 @@ class TrialResult:
     """One complete trial.
 
     ``record`` is its ``results.json``, ``config_hash`` the hash in its folder's name. ``settings``
-    reads the configurations of its experiment. ``known`` is the Unix time of a declaration that
-    its results came before, whatever their own time says.
+    reads the configurations of its experiment.
     """
 
     path: Path
@@ -35,7 +32,7 @@ class TrialResult:
     # swept settings that distinguish arms of one initialiser and densifier
     variant: tuple[tuple[str, str], ...] = ()
     settings: Configurations = field(default_factory=Configurations, repr=False, compare=False)
-    known: float = field(default=math.inf, repr=False)
+    alias: Digest = ""  # stands for the digest where a question names its sides otherwise
 
     @property
     def experiment(self) -> str:
@@ -110,21 +107,24 @@ class TrialResult:
         return code_of(self.record.code)
 
     @cached_property
-    def as_seen(self) -> SeenResult:
-        """The result as the record of what was ever measured has it."""
-        return SeenResult.of(self.record)
+    def digest(self) -> Digest:
+        """The digest of its arm on its scene: settings, user's modules, edited packages."""
+        if self.alias:
+            return self.alias
+        code = self.record.code
+        arm = f"{self.init}-{self.densify}"
+        return make_digest(arm, self.config_hash, code.sources, code.packages)
+
+    @property
+    def asked(self) -> bool:
+        """Return whether a question covered it before its training began."""
+        return bool(self.record.questions)
 
     @property
     def code_texts(self) -> list[str]:
         """``code of mine 3fa9c1d2`` for each of the user's modules and of gsbench's stages."""
         shown = [part for part in self.code if part.kind != "package"]
         return [f"{part} {self.code[part]:.{SHOWN}}" for part in shown]
-
-    @cached_property
-    def edits(self) -> list[Change]:
-        """The user's modules that were edited since, as far as they are found from here."""
-        modules = {part: made for part, made in self.code.items() if part.kind == "module"}
-        return list(code_changes(modules, partial(present_version, folder=os.getcwd())))
 
     @cached_property
     def finished(self) -> float:
@@ -152,7 +152,7 @@ class TrialResult:
     def measured(self) -> float:
         """The Unix time of measuring the metrics; if unrecorded, that of finishing the trial."""
         moment = unix_time(self.record.measured)
-        return min(self.finished if moment is None else moment, self.known - 1)
+        return self.finished if moment is None else moment
 
     @cached_property
     def conditions(self) -> Mapping[str, str]:

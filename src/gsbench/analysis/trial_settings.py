@@ -13,7 +13,14 @@ from gsbench.runs.nested import flatten
 from gsbench.runs.trial_folder import TrialFolder
 
 # settings in which repetitions of a trial may differ
-UNCOUNTED = ("eval.primary", "eval.controls", "densify.switches", "scene.path", "hydra.")
+UNCOUNTED = (
+    "eval.primary",
+    "eval.baseline",
+    "eval.controls",
+    "densify.switches",
+    "scene.path",
+    "hydra.",
+)
 GROUPS = ("scene", "init", "densify")  # groups that every trial's configuration has
 ENCODER = json.JSONEncoder(sort_keys=True, separators=(",", ":"))
 

@@ -1,366 +1,378 @@
-"""The verdicts of a sweep: on each compared pair of arms in each metric that has a direction.
+"""The verdict on a question. `judge` is the only code that decides one.
 
-If the question about an arm was declared in time (``eval.primary``), the declared metric decides
-it. The arms of one declaration share 5 %, one test per pair of arms, as Demšar (2006, section
-3.2.2) adjusts comparisons of many methods with one control. All other metrics of these pairs are
-secondary, with 5 % of their own. They are tested even if the declared metric shows nothing, so that
-a metric that got worse is seen. A declaration may be about one question only
-(``psnr@extrapolation``).
-
-Otherwise the question is exploratory: all metrics of its pair of arms are one family, adjusted by
-Holm (1979). So a further arm never changes the verdict on another one.
-
-If several versions of an arm's code were measured on the pairs of a question, its error rate is
-smaller (`gsbench.analysis.attempts`). The other arms of its declaration are still adjusted for it.
+It needs the question and its trials and nothing else: no folder, no clock, no other question. It
+serves tables, reports, looks, gates and ledgers.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
-from gsbench.analysis.attempts import measured_versions, of_same_arm, share_of_version
-from gsbench.analysis.cells import short_reason
-from gsbench.analysis.declaration import ActiveDeclaration, Standing
-from gsbench.analysis.designs import seeds_needed
-from gsbench.analysis.judgement import OtherTest, Verdict, judge, other_test
+import numpy as np
+
+from gsbench.analysis.differences import between_scenes_notes
 from gsbench.analysis.notes import Note
-from gsbench.analysis.quantities import (
-    NO_DIRECTION,
-    Quantity,
-    asked_quantity,
-    choose_quantities,
+from gsbench.analysis.pairs import SAME_CAPTURE, Pairs, are_equal, pair, pair_sides
+from gsbench.analysis.quantities import Quantity, asked_quantity
+from gsbench.analysis.questions import look_shares
+from gsbench.analysis.results import TrialResult, Unfinished, group_by
+from gsbench.analysis.statistics import (
+    ALPHA,
+    UNDECIDED,
+    Interval,
+    LikeThese,
+    Outcome,
+    StudentT,
+    favoured,
+    judge_like_these,
+    outcome_of,
+    t_test,
 )
-from gsbench.analysis.results import Arm, TrialResult, group_by
-from gsbench.analysis.statistics import UNDECIDED
-from gsbench.analysis.unfinished import Unfinished
-from gsbench.runs.experiments import NO_TIME, Declaration, Question
-from gsbench.runs.seen import SeenResult
+from gsbench.runs.commands import BY_COMMAND, Question
+from gsbench.runs.experiments import Arm
+from gsbench.words import signed
 
-ArmPair = tuple[Arm, Arm]  # baseline, other arm
-DECLARED, SECONDARY = "declared", "secondary"
+# deviations from the other trials of its scene and arm, beyond which a trial is outlying
+OUTLYING = 5.0
+LEAST_OTHERS = 2  # the fewest other trials that this needs
+# corrects the median sample deviation of three trials, which is too small: 1 / sqrt(ln 2)
+FEW = 1.2
 
-
-@dataclass(frozen=True)
-class PairVerdicts:
-    """The verdicts on two arms, that on the declared metric first.
-
-    ``notes`` say what could not be compared, each ``about`` a metric. ``declared`` is the declared
-    metric, ``standing`` how the declaration stands to this question. ``undeclared`` says why the
-    question is exploratory if no metric was declared. ``versions`` of the arm's code were measured
-    on these pairs.
-    """
-
-    first: Arm
-    second: Arm
-    verdicts: tuple[Verdict, ...]
-    notes: tuple[Note, ...]
-    declared: Quantity | None = None
-    standing: Standing | None = None
-    undeclared: str = "no metric was declared (eval.primary)"
-    versions: int = 1
-
-    @property
-    def beforehand(self) -> bool:
-        """Return whether the question was declared before any result of its arm."""
-        return self.standing is not None and self.standing.beforehand
-
-    @property
-    def missing(self) -> Note | None:
-        """The reason why the declared metric has no verdict, if it has none."""
-        if self.declared is None or any(
-            verdict.quantity.key == self.declared.key for verdict in self.verdicts
-        ):
-            return None
-        return next((note for note in self.notes if note.about == self.declared.name), None)
-
-    @property
-    def undecided(self) -> bool:
-        """Return whether no verdict that decides about the arms is decided."""
-        return all(one.outcome == UNDECIDED for one in self.primary)
-
-    def role(self, verdict: Verdict) -> str:
-        """Declared or secondary; "" if all metrics are one family."""
-        return SECONDARY if verdict.question.secondary else DECLARED if self.beforehand else ""
-
-    @property
-    def primary(self) -> tuple[Verdict, ...]:
-        """The verdicts that are not secondary."""
-        return tuple(verdict for verdict in self.verdicts if not verdict.question.secondary)
-
-
-def judge_pairs(
-    trials: Sequence[TrialResult],
-    pairs: Sequence[ArmPair],
-    declared: ActiveDeclaration | None = None,
-    lacking: Sequence[Unfinished] = (),
-    others: Sequence[ArmPair] = (),
-    older: Sequence[TrialResult] = (),
-    seen: Sequence[SeenResult] = (),
-    turned: Collection[ArmPair] = (),
-) -> list[PairVerdicts]:
-    """Judge each pair of arms in every metric that has a direction.
-
-    ``declared`` defines the families of tests; ``lacking`` are trials without a result, ``older``
-    those of earlier code, ``seen`` what was ever measured. The pairs ``others`` are no questions of
-    the declaration, and those that are ``turned`` are questions of it with the sides exchanged.
-    """
-    by_arm = group_by(trials, lambda trial: trial.arm)
-    primaries: dict[ArmPair, Quantity] = {}
-    standings: dict[ArmPair, Standing] = {}
-    undirected: dict[ArmPair, list[Note]] = {}
-    versions: dict[ArmPair, int] = {}
-    asked: list[PairQuestion] = []
-    gone: list[tuple[PairQuestion, OtherTest]] = []
-    # All questions are collected before one is judged, since families span pairs.
-    for pair in pairs:
-        first, second = (by_arm.get(arm, []) for arm in pair)
-        metrics = [
-            metric for metric in choose_quantities(_trials_of(by_arm, pair)) if not metric.cost
-        ]
-        # of a question that is turned, what was asked of the arm stands in the baseline's place
-        sides = (second, first) if pair in turned else (first, second)
-        if declared is not None:
-            standing = declared.standing(*sides, other_pair=pair in others)
-            primary = asked_quantity(standing.active.metric, trials)
-            standings[pair], primaries[pair] = standing, primary
-            metrics = [primary, *(metric for metric in metrics if metric.key != primary.key)]
-        undirected[pair] = [
-            replace(Note.of("no direction", reason=NO_DIRECTION), about=metric.name)
-            for metric in metrics
-            if not metric.direction
-        ]
-        directed = [metric for metric in metrics if metric.direction]
-        versions[pair] = measured_versions(*sides, older, seen)
-        known = standings.get(pair)
-        asked += [
-            PairQuestion(pair, metric, _question(first, pair, metric, known), known, versions[pair])
-            for metric in directed
-        ]
-        if declared is not None:
-            gone += _before_late_trials(pair, directed, *sides, known)
-            gone += _of_earlier_code(pair, directed, *sides, declared)
-    verdicts = _judge_families(by_arm, trials, asked, gone, lacking)
-    by_pair = group_by(zip(asked, verdicts, strict=True), lambda answered: answered[0].pair)
-    judged = []
-    for pair in pairs:
-        own, notes = [], list[Note]()
-        for question, verdict in by_pair.get(pair, []):
-            metric, found = question.metric, verdict.notes
-            if verdict.pairs.rows:
-                own.append(verdict)
-            else:
-                found = (_why_missing(_trials_of(by_arm, pair), metric, verdict),)
-            notes += [replace(note, about=metric.name) for note in found]
-        judged.append(
-            PairVerdicts(
-                *pair,
-                tuple(own),
-                (*notes, *undirected[pair]),
-                declared=primaries.get(pair),
-                standing=standings.get(pair),
-                versions=versions[pair],
-            )
-        )
-    return judged
-
-
-def _why_missing(trials: Sequence[TrialResult], metric: Quantity, verdict: Verdict) -> Note:
-    """The first reason why a metric has no pair of trials with values."""
-    question = verdict.question
-    nothing = Note.of("no pairs", baseline=question.baseline, arm=question.arm)
-    why = (*verdict.notes, nothing)[0]
-    lacking = [trial for trial in trials if metric.read(trial) is None]
-    if not lacking:
-        return why
-    reasons = [trial.unavailable.get(metric.key) for trial in lacking]
-    reason = next((short_reason(text) for text in reasons if text is not None), why.sentence)
-    if len(lacking) == len(trials):
-        return Note.of("no value", reason=reason)
-    arms = [str(arm) for arm in dict.fromkeys(trial.arm for trial in lacking)]
-    return Note.of("valueless", places=arms, reason=reason)
+State = Literal["answered", "running", "stopped", "not tested", "not asked beforehand"]
+ANSWERED: State = "answered"
+RUNNING: State = "running"
+STOPPED: State = "stopped"
+NOT_TESTED: State = "not tested"
+NOT_ASKED: State = "not asked beforehand"
 
 
 @dataclass(frozen=True)
-class PairQuestion:
-    """A question about a pair of arms, with the standing of the declaration to it."""
+class SceneEstimate:
+    """The mean paired difference of one scene, with its 95 % interval; it is not tested.
 
-    pair: ArmPair
-    metric: Quantity
+    Without an interval if one arm lacks results, or with a single pair.
+    """
+
+    scene: str
+    mean: float
+    seeds: int
+    interval: Interval | None
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The answer to a question from ``pairs`` of trials.
+
+    Only in the ``state`` "answered" the ``outcome`` says more than "undecided". ``test`` is about
+    these scenes, None with a single pair of each; ``like_these`` is about scenes like these. Both
+    have the ``level``. ``done`` of the question's trials have a result or have failed.
+    ``untestable`` says why such trials can never answer it. ``final`` is False while trials to come
+    may decide. ``lacking`` are trials of one arm without a result where the other arm has one; if
+    the outcome favoured that arm, the verdict ``favours_lacking`` and is undecided. ``outlying``
+    trials lie far outside the others of their scene and arm; they change nothing.
+    """
+
     question: Question
-    standing: Standing | None
-    versions: int = 1
+    quantity: Quantity
+    pairs: Pairs
+    state: State
+    level: float
+    outcome: Outcome = "undecided"
+    test: StudentT | None = None
+    like_these: LikeThese | None = None
+    scenes: tuple[SceneEstimate, ...] = ()
+    done: int = 0
+    final: bool = True
+    untestable: Note | None = None
+    outlying: tuple[TrialResult, ...] = ()
+    missing: tuple[Unfinished, ...] = ()  # planned trials that are not there yet
+    lacking: tuple[Unfinished, ...] = ()
+    favours_lacking: bool = False
+    notes: tuple[Note, ...] = ()
 
     @property
-    def declaration(self) -> Declaration | None:
-        """The declaration that fixed the question beforehand."""
-        in_time = self.standing is not None and self.standing.beforehand
-        return self.standing.declaration if self.standing is not None and in_time else None
+    def wanted(self) -> int:
+        """The number of the question's trials."""
+        return self.question.trials
 
     @property
-    def family(self) -> tuple[object, ...]:
-        """Questions with the same value share an error rate.
+    def least(self) -> float | None:
+        """The least difference that matters, in the unit of the test.
 
-        The baseline's own settings are a family of their own: questions about ideas pay nothing for
-        them.
+        A relative question is tested in logarithms.
         """
-        named = self.declaration
-        if named is None:
-            return self.pair
-        return named.time, named.hash, bool(self.question.seeds), _is_setting(self.pair)
+        least = self.question.least
+        return math.log1p(least) if self.question.relative and least is not None else least
+
+    @property
+    def mean(self) -> float | None:
+        return float(self.pairs.differences.mean()) if self.pairs.seeds else None
+
+    @property
+    def interval(self) -> Interval | None:
+        return None if self.test is None else self.test.interval(self.level)
+
+    @property
+    def p(self) -> float | None:
+        return None if self.test is None else self.test.p
+
+    @property
+    def statements(self) -> int:
+        """The number of statements that it makes or will make, each at its level."""
+        tested = self.state not in (NOT_TESTED, NOT_ASKED)
+        return tested * (1 + (self.like_these is not None))
+
+    @property
+    def relative(self) -> float:
+        """The mean difference relative to the baseline's value."""
+        if self.mean is None:
+            return math.nan
+        if self.pairs.relative:
+            return math.expm1(self.mean)
+        return self.mean / self.pairs.baseline if self.pairs.baseline else math.nan
+
+    @property
+    def deviation(self) -> float | None:
+        """The deviation of paired differences within scenes; None with one pair per scene."""
+        if self.pairs.seeds < 2:
+            return None
+        return float(np.sqrt(self.pairs.differences.var(axis=1, ddof=1).mean()))
+
+    @property
+    def equal(self) -> bool:
+        """Return whether all pairs have a difference of exactly 0; False without a pair."""
+        differences = self.pairs.differences
+        return differences.size > 0 and not differences.any()
+
+    @property
+    def loss_excluded(self) -> bool:
+        """Return whether the interval excludes a loss of the least difference that matters."""
+        if self.interval is None or self.least is None:
+            return False
+        sign = self.question.sign
+        return min(sign * self.interval.low, sign * self.interval.high) > -self.least
+
+    def gain_excluded(self, error_rate: float) -> bool:
+        """Return whether a gain of the least difference that matters is excluded.
+
+        ``error_rate`` is the chance that such a gain is excluded although it is there.
+        """
+        if self.test is None or self.least is None:
+            return False
+        sign, interval = self.question.sign, self.test.interval(2 * error_rate)
+        return max(sign * interval.low, sign * interval.high) < self.least
+
+    def shown(self, value: float) -> str:
+        """A difference as text: ``−0.0123``, or ``+28.4 %`` if the question is relative."""
+        if self.question.relative:
+            return f"{signed(100 * math.expm1(value), '.1f')} %"
+        return signed(value, f".{self.quantity.decimals + 1}f")
+
+    def shown_interval(self, interval: Interval) -> str:
+        return f"{self.shown(interval.low)} to {self.shown(interval.high)}"
 
 
-def _judge_families(
-    by_arm: Mapping[Arm, Sequence[TrialResult]],
-    trials: Sequence[TrialResult],
-    asked: Sequence[PairQuestion],
-    gone: Sequence[tuple[PairQuestion, OtherTest]],
-    lacking: Sequence[Unfinished],
-) -> list[Verdict]:
-    """Judge each family of questions: those of one declaration, or of one exploratory pair.
+def judge(
+    trials: Sequence[TrialResult], question: Question, unfinished: Sequence[Unfinished] = ()
+) -> Verdict:
+    """The verdict on a question by the ``trials`` of its experiment, done or ``unfinished``.
 
-    Families also count the tests of questions that are ``gone`` from them, so that the verdicts on
-    the others stay.
+    Trials of which it does not ask change nothing. It waits until all its trials are done or have
+    failed; with looks, it is answered at the first look that decides it.
     """
-    verdicts: dict[int, Verdict] = {}
-    for key, whole in group_by(enumerate(asked), lambda entry: entry[1].family).items():
-        # Versions of one number have one error rate. The others count as members of the family.
-        for number, own in group_by(whole, lambda entry: entry[1].versions).items():
-            questions = tuple(one.question for _, one in own)
-            others = [
-                other_test(_trials_of(by_arm, one.pair), one.question)
-                for _, one in whole
-                if one.versions != number
-            ]
-            others += [test for one, test in gone if one.family == key]
-            # Without a time no trial is late, so Holm's method alone adjusts for the number of
-            # metrics.
-            declaration = Declaration(time=NO_TIME, questions=questions)
-            standing = own[0][1].standing
-            if standing is not None and questions[0].seeds:
-                # also if it is exploratory: its trials end at the look that pleased
-                declaration = replace(declaration, looks=standing.declaration.looks)
-            if (named := own[0][1].declaration) is not None:
-                looks = declaration.looks
-                # an arm without any trial yet keeps its share of the error rate
-                asked_scenes = [question.scenes for question in questions]
-                waiting = [
-                    question
-                    for question in named.questions
-                    if looks and question.scenes not in asked_scenes
-                ]
-                # a look's own questions wait already
-                others = [other for other in others if other.secondary or not looks]
-                declaration = replace(
-                    declaration,
-                    questions=(*questions, *waiting),
-                    error_rate=named.error_rate,
-                )
-            rate = declaration.error_rate * share_of_version(number)
-            found = judge(trials, replace(declaration, error_rate=rate), lacking, others)
-            verdicts |= dict(zip((place for place, _ in own), found, strict=False))
-    return [verdicts[place] for place in range(len(asked))]
-
-
-def _before_late_trials(
-    pair: ArmPair,
-    metrics: Sequence[Quantity],
-    baseline: Sequence[TrialResult],
-    arm: Sequence[TrialResult],
-    standing: Standing | None,
-) -> list[tuple[PairQuestion, OtherTest]]:
-    """The tests of a pair's questions as they were before trials were added too late."""
-    if standing is None or not standing.added:
-        return []
-    whole = replace(standing, added=())
-    if not whole.beforehand:
-        return []
-    late = {(trial.scene, trial.seed) for trial in standing.added}
-    in_time = [trial for trial in arm if (trial.scene, trial.seed) not in late]
-    questions = [
-        PairQuestion(pair, metric, _question(baseline, pair, metric, whole), whole)
-        for metric in metrics
-    ]
-    return [
-        (question, other_test([*baseline, *in_time], question.question)) for question in questions
-    ]
-
-
-def _of_earlier_code(
-    pair: ArmPair,
-    metrics: Sequence[Quantity],
-    baseline: Sequence[TrialResult],
-    arm: Sequence[TrialResult],
-    declared: ActiveDeclaration,
-) -> list[tuple[PairQuestion, OtherTest]]:
-    """The tests of a pair's questions with each earlier version of the arm's code.
-
-    The new code is tested in another family.
-    """
-    found = []
-    old = [replace(trial, variant=arm[0].variant) for trial in of_same_arm(arm, declared.older)]
-    for version in group_by(old, lambda trial: frozenset(trial.code.items())).values():
-        # the state when this version was trained
-        first = min(trial.measured for trial in version)
-        known = replace(
-            declared,
-            older=tuple(one for one in declared.older if one.measured < first),
-            seen=tuple(one for one in declared.seen if one.moment < first),
-        )
-        standing = known.standing(baseline, version)
-        questions = [
-            PairQuestion(pair, metric, _question(baseline, pair, metric, standing), standing)
-            for metric in metrics
-        ]
-        found += [
-            (question, other_test([*baseline, *version], question.question))
-            for question in questions
-            if question.declaration is not None
-        ]
-    return found
-
-
-def _is_setting(pair: ArmPair) -> bool:
-    """Return whether a pair compares two settings of one densifier."""
-    return pair[0].densify == pair[1].densify
-
-
-def _trials_of(by_arm: Mapping[Arm, Sequence[TrialResult]], pair: ArmPair) -> list[TrialResult]:
-    return [trial for arm in pair for trial in by_arm.get(arm, [])]
-
-
-def _question(
-    of_baseline: Sequence[TrialResult],
-    pair: ArmPair,
-    metric: Quantity,
-    standing: Standing | None,
-) -> Question:
-    """The question about two arms in one metric; in a sweep in looks, about the planned trials."""
-    baseline, arm = pair
-    question = Question(
-        metric=metric.key,
-        sign=metric.direction,
-        least=metric.worthwhile,
-        baseline=baseline,
-        arm=arm,
+    own = [one for one in trials if question.has(one.digest, one.scene, one.seed)]
+    open_ = [one for one in unfinished if one.is_of(question)]
+    pairs = pair(own, question)
+    verdict = Verdict(
+        question,
+        asked_quantity(question.metric, own),
+        pairs,
+        _state(question, own, open_),
+        question.level,
+        done=len(own) + sum(one.failed for one in open_),
+        notes=(*pairs.left_out, *between_scenes_notes(pairs.of_baseline, pairs.of_arm)),
+        missing=tuple(one for one in open_ if not one.failed),
     )
-    if standing is None:
-        return question
-    active, planned = standing.active, standing.question
-    if planned is not None:
-        question = replace(question, scenes=planned.scenes, seeds=planned.seeds)
-    if not standing.beforehand:
-        return question
-    split_question = next((trial.question for trial in of_baseline), "")
-    is_primary = active.question in ("", split_question) and metric.key == active.metric
-    if planned is not None and is_primary:
-        question = replace(question, least=planned.least)
-    return replace(question, secondary=not is_primary)
+    if why := _untestable(verdict):
+        others = tuple(note for note in verdict.notes if note != why)
+        return replace(verdict, untestable=why, notes=others)
+    if question.looks and verdict.state not in (NOT_TESTED, NOT_ASKED):
+        verdict = _at_looks(verdict)
+    elif verdict.state == ANSWERED:
+        verdict = _without_lacking(_decide(verdict), own, open_)
+    else:
+        verdict = replace(_measure(verdict), final=verdict.state in (NOT_TESTED, NOT_ASKED))
+    return replace(verdict, scenes=_scenes(verdict))
 
 
-def seeds_to_resolve(verdict: Verdict) -> int | None:
-    """The number of seeds that would resolve the worthwhile difference.
+def _state(
+    question: Question, own: Sequence[TrialResult], unfinished: Sequence[Unfinished]
+) -> State:
+    if question.untested:
+        return NOT_TESTED
+    ideas = {second for _, second in question.digests.values()}
+    # gates, ledgers and old declarations know by themselves what was asked before
+    if question.rule == BY_COMMAND and not all(one.asked for one in own if one.digest in ideas):
+        return NOT_ASKED
+    ended = len(own) + sum(one.failed for one in unfinished)
+    if ended >= question.trials:
+        return ANSWERED
+    return RUNNING if any(one.running for one in unfinished) else STOPPED
 
-    None if that is unknown, or if there would be too many to run.
+
+def _untestable(verdict: Verdict) -> Note | None:
+    """The reason why the question's trials can never answer it."""
+    pairs = verdict.pairs
+    same = [note for note in pairs.left_out if note.kind in (SAME_CAPTURE, "unlike")]
+    if same or (pairs.left_out and not pairs.rows and verdict.state == ANSWERED):
+        return (*same, *pairs.left_out)[0]
+    if (
+        pairs.rows
+        and verdict.state == ANSWERED
+        and all(are_equal(*both) for row in pairs.rows for both in row.trials)
+    ):
+        return Note.of("equal", pairs=sum(len(row.trials) for row in pairs.rows))
+    return None
+
+
+def _at_looks(asked: Verdict) -> Verdict:
+    """Judge at each look that has all its trials, and stop at the first look that decides."""
+    looks, rate = asked.question.looks, asked.question.level
+    verdict = replace(asked, pairs=asked.pairs.first(0), final=False)
+    whole = len(asked.pairs.rows) == len(asked.question.seeds)
+    for seeds, share in zip(looks, look_shares(len(looks)), strict=True):
+        if not whole or seeds > asked.pairs.seeds:
+            break
+        at_look = replace(asked, pairs=asked.pairs.first(seeds), level=rate * share)
+        verdict = replace(_decide(at_look), state=ANSWERED)
+        verdict = replace(verdict, final=verdict.outcome != UNDECIDED or seeds == looks[-1])
+        if verdict.final:
+            return verdict
+    return replace(verdict, state=RUNNING if asked.state == ANSWERED else asked.state)
+
+
+def _measure(verdict: Verdict) -> Verdict:
+    """The verdict with mean and test, the outlying trials, and no outcome."""
+    pairs = verdict.pairs
+    test = t_test(pairs.differences) if pairs.seeds else None
+    return replace(verdict, test=test, outlying=tuple(find_outlying(pairs)))
+
+
+def _decide(verdict: Verdict) -> Verdict:
+    verdict = _measure(verdict)
+    if verdict.interval is None:
+        return verdict
+    sign, least = verdict.question.sign, verdict.least
+    means = verdict.pairs.differences.mean(axis=1)
+    return replace(
+        verdict,
+        outcome=outcome_of(verdict.interval, sign, least),
+        like_these=judge_like_these(means, sign, least, verdict.level),
+    )
+
+
+def _without_lacking(
+    verdict: Verdict, trials: Sequence[TrialResult], unfinished: Sequence[Unfinished]
+) -> Verdict:
+    """The verdict, undecided if it favours an arm that lacks results which the other arm has."""
+    question, read = verdict.question, verdict.quantity.read
+    sides = {second for _, second in question.digests.values()}
+    done: tuple[set[tuple[str, int]], set[tuple[str, int]]] = (set(), set())
+    for trial in trials:
+        if read(trial) is not None:
+            done[trial.digest in sides].add((trial.scene, trial.seed))
+    valueless = [Unfinished.of(trial) for trial in trials if read(trial) is None]
+    lacking: tuple[list[Unfinished], list[Unfinished]] = ([], [])
+    for one in (*unfinished, *valueless):
+        side = int(one.is_of(question, 1))
+        if (one.scene, one.seed) in done[1 - side] - done[side]:
+            lacking[side].append(one)
+
+    def favours_lacking(outcome: Outcome) -> bool:
+        favoured_sides = favoured(outcome, question.sign, verdict.quantity.direction)
+        return any(lacking[side] for side in favoured_sides)
+
+    like, favours = verdict.like_these, favours_lacking(verdict.outcome)
+    if like is not None and favours_lacking(like.outcome):
+        like = replace(like, outcome=UNDECIDED)
+    return replace(
+        verdict,
+        outcome=UNDECIDED if favours else verdict.outcome,
+        like_these=like,
+        lacking=(*lacking[0], *lacking[1]),
+        favours_lacking=favours,
+    )
+
+
+def _scenes(verdict: Verdict) -> tuple[SceneEstimate, ...]:
+    lacking = {one.scene for one in verdict.lacking}
+    found = []
+    for row, differences in zip(verdict.pairs.rows, verdict.pairs.differences, strict=True):
+        if not len(differences):
+            continue
+        test = None if row.scene in lacking else t_test(differences[None])
+        interval = None if test is None else test.interval(ALPHA)
+        found.append(
+            SceneEstimate(row.scene, float(differences.mean()), len(differences), interval)
+        )
+    return tuple(found)
+
+
+def find_outlying(pairs: Pairs) -> list[TrialResult]:
+    """The trials that are far from the other trials of their scene and arm.
+
+    Far is more than `OUTLYING` deviations from the mean of the others. The deviation of two or
+    three trials is often small by chance. So the largest of three counts: the other trials'
+    deviation, that of the scene's other arm, and the typical deviation over all scenes and
+    arms.
     """
-    if verdict.deviation is None or verdict.quantity.worthwhile is None:
-        return None
-    return seeds_needed(verdict.deviation, len(verdict.scenes), verdict.quantity.worthwhile)
+    rows = [row for row in pairs.rows if len(row.seeds) > LEAST_OTHERS]
+    deviations = [(float(row.baseline.std(ddof=1)), float(row.arm.std(ddof=1))) for row in rows]
+    ordered = sorted(deviation for both in deviations for deviation in both)
+    typical = FEW * ordered[(len(ordered) - 1) // 2] if ordered else 0.0
+    outlying = []
+    for row, both in zip(rows, deviations, strict=True):
+        for side, values in enumerate((row.baseline, row.arm)):
+            for index, value in enumerate(values):
+                others = np.delete(values, index)
+                deviation = max(float(others.std(ddof=1)), both[1 - side], typical)
+                if abs(value - others.mean()) > OUTLYING * deviation > 0:
+                    outlying.append(row.trials[index][side])
+    return outlying
+
+
+def interval_of(
+    trials: Sequence[TrialResult],
+    baseline: Arm,
+    idea: Arm,
+    metric: str,
+    state: State = NOT_TESTED,
+    why: str = "",
+) -> Verdict:
+    """Mean and 95 % interval of all trials of two arms in any metric; it is no verdict."""
+    own = [trial for trial in trials if trial.arm in (baseline, idea)]
+    quantity = asked_quantity(metric, own)
+    sides = {
+        scene: ([t for t in of_scene if t.arm == baseline], [t for t in of_scene if t.arm == idea])
+        for scene, of_scene in group_by(own, lambda trial: trial.scene).items()
+    }
+    sides = {scene: both for scene, both in sides.items() if all(both)}
+    question = Question(
+        idea=idea,
+        baseline=baseline,
+        metric=metric,
+        sign=quantity.direction,  # type: ignore[arg-type]
+        least=quantity.worthwhile,
+        digests={scene: (one[0].digest, two[0].digest) for scene, (one, two) in sides.items()},
+        seeds={
+            scene: tuple(sorted({t.seed for t in one} & {t.seed for t in two}))
+            for scene, (one, two) in sides.items()
+        },
+        untested=why or state,
+    )
+    pairs = pair_sides(sides, question)
+    notes = (*pairs.left_out, *between_scenes_notes(pairs.of_baseline, pairs.of_arm))
+    verdict = Verdict(question, quantity, pairs, state, ALPHA, done=len(own), notes=notes)
+    verdict = _measure(verdict)
+    return replace(verdict, scenes=_scenes(verdict))

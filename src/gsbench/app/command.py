@@ -1,19 +1,19 @@
 """A command line becomes trials and an exit code.
 
 It is read once (`gsbench.app.sweep`), and its trials are composed. Then they are listed, run by
-gsbench's own sweeper (`gsbench.app.grids`), or proposed by another one, which is a plug-in of
-Hydra's (`gsbench.app.plugins`).
+gsbench's own sweeper (`gsbench.app.grids`), or by what of Hydra's the command asks for
+(`gsbench.app.hydra_app`).
 """
 
 import logging
 import os
 import sys
+from collections import Counter
 from collections.abc import Sequence
 
 from gsbench.analysis.quantities import COSTS
 from gsbench.app.grids import planned_trials, run_sweep
-from gsbench.app.hydra_main import run_main
-from gsbench.app.plugins import TrialTask, other_sweep, words_for_plugins, words_without_sweeper
+from gsbench.app.hydra_app import run_by_hydra, words_without_sweeper
 from gsbench.app.sweep import HYDRA_ERRORS, Ended, Sweep
 from gsbench.claims.stopping import log_verdicts
 from gsbench.config.command_words import parse
@@ -23,9 +23,9 @@ from gsbench.errors import GsbenchError, InputError
 from gsbench.eval.options import EvalConfig
 from gsbench.launch.batch import check_parts, missing_folders, need_no_check, run_batch
 from gsbench.launch.dry_run import describe_plan
-from gsbench.launch.jobs import Outcome
+from gsbench.launch.outcomes import Outcome
 from gsbench.logs import set_up_logging
-from gsbench.words import command
+from gsbench.words import command, counted
 
 log = logging.getLogger(__name__)
 
@@ -41,7 +41,9 @@ def launch(argv: list[str]) -> int:
     with explained(words, HYDRA_ERRORS):
         if is_dry_run:
             return dry_run(sweep)
-        ended = other_sweep(sweep, run_batch) if sweep.other_sweeper else own_sweep(sweep)
+        if sweep.config.hydra.job.chdir:
+            log.info("hydra.job.chdir: paths still start in %s, as the command does", os.getcwd())
+        ended = run_by_hydra(sweep, run_batch) or own_path(sweep)
     if not ended.trials:  # a sweep whose question is decided needs no trial
         return 0
     return summarize(ended.outcomes, ended.trials)
@@ -87,16 +89,8 @@ def dry_run(sweep: Sweep) -> int:
     return 0
 
 
-def own_sweep(sweep: Sweep) -> Ended:
-    """Run the trials of a command by gsbench's own sweeper, and by what of Hydra's it asks for."""
-    if sweep.config.hydra.job.chdir:
-        log.info(
-            "hydra.job.chdir: paths still start in %s, where the command was given", os.getcwd()
-        )
-    if (words := words_for_plugins(sweep)) is not None:
-        task = TrialTask(run_batch, sweep.composer.allowed, sweep=sweep)
-        run_main(task, words, sweep.config)
-        return task.ended
+def own_path(sweep: Sweep) -> Ended:
+    """Run the trials of a command by gsbench's own sweeper and launcher."""
     ended = Ended()
 
     def run(trials: Sequence[Trial]) -> None:
@@ -137,9 +131,12 @@ def require_waiting(verb: str, trials: Sequence[Trial]) -> None:
         raise InputError(f"{verb} waits for its trials: leave out launch.wait=false")
 
 
-def run_trials(trials: Sequence[Trial]) -> int:
-    """Run the ``trials`` that are not done, by their launcher; returns the exit code."""
-    return summarize(run_batch(trials), trials)
+def run_trials(trials: Sequence[Trial], asks: bool = True) -> int:
+    """Run the ``trials`` that are not done, by their launcher; returns the exit code.
+
+    With ``asks``, their questions are written down first.
+    """
+    return summarize(run_batch(trials, asks), trials)
 
 
 def list_trials(trials: Sequence[Trial]) -> None:
@@ -160,11 +157,22 @@ def summarize(outcomes: Sequence[Outcome], trials: Sequence[Trial]) -> int:
     if failed and len(outcomes) == 1:
         raise (InputError if failed[0].bad_input else GsbenchError)(failed[0].message)
     for outcome in failed:
-        print(f"gsbench: failed: {outcome.label}: {outcome.message}", file=sys.stderr)
+        if not outcome.change:
+            print(f"gsbench: failed: {outcome.label}: {outcome.message}", file=sys.stderr)
+    changes = Counter(outcome.change for outcome in failed if outcome.change)
+    for setting, count in changes.items():
+        print(
+            f"gsbench: not started: {counted(count, 'trial')} would fail in the same way: change "
+            f"{setting}, then give the command again",
+            file=sys.stderr,
+        )
     name = trials[-1].values["name"]  # the last one's: a tuning runs before, in its own experiments
     done = sum(outcome.status == "done" for outcome in outcomes)
+    must_change = changes or all(outcome.bad_input for outcome in failed)
     if any(outcome.status == "queued" for outcome in outcomes):
         advice = f"how far the others are: {command('status', name)}"
+    elif failed and must_change:  # a retry would fail again
+        advice = "change what the lines above name, then give the command again"
     else:
         advice = command("retry" if failed else "tables", name)
         advice = f"{'again' if failed else 'the table'}: {advice}"

@@ -7,7 +7,6 @@ arms (`gsbench.app.tuning`).
 import itertools
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +14,18 @@ from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, OmegaConf
 
 from gsbench.analysis.advice import GRIDS
+from gsbench.analysis.questions import plan_looks
+from gsbench.analysis.results import read_experiment
 from gsbench.app.sweep import Run, Sweep
 from gsbench.app.tuning import tuned_jobs
-from gsbench.claims.stopping import KeyAndSeed, log_verdicts, plan_sweep, sequential_test
+from gsbench.claims.stopping import Needed, SequentialTest, log_verdicts
 from gsbench.config.command_words import grid_points, is_interval
 from gsbench.config.compose import Trial
 from gsbench.config.groups import GROUPS
 from gsbench.config.overrides import bare_key, key_of, value_text
 from gsbench.errors import InputError
 from gsbench.files import checked_runs_folder, make_runs_folder
-from gsbench.launch.record import declare_questions
+from gsbench.launch.record import check_looks, planned_rows, record
 from gsbench.runs.layout import RESULTS
 from gsbench.words import listed
 
@@ -72,7 +73,8 @@ def planned_trials(sweep: Sweep, run: Run | None) -> tuple[list[Trial], bool]:
             raise
         raise InputError(advice) from error
     if run is None and any(trial.values["launch"]["stop_when_decided"] for trial in trials):
-        print(plan_sweep(trials).describe())
+        seeds = check_looks(trials, planned_rows(trials))
+        print(f"stops when decided: looks at {', '.join(map(str, plan_looks(len(seeds))))} seeds")
     return trials, are_known
 
 
@@ -82,18 +84,28 @@ def _run_until_decided(trials: Sequence[Trial], run: Run) -> None:
     Decided pairs of arms get no further trials. Raises InputError for a sweep that cannot be tested
     in this way.
     """
-    stopping = plan_sweep(trials)
+    rows = planned_rows(trials)
+    check_looks(trials, rows)
     make_runs_folder(checked_runs_folder(trials[0].values["runs"]))
-    stopping = replace(stopping, declaration=declare_questions(stopping.home, stopping.declaration))
+    questions = record(trials)
+    if not questions:
+        raise InputError(
+            "launch.stop_when_decided compares arms, and this sweep has one: give two densifiers"
+        )
+    by_place = {
+        (row.scene, row.digest, row.seed): trial for row, trial in zip(rows, trials, strict=True)
+    }
+    home = trials[0].files.home
     launched: set[Path] = set()
 
-    def run_planned(planned: Sequence[KeyAndSeed]) -> None:
-        batch = [trial for key in planned if (trial := stopping.trials[key]).folder not in launched]
+    def run_planned(planned: Sequence[Needed]) -> None:
+        batch = [by_place[key] for key in planned if key in by_place]
+        batch = [trial for trial in batch if trial.folder not in launched]
         launched.update(trial.folder for trial in batch)
         if batch:
             run(batch)
 
-    sequential_test(stopping).answer(run_planned)
+    SequentialTest(tuple(questions), lambda: read_experiment(home).trials).answer(run_planned)
     if not launched:  # else it is said when the trials' outcomes are
         log_verdicts(trials)
     spared = [
@@ -140,8 +152,8 @@ def words_of_grids(
 ) -> list[list[str]]:
     """The words of each grid: its own, the shared ``params``, and those ``given`` for it.
 
-    If two words set one key, the later one counts. Trials are in the order of the grids; the shared
-    settings vary fastest.
+    If two words set one key, the later one counts, with the plus of a grid's own word. Trials are
+    in the order of the grids; the shared settings vary fastest.
     """
     listed = set(map(bare_key, itertools.chain(*grids)))
     jobs = []
@@ -149,8 +161,15 @@ def words_of_grids(
         of_grid = set(map(bare_key, grid))
         shared = {key: value for key, value in params.items() if bare_key(key) not in of_grid}
         words = [f"{key}={value}" for key, value in (*grid.items(), *shared.items())]
-        jobs.append([*words, *(word for word in given if key_of(word) not in listed - of_grid)])
+        signs = {bare_key(key): key[: len(key) - len(bare_key(key))] for key in (*grid, *shared)}
+        own = (word for word in given if key_of(word) not in listed - of_grid)
+        jobs.append([*words, *(_signed(word, signs.get(key_of(word), "")) for word in own)])
     return jobs
+
+
+def _signed(word: str, sign: str) -> str:
+    """A word that sets a value, with the ``sign`` (``+``) if it has none."""
+    return word if word.startswith(("+", "~")) else f"{sign}{word}"
 
 
 def _advise_grids(sweep: Sweep, typed: Mapping[str, Override]) -> str:

@@ -2,9 +2,8 @@
 
 from collections.abc import Sequence
 
-from gsbench.analysis.looks import FIRST_LOOK
+from gsbench.analysis.questions import FIRST_LOOK
 from gsbench.app.command import compose_trials, require_waiting
-from gsbench.claims.stopping import KeyAndSeed
 from gsbench.config.command_words import typed_permissions
 from gsbench.config.compose import Trial
 from gsbench.config.overrides import key_of
@@ -25,7 +24,7 @@ OF_IDEAS = (
     "threads",
     "tracking",
 )
-Trials = dict[KeyAndSeed, Trial]
+Trials = dict[tuple[str, int], Trial]  # by key (scene, arm and hash) and seed
 
 
 def compose_words(name: str, words: Sequence[str], typed: Sequence[str]) -> Trials:

@@ -12,21 +12,21 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gsbench.claims.stopping import facts_for
 from gsbench.config.command_words import check_removal, check_words
 from gsbench.config.compose import Composer, Trial
 from gsbench.config.explain import explained
 from gsbench.config.hydra_setup import config_loader, hydra_config, hydra_ready
 from gsbench.config.overrides import is_sweep, parse_word, task_words
 from gsbench.errors import InputError
-from gsbench.launch.jobs import Outcome
+from gsbench.launch.outcomes import Outcome
+from gsbench.pipeline.metric_facts import facts_for
 
 OWN = "gsbench"  # the name of the launcher and of the sweeper in Hydra
 DEFAULT_METRIC = "psnr"
 # the errors of Hydra for a user's words and files
 HYDRA_ERRORS = (HydraException, OmegaConfBaseException, OSError)
 
-Run = Callable[[Sequence[Trial]], None]  # runs trials to their ends
+Run = Callable[[Sequence[Trial]], object]  # runs trials to their ends
 
 
 @dataclass

@@ -1,4 +1,4 @@
-"""Ablation of a densifier: its switches, the runs of all combinations, and the verdicts on them.
+"""Ablation of a densifier: its switches, and the runs of all combinations.
 
 A switch turns one part of the densifier off by its ``off`` settings; as configured, all switches
 are on. The class (``SWITCHES``), the YAML file (``switches``) or the command line declares it. A
@@ -10,19 +10,13 @@ import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from gsbench.analysis.judgement import Verdict, judge
-from gsbench.analysis.quantities import asked_quantity
-from gsbench.analysis.results import TrialResult
-from gsbench.analysis.verdict_words import reason
 from gsbench.errors import InputError
-from gsbench.runs.experiments import NO_TIME, Arm, Declaration, Question
 from gsbench.settings import Switch, check_values
 from gsbench.words import did_you_mean, listed
 
 MAX_SWITCHES = 8
 
 Run = frozenset[str]  # the switches that are on
-TrialKeys = Mapping[str, str]  # scene -> folder of a run's trials, without the seed
 
 
 def declared_switches(
@@ -122,39 +116,3 @@ def run_name(run: Run, switches: Sequence[str]) -> str:
     """``without shrink``; ``with all of them`` if all switches are on."""
     off = [name for name in switches if name not in run]
     return f"without {listed(off)}" if off else "with all of them"
-
-
-def judge_runs(
-    trials: Sequence[TrialResult], runs: Mapping[Run, TrialKeys], metric: str
-) -> list[Verdict]:
-    """The verdicts on all ``runs`` against the run with all switches on, as one family."""
-    quantity = asked_quantity(metric, trials)
-    full = max(runs, key=len)
-    questions = []
-    for run, keys in runs.items():
-        if run == full:
-            continue
-        question = Question(
-            metric=metric,
-            sign=quantity.direction or 1,
-            least=quantity.worthwhile,
-            baseline=Arm("", run_name(full, sorted(full))),
-            arm=Arm("", run_name(run, sorted(full))),
-            scenes={scene: (runs[full][scene], key) for scene, key in keys.items()},
-        )
-        questions.append(question)
-    return judge(trials, Declaration(time=NO_TIME, questions=tuple(questions)))
-
-
-def markdown_table(verdicts: Sequence[Verdict]) -> list[str]:
-    """The verdicts as lines of a Markdown table."""
-    name = verdicts[0].quantity.name
-    lines = [
-        f"| run | difference in {name} from all parts | interval | verdict |",
-        "|---|---|---|---|",
-    ]
-    for verdict in verdicts:
-        mean = "–" if verdict.mean is None else verdict.shown(verdict.mean)
-        interval = "–" if verdict.interval is None else verdict.shown_interval(verdict.interval)
-        lines.append(f"| {verdict.question.arm} | {mean} | {interval} | {reason(verdict)} |")
-    return lines

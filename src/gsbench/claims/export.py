@@ -1,64 +1,59 @@
 """Export of an experiment's results as an archive (`gsbench.claims.archive`).
 
-Of paths on this machine only the last name is kept. The same results give the same archive, bit by
-bit.
+Files are as they are, without what is private: of paths on this machine only the last name is kept,
+of addresses no user and password, and settings of folders and servers are left out. The same
+results give the same archive, bit by bit.
 """
 
-import csv
 import hashlib
-import io
-import itertools
 import json
 import re
 import time
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path, PurePath
 from typing import Any
 
+import yaml
+
 from gsbench import __version__
+from gsbench.analysis.comparison import compare
 from gsbench.analysis.fairness import searches_of
 from gsbench.analysis.images import PixelMeasures, textured_error
+from gsbench.analysis.old_declarations import all_questions
 from gsbench.analysis.quantities import TEXTURED
-from gsbench.analysis.results import (
-    Experiment,
-    TrialResult,
-    group_by,
-    newest_code,
-    read_views,
-)
+from gsbench.analysis.results import Experiment, TrialResult, group_by, newest_code, read_views
+from gsbench.analysis.verdicts import RUNNING, STOPPED
 from gsbench.claims.archive import (
-    CONFIGURATIONS,
     CRATE,
     FORMAT,
     MANIFEST,
     NO_CONFIGURATION,
-    OLDER,
     PICTURES,
-    PICTURES_FOLDER,
-    PIXELS,
-    SEARCHES,
-    SEED_KEY,
-    SEEN_RESULTS,
-    TRIALS,
-    UNFINISHED,
     VERSION,
     check_size,
-    records_of,
 )
 from gsbench.errors import InputError
 from gsbench.files import atomic
 from gsbench.parsing import read_bytes, read_typed, read_yaml
-from gsbench.runs.experiments import STAMP, TuningRecord, read_declarations
+from gsbench.runs.commands import Command, read_lines
+from gsbench.runs.commands import chained as chained_commands
+from gsbench.runs.experiments import STAMP, TuningRecord
 from gsbench.runs.layout import (
+    COMMANDS,
     CONFIG,
     DECLARED,
+    FAILED,
+    FROM_PIXELS,
     LEDGER,
     PER_VIEW,
+    RESULTS,
     TUNING,
 )
 from gsbench.runs.ledger import as_json, chained, read_ledger
+from gsbench.runs.trial_folder import TrialFolder
 from gsbench.words import without_folders
 
 # the date of every file in the zip (the earliest possible), so that archives do not depend on time
@@ -68,110 +63,103 @@ PASSWORD = re.compile(r"(?<=://)[^/@\s]*@")  # user and password in a URL
 FOLDERS = re.compile(r"(?<=:)///+\S*/")  # folders in a file's URL, such as sqlite:////home/me/a.db
 ITEM = re.compile(r"[^=,\[\]{}'\"]+")  # one value in a word such as scene=[a,b]
 SPECIFICATION = "https://w3id.org/ro/crate/1.2"
-PICTURE = ("image/png", "A test view of a trial: its render, or the photograph")
-FILES = {  # media types and descriptions
-    TRIALS: (
-        "application/jsonl",
-        "Results of every trial, one JSON object a line: metrics, counts, hashes, code",
-    ),
-    UNFINISHED: ("application/jsonl", "Trials that failed or were stopped, with configurations"),
-    CONFIGURATIONS: ("application/jsonl", "Every configuration, with the trials that had it"),
-    PER_VIEW: ("text/csv", "Metrics of every test view of every trial"),
-    PIXELS: ("application/jsonl", "What declared claims ask of the trials' pictures, measured"),
-    SEARCHES: ("application/jsonl", "The searches that tuned arms, with all points"),
-    DECLARED: ("application/jsonl", "What was declared before the trials were run"),
-    LEDGER: ("application/jsonl", "The ideas of a ledger and their tests (gsbench ledger)"),
-    SEEN_RESULTS: ("application/jsonl", "All results that were measured, also removed ones"),
-    MANIFEST: ("application/json", "Version of the archive, and the sha256 of its files"),
-}
 
 
-def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> list[str]:
-    """Write the experiment's results to ``out``; return a line for each trial left out.
+def write_archive(
+    experiment: Experiment, out: Path, pictures: bool = False
+) -> tuple[list[str], str]:
+    """Write the experiment's results to ``out``.
 
-    ``pictures`` adds those of the test views. Raises InputError if no trial can be exported.
+    Returns a line for each trial left out, and how many of its questions are open: ``open: 3 of
+    6``, "" if none is. ``pictures`` adds those of the test views. Raises InputError if no trial can
+    be exported.
     """
-    left_out, unfinished = list(experiment.warnings), [*experiment.lacking]
-    experiment = newest_code(experiment)
-    kept, rows = list[TrialResult](), list[dict[str, Any]]()
-    # {configuration as JSON: (folder, seed) of its trials}
-    configurations: dict[str, list[tuple[str, int]]] = {}
-    # results of earlier code were seen, so a declaration after it is late
+    left_out = list(experiment.warnings)
+    unfinished = {one.path for one in experiment.unfinished if one.path.is_dir()}
+    files, kept = _of_experiment(experiment.folder), list[TrialResult]()
     for trial in (*experiment.trials, *experiment.older):
         try:
-            views, configuration = read_views(trial), _configuration(trial.path)
+            files |= _of_trial(trial, pictures)
+            kept.append(trial)
         except InputError as error:
             left_out.append(f"{trial.label}: {error}")
-            unfinished.append(trial.path)
-            continue
-        place = _folder(trial.path)
-        rows += [{"trial": place, "view": view} | views[view] for view in sorted(views)]
-        configurations.setdefault(configuration, []).append((place, trial.seed))
-        kept.append(trial)
+            unfinished.add(trial.path)
     if not kept:
         raise InputError(f"{experiment.name} has no whole trial to export (first: {left_out[0]})")
-    older = {trial.path for trial in experiment.older}
-    contents = {
-        TRIALS: _json_lines(
-            {"folder": _folder(trial.path), "results": _results(trial)}
-            | ({OLDER: True} if trial.path in older else {})
-            for trial in kept
-        ),
-        CONFIGURATIONS: _json_lines(
-            {"configuration": json.loads(text), "trials": trials}
-            for text, trials in configurations.items()
-        ),
-        PER_VIEW: _table(rows),
-        **_declared(experiment.folder, kept),
-        **_searches(experiment.folder, kept),
-    }
-    if unfinished:
-        contents[UNFINISHED] = _json_lines(map(_unfinished, unfinished))
-    for trial in kept if pictures else ():
-        for kind in PICTURES:
-            place = f"{PICTURES_FOLDER}/{_folder(trial.path)}/{kind}"
-            for path in trial.folder.pictures(kind):
-                contents[f"{place}/{path.name}"] = read_bytes(path)
-    check_size(sum(map(len, contents.values())))
-    _write_zip(out, experiment.name, kept, contents)
-    return left_out
+    for path in unfinished:
+        files |= _of_unfinished(path)
+    if TEXTURED.key in {question.metric for question in all_questions(experiment)}:
+        for trial in kept:
+            with suppress(InputError):  # a trial whose pictures cannot be read
+                measures = PixelMeasures(error_textured=textured_error(trial)).to_json()
+                files[f"{_folder(trial.path)}/{FROM_PIXELS}"] = _page(measures)
+    files |= _searches(experiment.folder, kept)
+    check_size(sum(map(len, files.values())))
+    _write_zip(out, experiment.name, kept, dict(sorted(files.items())))
+    return left_out, _open(experiment)
+
+
+def _open(experiment: Experiment) -> str:
+    answers = compare(newest_code(experiment)).answers
+    states = [verdict.state for one in answers for verdict in (one.verdict, *one.others)]
+    still_open = sum(state in (RUNNING, STOPPED) for state in states)
+    return f"open: {still_open} of {len(states)}" if still_open else ""
 
 
 def _write_zip(
-    out: Path, name: str, trials: Sequence[TrialResult], contents: dict[str, bytes]
+    out: Path, name: str, trials: Sequence[TrialResult], files: Mapping[str, bytes]
 ) -> None:
-    """Write the archive of these ``contents`` by name, with its manifest and its description."""
-    digests = {file: hashlib.sha256(content).hexdigest() for file, content in contents.items()}
+    """Write the archive of these ``files`` by place, with its manifest and its description."""
+    digests = {place: hashlib.sha256(content).hexdigest() for place, content in files.items()}
     manifest = {"format": FORMAT, "version": VERSION, "experiment": name}
-    contents = contents | {MANIFEST: _page(manifest | {"gsbench": __version__, "sha256": digests})}
-    sizes = {file: len(content) for file, content in contents.items()}
+    manifest |= {"gsbench": __version__, "sha256": digests}
     # The description of the crate comes first, where other programs look for it.
-    contents = {CRATE: _page(crate_metadata(name, trials, sizes))} | contents
+    own = {CRATE: _page(crate_metadata(name, trials)), MANIFEST: _page(manifest)}
     with atomic(out, sync=False) as temporary, zipfile.ZipFile(temporary, "w") as archive:
-        for file, content in contents.items():
-            info = zipfile.ZipInfo(file, FIXED_DATE)
+        for place, content in (own | dict(files)).items():
+            info = zipfile.ZipInfo(place, FIXED_DATE)
             archive.writestr(info, content, zipfile.ZIP_DEFLATED, compresslevel=9)
 
 
-def _declared(home: Path, trials: Sequence[TrialResult]) -> dict[str, bytes]:
-    """The experiment's own records, and what declared questions ask of pictures.
-
-    The pictures themselves are mostly not in the archive.
-    """
-    records = {name: place for name, place in records_of(home).items() if place.is_file()}
-    contents = {
-        name: _shared_ledger(home) if name == LEDGER else read_bytes(place)
-        for name, place in records.items()
+def _of_trial(trial: TrialResult, pictures: bool) -> dict[str, bytes]:
+    """The files of a trial by their places; raises InputError if one is damaged."""
+    read_views(trial)
+    folder = _folder(trial.path)
+    files = {
+        f"{folder}/{RESULTS}": _page(_results(trial)),
+        f"{folder}/{CONFIG}": _configuration(trial.path),
+        f"{folder}/{PER_VIEW}": read_bytes(trial.path / PER_VIEW),
     }
-    asked = itertools.chain(*(one.questions for one in read_declarations(home)))
-    if TEXTURED.key in {question.metric for question in asked}:
-        measured = []
-        for trial in trials:
-            with suppress(InputError):  # a trial whose pictures cannot be read
-                measures = PixelMeasures(error_textured=textured_error(trial)).to_json()
-                measured.append({"folder": _folder(trial.path), "measures": measures})
-        contents[PIXELS] = _json_lines(measured)
-    return contents
+    for kind in PICTURES if pictures else ():
+        for path in trial.folder.pictures(kind):
+            files[f"{folder}/{kind}/{path.name}"] = read_bytes(path)
+    return files
+
+
+def _of_unfinished(path: Path) -> dict[str, bytes]:
+    """The files of a trial without a usable result; its configuration may be unreadable, too."""
+    folder, configuration = _folder(path), b"{}\n"
+    with suppress(InputError, OSError):
+        configuration = _configuration(path)
+    files = {f"{folder}/{CONFIG}": configuration}
+    if TrialFolder(path).state() in ("failed", "damaged"):
+        reason = without_folders(TrialFolder(path).failure().reason)
+        files[f"{folder}/{FAILED}"] = _page({"status": "failed", "message": reason})
+    return files
+
+
+def _of_experiment(home: Path) -> dict[str, bytes]:
+    """The experiment's own records."""
+    shared: dict[str, Callable[[Path], bytes]] = {
+        COMMANDS: _shared_commands,
+        LEDGER: _shared_ledger,
+        DECLARED: lambda home: read_bytes(home / DECLARED),
+    }
+    return {
+        f"{home.name}/{name}": share(home)
+        for name, share in shared.items()
+        if (home / name).is_file()
+    }
 
 
 def _searches(home: Path, trials: Sequence[TrialResult]) -> dict[str, bytes]:
@@ -184,11 +172,9 @@ def _searches(home: Path, trials: Sequence[TrialResult]) -> dict[str, bytes]:
         found[home.name] = read_typed(home / TUNING, TuningRecord)
     for of_arm in group_by(trials, lambda trial: trial.key).values():
         found |= searches_of(of_arm[0])
-    lines = [
-        {"experiment": name, "search": without_paths(search.to_json())}
-        for name, search in sorted(found.items())
-    ]
-    return {SEARCHES: _json_lines(lines)} if lines else {}
+    return {
+        f"{name}/{TUNING}": _page(without_paths(search.to_json())) for name, search in found.items()
+    }
 
 
 def _shared_ledger(home: Path) -> bytes:
@@ -199,6 +185,21 @@ def _shared_ledger(home: Path) -> bytes:
             entry["words"] = without_private_words(entry["words"])
         entries.append(without_paths(entry))
     return chained(entries).encode()
+
+
+def _shared_commands(home: Path) -> bytes:
+    """The commands for others, without folders and servers of this machine, and so linked anew."""
+    lines = []
+    for line in read_lines(home):
+        if isinstance(line, Command):
+            trials = {
+                name: replace(trial, words=tuple(without_private_words(trial.words)))
+                for name, trial in line.trials.items()
+            }
+            words = tuple(without_private_words(line.words))
+            line = replace(line, words=words, cwd="", trials=trials)
+        lines.append(line)
+    return chained_commands(lines).encode()
 
 
 def without_private_words(words: Sequence[str]) -> list[str]:
@@ -216,20 +217,12 @@ def _page(content: Mapping[str, Any]) -> bytes:
 
 
 def _folder(path: Path) -> str:
-    """A trial's folder within its experiment."""
-    return "/".join(path.parts[-3:])
+    """A trial's folder within the runs folder."""
+    return "/".join(path.parts[-4:])
 
 
-def _unfinished(path: Path) -> dict[str, Any]:
-    """The line of a trial without a usable result; its configuration may be unreadable, too."""
-    configuration = "{}"
-    with suppress(InputError, OSError):
-        configuration = _configuration(path)
-    return {"folder": _folder(path), "configuration": json.loads(configuration)}
-
-
-def _configuration(path: Path) -> str:
-    """The trial's ``config.yaml`` as JSON, without paths of this machine.
+def _configuration(path: Path) -> bytes:
+    """The trial's ``config.yaml`` without paths of this machine.
 
     Raises InputError if it is damaged.
     """
@@ -239,8 +232,8 @@ def _configuration(path: Path) -> str:
         raise InputError(NO_CONFIGURATION) from None
     if not isinstance(values, dict):
         raise InputError(f"its {CONFIG} is not a mapping")
-    kept = {key: value for key, value in values.items() if key not in (*PRIVATE, SEED_KEY)}
-    return json.dumps(without_paths(kept))
+    kept = {key: value for key, value in values.items() if key not in PRIVATE}
+    return yaml.safe_dump(without_paths(kept), sort_keys=False).encode()
 
 
 def _results(trial: TrialResult) -> dict[str, Any]:
@@ -267,22 +260,8 @@ def without_paths(value: Any) -> Any:
     return value
 
 
-def _json_lines(entries: Any) -> bytes:
-    return "".join(json.dumps(entry, separators=(",", ":")) + "\n" for entry in entries).encode()
-
-
-def _table(rows: Sequence[Mapping[str, object]]) -> bytes:
-    text, columns = io.StringIO(), dict.fromkeys(itertools.chain(*rows))
-    writer = csv.DictWriter(text, columns, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue().encode()
-
-
-def crate_metadata(
-    name: str, trials: Sequence[TrialResult], sizes: Mapping[str, int]
-) -> dict[str, Any]:
-    """The archive in the terms of RO-Crate; ``sizes`` are the bytes of each of its files."""
+def crate_metadata(name: str, trials: Sequence[TrialResult]) -> dict[str, Any]:
+    """The archive in the terms of RO-Crate; the manifest lists its files."""
     scenes = sorted({trial.scene for trial in trials})
     arms = sorted({str(trial.arm) for trial in trials})
     protocols = sorted({trial.record.protocol for trial in trials})
@@ -294,19 +273,15 @@ def crate_metadata(
         "description": f"{len(trials)} trainings of 3D Gaussian Splatting: {', '.join(arms)} on "
         f"{', '.join(scenes)}, measured by {', '.join(protocols)}. No models.",
         "datePublished": day,
-        "hasPart": [{"@id": file} for file in sizes],
+        "hasPart": [{"@id": MANIFEST}],
     }
-    files = [
-        {
-            "@id": file,
-            "@type": "File",
-            "name": file,
-            "description": FILES.get(file, PICTURE)[1],
-            "encodingFormat": FILES.get(file, PICTURE)[0],
-            "contentSize": str(size),
-        }
-        for file, size in sizes.items()
-    ]
+    manifest = {
+        "@id": MANIFEST,
+        "@type": "File",
+        "name": MANIFEST,
+        "description": "Version of the archive, and the sha256 of its files",
+        "encodingFormat": "application/json",
+    }
     about = {"conformsTo": {"@id": SPECIFICATION}, "about": {"@id": "./"}}
     descriptor = {"@id": CRATE, "@type": "CreativeWork"} | about
-    return {"@context": f"{SPECIFICATION}/context", "@graph": [descriptor, root, *files]}
+    return {"@context": f"{SPECIFICATION}/context", "@graph": [descriptor, root, manifest]}

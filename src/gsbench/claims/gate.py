@@ -9,79 +9,75 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from gsbench.analysis.judgement import Verdict
-from gsbench.analysis.looks import FIRST_LOOK, plan_looks
 from gsbench.analysis.notes import Note
 from gsbench.analysis.quantities import COSTS, NO_DIRECTION
+from gsbench.analysis.questions import FIRST_LOOK, LeastEffect, plan_looks, read_least
 from gsbench.analysis.results import Arm, TrialResult
+from gsbench.analysis.sentences import in_words, least_words, with_notes
 from gsbench.analysis.statistics import REFUTED, SUPPORTED, TOO_SMALL, UNDECIDED
-from gsbench.analysis.verdict_words import in_words, least_words, with_notes
-from gsbench.claims.file import LeastEffect, read_least
-from gsbench.claims.stopping import SequentialTest, facts_for
+from gsbench.analysis.verdicts import Verdict
+from gsbench.claims.stopping import SequentialTest
 from gsbench.errors import InputError
 from gsbench.eval.facts import known_keys
-from gsbench.runs.experiments import Declaration, Question, declared_now, trial_key
+from gsbench.pipeline.metric_facts import facts_for
+from gsbench.runs.commands import Question
 from gsbench.words import did_you_mean
 
-# replace the configuration hash in trials' keys, since versions may share settings
+# stand for the digests of trials, since versions may share settings
 BASELINE, NEW = "baseline", "new"
 PASSED, WORSE, NOT_DECIDED = "passed", "worse", "undecided"
 
 ReadTrials = Callable[[], Iterable[TrialResult]]
 
 
-def ask_gate(declaration: Declaration, baseline: ReadTrials, new: ReadTrials) -> SequentialTest:
+def ask_gate(question: Question, baseline: ReadTrials, new: ReadTrials) -> SequentialTest:
     """The question of a gate, with functions that read each version's finished trials.
 
     It ends also as soon as the new version is shown not to be worse: a gate asks no more.
     """
     read = _versions({BASELINE: baseline, NEW: new})
-    return SequentialTest(declaration, read, lambda verdicts: result_of(verdicts[0]) != NOT_DECIDED)
+    return SequentialTest((question,), read, lambda verdicts: result_of(verdicts[0]) != NOT_DECIDED)
 
 
 def _versions(sides: Mapping[str, ReadTrials]) -> ReadTrials:
-    """A function that reads the trials of all versions, with the versions in their keys."""
+    """A function that reads the trials of all versions, with the versions as their digests."""
     return lambda: [
-        trial if trial.config_hash == version else replace(trial, config_hash=version)
-        for version, read in sides.items()
-        for trial in read()
+        replace(trial, alias=version) for version, read in sides.items() for trial in read()
     ]
 
 
 def declare_gate(
     metric: str,
     least: str | None,
-    scenes: Mapping[str, tuple[str, str]],
+    scenes: Iterable[str],
     seeds: Sequence[int],
     values: Mapping[str, Any],
-) -> Declaration:
-    """The declaration of a gate about ``metric``.
+) -> Question:
+    """The question of a gate about ``metric`` on ``scenes``.
 
-    ``scenes`` has, for each scene, the names of both arms, such as ``sfm-adc``. Seeds are added
-    in the order of ``seeds``. Raises InputError, one line, for a metric that cannot be judged
-    (`asked_difference`), and for too few seeds.
+    Seeds are added in the order of ``seeds``. Raises InputError, one line, for a metric that cannot
+    be judged (`asked_difference`), and for too few seeds.
     """
     sign, size = asked_difference(metric, least, values)
     if len(seeds) < FIRST_LOOK:
         raise InputError(
             f"a gate needs at least {FIRST_LOOK} seeds, and there is {len(seeds)}: allow more"
         )
-    question = Question(
+    names = list(scenes)
+    return Question(
         metric=metric,
-        sign=sign,
+        sign=1 if sign > 0 else -1,
         least=size.size,
         relative=size.relative,
         baseline=Arm("", BASELINE),
-        arm=Arm("", NEW),
-        scenes={
-            scene: (trial_key(scene, baseline, BASELINE), trial_key(scene, new, NEW))
-            for scene, (baseline, new) in scenes.items()
-        },
-        seeds=tuple(seeds),
+        idea=Arm("", NEW),
+        digests=dict.fromkeys(names, (BASELINE, NEW)),
+        seeds=dict.fromkeys(names, tuple(seeds)),
+        looks=plan_looks(len(seeds)),
+        rule="gate",
         versions=True,
         name="gate",
     )
-    return declared_now(questions=(question,), looks=plan_looks(len(seeds)))
 
 
 def asked_difference(
@@ -134,7 +130,7 @@ def describe(verdict: Verdict) -> str:
 
     For example ``worse: worse in PSNR (dB) on this scene: −1.20 (interval −1.50 to −0.90), …``.
     """
-    sentence = in_words(verdict, _not_worse(verdict))
+    sentence = _not_worse(verdict) or in_words(verdict)
     return with_notes(f"{result_of(verdict)}: {sentence}", verdict)
 
 

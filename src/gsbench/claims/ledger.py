@@ -15,18 +15,18 @@ side. `scripts/ledger_rates.py` simulates it (findings/simulations.md).
 
 import hashlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 
-from gsbench.analysis.comparison import unused_trials
-from gsbench.analysis.judgement import Verdict, judge
-from gsbench.analysis.looks import plan_looks
 from gsbench.analysis.notes import Note
 from gsbench.analysis.quantities import COSTS, relative_change
+from gsbench.analysis.questions import plan_looks
 from gsbench.analysis.results import Arm, TrialResult
+from gsbench.analysis.sentences import least_words, reason, with_notes
 from gsbench.analysis.statistics import REFUTED, SUPPORTED, TOO_SMALL
-from gsbench.analysis.verdict_words import least_words, reason, with_notes
+from gsbench.analysis.verdicts import Verdict
 from gsbench.claims.stopping import SequentialTest
 from gsbench.errors import InputError
-from gsbench.runs.experiments import Declaration, Question
+from gsbench.runs.commands import ERROR_RATE, Question
 from gsbench.runs.ledger import (
     BASELINE,
     DROPPED,
@@ -104,22 +104,20 @@ def _new_seeds(ledger: Ledger, idea: str) -> tuple[int, ...]:
             return seeds
 
 
-def screening_of(ledger: Ledger, idea: str) -> Declaration:
+def screening_of(ledger: Ledger, idea: str) -> Question:
     """The question whether an idea looks better on the seeds of all ideas, in looks."""
     started = ledger.started[idea]
     level = SCREEN if started.level is None else started.level
-    return _in_looks(ledger, idea, started.time, ledger.opened.seeds, level)
+    return _in_looks(ledger, idea, ledger.opened.seeds, level)
 
 
-def test_of(ledger: Ledger, idea: str) -> Declaration:
+def test_of(ledger: Ledger, idea: str) -> Question:
     """The question of an idea's test, in looks on its new seeds."""
     test = ledger.tests[idea]
-    return _in_looks(ledger, idea, test.time, test.seeds, test.level)
+    return _in_looks(ledger, idea, test.seeds, test.level)
 
 
-def _in_looks(
-    ledger: Ledger, idea: str, time: str, seeds: tuple[int, ...], level: float
-) -> Declaration:
+def _in_looks(ledger: Ledger, idea: str, seeds: tuple[int, ...], level: float) -> Question:
     """An idea passes by one side of the interval, so the interval has twice the level."""
     started = ledger.started[idea]
     question = _question(
@@ -128,22 +126,17 @@ def _in_looks(
         (idea, started.keys),
         seeds,
     )
-    return Declaration(
-        time=time,
-        questions=(question,),
-        looks=plan_looks(len(seeds)),
-        error_rate=min(1.0, 2 * level),
-    )
+    return replace(question, looks=plan_looks(len(seeds)), level=min(1.0, 2 * level))
 
 
-def confirmation_of(opened: Opened, confirming: Confirming) -> Declaration:
+def confirmation_of(opened: Opened, confirming: Confirming) -> list[Question]:
     """The questions of a confirmation. All seeds are judged at once; the ideas share 5 %."""
-    questions = tuple(
+    questions = [
         _question(opened, (BASELINE, confirming.keys[BASELINE]), (idea, keys), confirming.seeds)
         for idea, keys in confirming.keys.items()
         if idea != BASELINE
-    )
-    return Declaration(time=confirming.time, questions=questions)
+    ]
+    return [replace(one, level=ERROR_RATE / len(questions)) for one in questions]
 
 
 def _question(
@@ -161,17 +154,27 @@ def _question(
         least=opened.least,
         relative=opened.relative,
         baseline=Arm("", against),
-        arm=Arm("", name),
-        scenes={scene: (old[scene], new[scene]) for scene in new},
-        seeds=seeds,
+        idea=Arm("", name),
+        digests={scene: (old[scene], new[scene]) for scene in new},
+        seeds=dict.fromkeys(new, seeds),
+        rule="lond",
         versions=True,
         name=name,
     )
 
 
-def ask_idea(declaration: Declaration, read: Callable[[], Iterable[TrialResult]]) -> SequentialTest:
+def ask_idea(question: Question, read: Callable[[], Iterable[TrialResult]]) -> SequentialTest:
     """The question of an idea; it ends also as soon as the idea is given up."""
-    return SequentialTest(declaration, read, lambda verdicts: result_of(verdicts[0]) != UNDECIDED)
+    return SequentialTest(
+        (question,),
+        lambda: named_by_key(read()),
+        lambda verdicts: result_of(verdicts[0]) != UNDECIDED,
+    )
+
+
+def named_by_key(trials: Iterable[TrialResult]) -> list[TrialResult]:
+    """The trials as the questions of a ledger name them: by their keys."""
+    return [replace(trial, alias=trial.key) for trial in trials]
 
 
 def result_of(verdict: Verdict) -> Result:
@@ -197,7 +200,7 @@ def end_of(idea: str, verdict: Verdict, time: str, tested: bool = True) -> Ended
     for cost in ("gaussians", "train_time"):
         change = relative_change(baseline, new, COSTS[cost][1])
         ratios[cost] = None if change is None else 1 + change.of_totals
-    words = reason(verdict, _hopeless(verdict))
+    words = _hopeless(verdict) or reason(verdict)
     if not tested and verdict.outcome == REFUTED:
         words = LOOKS_WORSE
     return Ended(
@@ -230,15 +233,6 @@ def difference_of(verdict: Verdict) -> Difference | None:
     return Difference(mean=verdict.mean, low=verdict.interval.low, high=verdict.interval.high)
 
 
-def unused(ledger: Ledger, trials: Sequence[TrialResult]) -> list[Note]:
-    """A note with the reason for the trials that are in no verdict on an idea."""
-    declarations = [screening_of(ledger, idea) for idea in ledger.started]
-    declarations += [test_of(ledger, idea) for idea in ledger.tests]
-    declarations += [confirmation_of(ledger.opened, asked) for asked, _ in ledger.confirmations]
-    verdicts = [verdict for declaration in declarations for verdict in judge(trials, declaration)]
-    return unused_trials(trials, verdicts)
-
-
 def contradictions(ledger: Ledger, trials: Sequence[TrialResult]) -> list[Note]:
     """A note for each idea whose recorded result is not what its trials show.
 
@@ -248,10 +242,10 @@ def contradictions(ledger: Ledger, trials: Sequence[TrialResult]) -> list[Note]:
     for idea, ended in ledger.ended.items():
         if ended.result == FAILED:
             continue
-        declaration = (test_of if idea in ledger.tests else screening_of)(ledger, idea)
-        seeds = declaration.questions[0].seeds[: ended.seeds]
+        question = (test_of if idea in ledger.tests else screening_of)(ledger, idea)
+        seeds = next(iter(question.seeds.values()))[: ended.seeds]
         counting = [trial for trial in trials if trial.seed in seeds]
-        (verdict,) = ask_idea(declaration, counting.copy).verdicts()
+        (verdict,) = ask_idea(question, counting.copy).verdicts()
         now = result_of(verdict)
         if verdict.pairs.seeds == ended.seeds and now != ended.result:
             notes.append(Note.of("contradiction", idea=idea, recorded=ended.result, now=now))

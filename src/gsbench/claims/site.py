@@ -13,7 +13,6 @@ from typing import Any
 
 from gsbench.analysis.cells import swept_settings
 from gsbench.analysis.comparison import compare
-from gsbench.analysis.judgement import Verdict, judge
 from gsbench.analysis.quantities import choose_quantities
 from gsbench.analysis.ranks import rank_all
 from gsbench.analysis.report.build import build_report
@@ -24,7 +23,6 @@ from gsbench.analysis.tables import build_table
 from gsbench.claims.archive import unpack_archive
 from gsbench.errors import InputError
 from gsbench.files import own_output, write_text
-from gsbench.runs.experiments import latest_declaration, read_declarations
 
 INDEX, REPORTS = "index.html", "reports"
 
@@ -67,16 +65,10 @@ def write_site(archives: Sequence[Path], out: Path, title: str, scratch: Path) -
 def _section(experiment: Experiment, key: str) -> dict[str, Any]:
     """An experiment's section of the first page; ``key`` is for names of files and anchors.
 
-    It has the verdicts on declared claims, a line on each compared pair of arms, and a table of
-    arms × scenes for each quantity.
+    It has a line on each idea, and a table of arms × scenes for each quantity.
     """
     trials, notes = experiment.trials, list[str]()
-    claims: list[Verdict] = []
     tables: list[Table] = []
-    try:
-        claims = _claims(experiment)
-    except InputError as error:
-        notes.append(f"Its declared claims cannot be judged: {error}")
     try:
         rows = ("init", "densify", *swept_settings(trials))
         tables = list(_by_quantity(build_table(experiment, rows=rows, columns=("scene",))))
@@ -98,27 +90,12 @@ def _section(experiment: Experiment, key: str) -> dict[str, Any]:
     ranks = [rank_plot(ranking) for ranking in rank_all(arms, choose_quantities(arms))]
     shown = {
         "facts": list(facts.items()),
-        "claims": claims,
         "lines": comparison.sentences,
         "tables": tables,
         "notes": [*notes, *comparison.remarks, *experiment.warnings],
     }
     ranks = ranks if comparison.pairs else []
     return {"name": experiment.name, "key": key, "ranks": ranks} | shown
-
-
-def _claims(experiment: Experiment) -> list[Verdict]:
-    """The verdicts on declared claims, as `gsbench check --from` gives them, without gates."""
-    declared = [
-        declaration
-        for declaration in read_declarations(experiment.folder)
-        if declaration.kind == "claims"
-    ]
-    if not declared:
-        return []
-    judged = judge(experiment.trials, latest_declaration(declared))
-    # A gate's baseline trials are not in this archive.
-    return [verdict for verdict in judged if not verdict.question.versions]
 
 
 def _by_quantity(table: Table) -> Iterator[Table]:

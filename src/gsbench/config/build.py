@@ -22,12 +22,16 @@ from gsbench.words import did_you_mean
 log = logging.getLogger(__name__)
 
 RESERVED = ("_target_", "name", "switches")  # keys of a group that are not options of its class
-REQUIRED_METHODS = {  # of a user's class, by the group that names it
+REQUIRED_METHODS = {  # of a user's class, by the group or the setting that names it
     "init": ("needs_reference", "content", "run"),
     "densify": ("prepare", "begin", "observe", "refine", "after_step"),
     "raster": ("render",),
     "eval": ("measure",),
     "scene": ("read",),
+    "train.loss": ("__call__",),
+    "train.terms": ("__call__",),
+    "train.schedule": ("__call__",),
+    "train.optimizer": ("init", "step"),
     "tracking": ("open", "params", "tags", "metrics", "artifacts", "close"),
 }
 
@@ -40,6 +44,8 @@ def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
     its code sees them. Raises InputError naming the key that is unknown or wrong.
     """
     target = values["_target_"]
+    if not target:
+        raise InputError(f"{group} names no _target_: the class to use")
     for place, nested_target in targets_in(values, tuple(group.split("."))):
         check_target(nested_target, ".".join(place), allow_targets, packages_allowed_at(place))
     external = group == "densify" and is_external(values)
@@ -100,8 +106,14 @@ def locate(target: str, group: str, allow_targets: list[str]) -> type:
     """
     loaded_before = set(sys.modules)
     cls = load_class(target, group, allow_targets)
-    required = REQUIRED_METHODS[group.partition(".")[0]]
-    lacking = [method for method in required if not callable(getattr(cls, method, None))]
+    required = next(
+        methods
+        for place, methods in REQUIRED_METHODS.items()
+        if group == place or group.startswith(f"{place}.")
+    )
+    # A class itself can always be called: only its own ``__call__`` counts.
+    defined = {name for base in getattr(cls, "__mro__", ()) for name in vars(base)}
+    lacking = [method for method in required if method not in defined]
     if not isinstance(cls, type) or lacking:
         without = f": it has no {', '.join(lacking)}()" if lacking else ""
         raise InputError(f"{group}._target_={target} is not a class for {group}{without}")

@@ -105,8 +105,10 @@ class Composer:
         self._chosen: dict[tuple[str, ...], DictConfig] = {}
         self._times: dict[str, Any] = {}  # what ${now:…} stands for, the same in all trials
         self._own_choices = _choices(own)
-        # The settings of a group whose choices are listed are checked with each choice.
+        # The settings of a group whose choices are listed, here or in a file, are checked with each
+        # choice.
         listed = set(map(key_of, words)) - set(map(key_of, single))
+        listed |= _swept_groups(self._choose(own).hydra.sweeper)
         values = [word for word in own if key_of(word).partition(".")[0] not in listed]
         self.config = self.settings(values)
         with explained(words):
@@ -265,6 +267,15 @@ class Composer:
                 for key, word in choices.items()
             )
         )
+
+
+def _swept_groups(sweeper: DictConfig) -> set[str]:
+    """The groups of which a sweep in a file lists choices or settings."""
+    raw: Any = OmegaConf.to_container(sweeper, resolve=False)
+    params, grids = raw.get("params"), raw.get("grids")
+    nodes = [params, *(grids if isinstance(grids, list) else [])]
+    keys = [str(key) for node in nodes if isinstance(node, dict) for key in node]
+    return {bare_key(key).partition(".")[0] for key in keys}
 
 
 def _is_value(word: str) -> bool:

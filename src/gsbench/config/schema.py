@@ -40,7 +40,7 @@ from gsbench.settings import (
     is_folder_name,
 )
 from gsbench.system.resources import trials_at_once
-from gsbench.train.options import TrainConfig, scale_steps
+from gsbench.train.options import IDEAS, TrainConfig, scale_steps
 
 NO_DENSIFIER = "gsbench.densify.NoDensifier"
 TUNE = "hydra.sweeper.tune"
@@ -79,7 +79,7 @@ class TrackingConfig:
     _target_: TargetName = "gsbench.tracking.MLflow"
     # null: $MLFLOW_TRACKING_URI, else sqlite in the runs folder; W&B: $WANDB_BASE_URL
     uri: Address | None = None
-    flush_seconds: PositiveFloat = 10.0
+    flush_seconds: PositiveFloat = 60.0  # between two sendings while trials run
     # waiting for a slow tracker at the end; `gsbench sync` sends the rest
     patience_seconds: NonNegativeFloat = 30.0
     images: NonNegativeInt = 4  # test renders mirrored per trial
@@ -172,6 +172,10 @@ class Config:
     runs: PathName = MISSING
     # names of what may run beside gsbench; only the command line sets them
     allow_targets: list[str] = field(default_factory=list)
+    # other questions than each idea against eval.baseline (docs/verdict.md)
+    questions: list[Any] = field(default_factory=list)
+    # of a command's questions: each idea has 5 %, or all share it
+    error_rate: Literal["each", "shared"] = "each"
     scene: SceneConfig = field(default_factory=SceneConfig)
     init: Any = MISSING
     densify: Any = MISSING
@@ -281,6 +285,7 @@ FIXED_IN_PROGRAMS: tuple[tuple[str, str, Any, str], ...] = (
     ("eval", "at", [], "shows its model only at the end: leave eval.at empty"),
     ("train", "max_seconds", None, "cannot be stopped early: give it fewer train.iterations"),
     ("train", "resolution_schedule", "none", "has its own sizes: leave it at none"),
+    *(("train", name, None, f"has its own {name}: leave it out") for name in IDEAS),
 )
 
 # ---- rules: each checks the values of a configuration, or converts some in place
@@ -314,8 +319,11 @@ def groups_keep_their_schemas(values: dict[str, Any]) -> None:
             given = {key: value for key, value in given.items() if key in known}
         settings = schema(**check_values(schema, given, group))
         values[group] |= plain({key: getattr(settings, key) for key in given})
-    if values["scene"].get("_target_") is None:  # as in configurations before it was a setting
-        values["scene"].pop("_target_", None)
+    # Settings that name a class stand only where one is named, as in configurations before them.
+    for group, names in (("scene", ("_target_",)), ("train", IDEAS)):
+        for name in names:
+            if not values[group].get(name):
+                values[group].pop(name, None)
 
 
 def root_keeps_its_schema(values: dict[str, Any]) -> None:
@@ -350,7 +358,7 @@ def nothing_grows_untrained(values: dict[str, Any]) -> None:
 
 def another_program_can_follow(values: dict[str, Any]) -> None:
     for group, key, free, why in FIXED_IN_PROGRAMS if is_external(values["densify"]) else ():
-        if values[group][key] != free:
+        if values[group].get(key) != free:
             raise InputError(f"{group}.{key}: another program {why}")
 
 

@@ -111,6 +111,7 @@ class Densifier:
     SWITCHES: ClassVar[Mapping[str, Switch]] = {}
     needs_absolute_gradient: bool = False
     needs_footprint: bool = False  # ``RenderOutput.footprint``, which not every rasterizer gives
+    needs_depth: bool = False  # ``RenderOutput.depth`` of each training view
     # the extra output to ask for (``RenderOutput.extra``), which not every rasterizer gives
     needs_extra: str | None = None
 
@@ -154,7 +155,10 @@ class Densifier:
         return None
 
     def observe(self, step: int, render: RenderOutput) -> None:
-        """Gather statistics of iteration ``step`` (1, 2, …) after its backward pass."""
+        """Gather statistics of iteration ``step`` (1, 2, …) after its backward pass.
+
+        A subclass may have a third argument ``view``, the `gsbench.train.ideas.TrainedView`.
+        """
 
     def rules(self, refinement: Refinement) -> list[Rule]:
         """Return the rules that are due at ``refinement.step``, in order; [] if none is due."""

@@ -64,9 +64,9 @@ class EvalConfig:
     at: Annotated[list[PositiveInt], Predicate(all_different), doc(AT_RULE)] = field(
         default_factory=list
     )
-    # The metric of the verdict, declared before results are seen (psnr@extrapolation: for one
-    # question); null: none.
-    primary: str | None = None
+    # the metric of the verdict (psnr@extrapolation: for one question of two splits)
+    primary: str | None = "psnr"
+    baseline: FolderName = "adc"  # the densifier that ideas are compared with
     # {longaxis: absgrad}
     controls: Annotated[dict[str, FolderName], doc(CONTROLS_RULE)] = field(default_factory=dict)
     maps: bool = False  # draw the large Gaussians over a test view

@@ -1,180 +1,155 @@
-"""Matching rendered pictures with photographs by name, without guesses, and measuring them."""
+"""Pictures of views on disk: how renders and photographs are read, what is odd, their metrics.
 
-import re
-from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+Photographs of a capture are read by `gsbench.scene.images.read_image`. A render is the result of a
+measurement, so nothing is blended or cut here, and what lowers its values is told.
+"""
+
+import logging
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator
+from gsbench.files import DAMAGE
 from gsbench.logs import Progress, no_progress
-from gsbench.scene.images import image_size, read_image
+from gsbench.scene.images import EXIF_ORIENTATION, open_image, read_image
 from gsbench.scene.masks import read_mask
 from gsbench.words import counted, some_of
 
-DIGITS = re.compile(r"\d+")
-SAME_NAMES = ""
-BY_ORDER = "by order"
-
-
-@dataclass(frozen=True)
-class Matching:
-    """The picture of each photograph. ``left_out`` are the pictures without a photograph.
-
-    ``rule`` says how the names were compared; it is "" if they are the same.
-    """
-
-    pairs: Mapping[str, str]
-    rule: str
-    left_out: tuple[str, ...]
-
-
-def match_pictures(
-    photographs: Sequence[str], pictures: Sequence[str], by_order: str = "--by-order"
-) -> Matching:
-    """Match names (relative paths) by the first rule under which every photograph has a picture.
-
-    The rules, from strict to loose, compare names: as they are; without the extension; with folders
-    written as part of the name; without case; without a start and an end that all names share;
-    without leading zeros; and by the last three rules without folders. Raises `InputError` if that
-    rule gives a photograph several pictures, or if no rule gives each a picture. ``by_order`` is
-    the option that error messages suggest for `match_by_order`.
-    """
-    for rule, make_keys in _RULES.items():
-        photograph_keys, picture_keys = make_keys(photographs), make_keys(pictures)
-        if len(set(photograph_keys.values())) < len(photographs):
-            continue  # this rule gives two photographs the same key
-        by_key = defaultdict(list)
-        for picture in pictures:
-            by_key[picture_keys[picture]].append(picture)
-        if not all(key in by_key for key in photograph_keys.values()):
-            continue
-        matches = {photograph: by_key[key] for photograph, key in photograph_keys.items()}
-        for photograph, candidates in matches.items():
-            if len(candidates) > 1:
-                raise InputError(
-                    f"{', '.join(sorted(candidates))} all fit the photograph {photograph}: leave "
-                    "one"
-                )
-        pairs = {photograph: candidates[0] for photograph, candidates in matches.items()}
-        return Matching(pairs, rule, tuple(sorted(set(pictures) - set(pairs.values()))))
-    raise InputError(_no_match(photographs, pictures, by_order))
-
-
-def match_by_order(photographs: Sequence[str], pictures: Sequence[str]) -> Matching:
-    """Match the k-th picture with the k-th photograph, both sorted with numbers by value.
-
-    Raises `InputError` if there are not equally many.
-    """
-    if len(photographs) != len(pictures):
-        raise InputError(
-            f"there are {counted(len(pictures), 'picture')} for "
-            f"{counted(len(photographs), 'photograph')}: by order, "
-            "each needs one"
-        )
-    in_order = sorted(photographs, key=_by_value), sorted(pictures, key=_by_value)
-    pairs = dict(zip(*in_order, strict=True))
-    return Matching({photograph: pairs[photograph] for photograph in photographs}, BY_ORDER, ())
-
-
-def _no_match(photographs: Sequence[str], pictures: Sequence[str], by_order: str) -> str:
-    missing = list(photographs)
-    # report the rule that left the fewest photographs without a picture
-    for make_keys in _RULES.values():
-        picture_keys, photograph_keys = set(make_keys(pictures).values()), make_keys(photographs)
-        missing = min(
-            missing,
-            [name for name in photographs if photograph_keys[name] not in picture_keys],
-            key=len,
-        )
-    called = some_of(sorted(pictures)) or "there are none"
-    hint = (
-        f"; {by_order} takes them as they are sorted" if len(pictures) == len(photographs) else ""
-    )
-    return (
-        f"{len(missing)} of {counted(len(photographs), 'photograph')} have no picture of their "
-        f"name ({some_of(missing)}); the pictures are {called}: rename them{hint}"
-    )
-
-
-def _stem(name: str) -> str:
-    return PurePosixPath(name).with_suffix("").as_posix()
-
-
-def _flat(name: str) -> str:
-    return _stem(name).replace("/", "__")
-
-
-def _base(name: str) -> str:
-    return re.split(r"/|__", _stem(name))[-1]
-
-
-def _folded(words: Mapping[str, str]) -> dict[str, str]:
-    return {name: word.casefold() for name, word in words.items()}
-
-
-def _stripped(words: Mapping[str, str]) -> dict[str, str]:
-    """The words without the start and the end that all of them share.
-
-    Digits next to the rest are kept, so that numbers stay whole.
-    """
-    if len(words) < 2:
-        return dict(words)
-    texts = list(words.values())
-    start = len(_common_start(texts).rstrip("0123456789"))
-    end = len(_common_start([text[start:][::-1] for text in texts]).rstrip("0123456789"))
-    return {name: text[start : len(text) - end] for name, text in words.items()}
-
-
-def _common_start(texts: Sequence[str]) -> str:
-    first, last = min(texts), max(texts)
-    different = (index for index, letter in enumerate(first) if last[index : index + 1] != letter)
-    return first[: next(different, len(first))]
-
-
-def _unpadded(words: Mapping[str, str]) -> dict[str, str]:
-    return {
-        name: DIGITS.sub(lambda digits: str(int(digits[0])), word) for name, word in words.items()
-    }
-
-
-def _by_value(name: str) -> list[tuple[int, int, str]]:
-    parts = re.split(r"(\d+)", _flat(name))
-    return [(1, int(part), part) if part.isdigit() else (0, 0, part) for part in parts]
-
-
-# names are equal under a rule if their keys are
-KeyFunction = Callable[[Sequence[str]], dict[str, str]]
-
-
-def _names(
-    key: Callable[[str], str], *steps: Callable[[Mapping[str, str]], dict[str, str]]
-) -> KeyFunction:
-    def keys(names: Sequence[str]) -> dict[str, str]:
-        words = {name: key(name) for name in names}
-        for step in steps:
-            words = step(words)
-        return words
-
-    return keys
-
-
-_RULES: dict[str, KeyFunction] = {
-    SAME_NAMES: _names(str),
-    "apart from the extension": _names(_stem),
-    "with folders as part of the name": _names(_flat),
-    "apart from case": _names(_flat, _folded),
-    "apart from what all names begin or end with": _names(_flat, _folded, _stripped),
-    "apart from leading zeros": _names(_flat, _folded, _stripped, _unpadded),
-    "apart from folders": _names(_base, _folded),
-    "apart from folders and what all names begin or end with": _names(_base, _folded, _stripped),
-    "apart from folders and leading zeros": _names(_base, _folded, _stripped, _unpadded),
-}
-
+log = logging.getLogger(__name__)
 
 # A view of so many pixels takes half a minute; a file of some kB may claim more.
 MAX_PIXELS = 64_000_000
+GREY_MODES = ("1", "L", "LA", "I;16", "I;16B", "I;16L", "I;16N")
+UPRIGHT = (0, 1)  # EXIF orientations; 0 is written by some cameras for none
+LOSSY_WEBP = b"VP8 "  # the first chunk of a WebP file without alpha that is compressed with loss
+
+
+@dataclass(frozen=True)
+class Look:
+    """The facts about a picture that its file tells, before its pixels are used."""
+
+    size: tuple[int, int] = (0, 0)  # px, width and height
+    mode: str = "RGB"  # Pillow's name of the kind of pixels
+    lossy: bool = False
+    sixteen_bits: bool = False  # in each channel
+    transparent: bool = False  # some pixel is
+    orientation: int = 1  # EXIF
+
+    @property
+    def is_grey(self) -> bool:
+        return self.mode in GREY_MODES
+
+
+def look_at(path: Path) -> Look:
+    """Look at a picture; raises `InputError` if it is missing, damaged or no image."""
+    with open_image(path) as image:
+        codecs = [str(tile.args) for tile in getattr(image, "tile", ())]  # such as RGB;16B
+        wide = image.mode.startswith("I;16") or any(";16" in codec for codec in codecs)
+        with path.open("rb") as file:
+            is_webp = file.read(16)[12:] == LOSSY_WEBP
+        try:
+            orientation = int(image.getexif().get(EXIF_ORIENTATION, 1))
+            transparent = image.has_transparency_data and _lowest_alpha(image) < 255
+        except DAMAGE as error:
+            raise InputError(
+                f"{path}: the image is damaged ({error}): replace or remove it"
+            ) from error
+        lossy = image.format in ("JPEG", "MPO") or is_webp
+        return Look(image.size, image.mode, lossy, wide, transparent, orientation)
+
+
+def _lowest_alpha(image: Image.Image) -> int:
+    return int(np.asarray(image.convert("RGBA").getchannel("A")).min())
+
+
+def read_picture(path: Path, is_render: bool) -> NDArray[np.uint8]:
+    """A render or a photograph as [H, W, 3] uint8 RGB.
+
+    16-bit values are rounded to the nearest of 255 levels. The colours of a transparent render are
+    taken as they are; a transparent photograph is blended over black. Raises `InputError` as
+    `read_image` does.
+    """
+    look, pixels = look_at(path), read_image(path)
+    if look.transparent and is_render:
+        with open_image(path) as image:
+            return np.array(image.convert("RGBA"), dtype=np.uint8)[..., :3]
+    if look.sixteen_bits and not look.transparent:
+        import pycolmap  # Pillow keeps the high bytes of 16-bit colours, and has lost the low ones
+
+        rounded = pycolmap.Bitmap.read(path, as_rgb=True)
+        return pixels if rounded is None else np.array(rounded.to_array(), dtype=np.uint8)
+    return pixels
+
+
+@dataclass(frozen=True)
+class PictureRule:
+    """A row of `RULES`: ``applies`` to a render and its photograph; ``says`` what it means."""
+
+    id: str
+    applies: Callable[[Look, Look], bool]
+    says: str  # after the number of renders or photographs
+
+
+RULES = (
+    PictureRule(
+        "transparent-render",
+        lambda render, _: render.transparent,
+        "{renders} transparent pixels (alpha below 1), and the colours are measured as stored: "
+        "blend them over the background of the photographs first if they are not",
+    ),
+    PictureRule(
+        "lossy-render",
+        lambda render, _: render.lossy,
+        "{renders} the compression of JPEG or WebP, which lowers every value: write PNG",
+    ),
+    PictureRule(
+        "palette-render",
+        lambda render, _: render.mode == "P",
+        "{renders} a palette of at most 256 colours, which lowers every value: write RGB",
+    ),
+    PictureRule(
+        "grey-render",
+        lambda render, truth: render.is_grey and not truth.is_grey,
+        "{renders} grey pixels only, and the photographs colours: are they depth maps or masks?",
+    ),
+    PictureRule(
+        "turned",
+        lambda render, truth: (render.orientation in UPRIGHT) != (truth.orientation in UPRIGHT),
+        "{photographs} another EXIF orientation than the renders: one of them is stored on its "
+        "side, and both are compared as stored",
+    ),
+    PictureRule(
+        "transparent-photograph",
+        lambda _, truth: truth.transparent,
+        "{photographs} transparent pixels, which are blended over black: blend them over the "
+        "background of the renders first if that is another",
+    ),
+)
+
+
+def find_odd_pictures(looks: Sequence[tuple[str, Look, Look]]) -> list[str]:
+    """Log and return one line for each rule that applies to some views.
+
+    ``looks`` has the name of each view and what its render and its photograph look like.
+    """
+    lines = []
+    for rule in RULES:
+        odd = [view for view, render, truth in looks if rule.applies(render, truth)]
+        if odd:
+            have = "has" if len(odd) == 1 else "have"
+            renders, photographs = (
+                f"{counted(len(odd), what)} {have}" for what in ("render", "photograph")
+            )
+            says = rule.says.format(renders=renders, photographs=photographs)
+            lines.append(f"{says} ({some_of(odd)})")
+            log.warning("%s", lines[-1])
+    return lines
 
 
 @dataclass(frozen=True)
@@ -187,25 +162,30 @@ class PicturePair:
     mask: Path | None = None
 
 
-def check_picture_sizes(pairs: Sequence[PicturePair]) -> None:
-    """Raise `InputError` for a picture whose size differs from its photograph's, or is too large.
+def check_pairs(pairs: Sequence[PicturePair]) -> list[str]:
+    """Look at all pictures before any is measured; returns what is odd, one line a kind.
 
-    Pictures are never resized.
+    Raises `InputError` for a picture whose size differs from its photograph's, or is too large:
+    pictures are never resized.
     """
+    looks = []
     for pair in pairs:
-        (width, height) = image_size(pair.picture)
-        (wanted_width, wanted_height) = image_size(pair.photograph)
-        if (width, height) != (wanted_width, wanted_height):
+        render, truth = look_at(pair.picture), look_at(pair.photograph)
+        (width, height), wanted = render.size, truth.size
+        if render.size != wanted:
+            turned = f"; it is stored on its side (EXIF orientation {truth.orientation}): turn it"
             raise InputError(
                 f"{pair.picture} is {width}x{height} px, but its photograph {pair.photograph} "
-                f"{wanted_width}x{wanted_height}: sizes are never changed here, so render at the "
-                "photographs' size"
+                f"{wanted[0]}x{wanted[1]}: sizes are never changed here, so render at the "
+                f"photographs' size{'' if truth.orientation in UPRIGHT else turned}"
             )
         if width * height > MAX_PIXELS:
             raise InputError(
                 f"{pair.picture} is {width}x{height} px: pictures of more than "
                 f"{MAX_PIXELS / 1e6:g} megapixels are not measured; render and shrink both"
             )
+        looks.append((pair.view, render, truth))
+    return find_odd_pictures(looks)
 
 
 def measure(
@@ -213,14 +193,12 @@ def measure(
 ) -> dict[str, dict[str, float]]:
     """The metrics of every view, in the pairs' order.
 
-    Raises `InputError` for damaged files and unequal sizes.
+    The pairs were checked (`check_pairs`). Raises `InputError` for damaged files.
     """
-    check_picture_sizes(pairs)
     per_view = {}
     for done, pair in enumerate(pairs, 1):
         mask = None if pair.mask is None else read_mask(pair.mask)
-        per_view[pair.view] = evaluator.evaluate_view(
-            read_image(pair.picture), read_image(pair.photograph), mask
-        )
+        render, truth = read_picture(pair.picture, True), read_picture(pair.photograph, False)
+        per_view[pair.view] = evaluator.evaluate_view(render, truth, mask)
         report("views", done, len(pairs))
     return per_view

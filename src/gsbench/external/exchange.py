@@ -8,14 +8,15 @@ import numpy as np
 from PIL import Image
 
 from gsbench.errors import InputError, TrainingError
-from gsbench.eval.pictures import match_by_order, match_pictures
+from gsbench.eval.matching import match_by_order, match_pictures
+from gsbench.eval.pictures import Look, find_odd_pictures, look_at, read_picture
 from gsbench.files import write_json
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.init.base import MODEL_FOLDER, PointCloud
 from gsbench.normalization import IDENTITY, Normalization
 from gsbench.scene.colmap import write_model
-from gsbench.scene.images import check_picture_names, png_name, read_image
+from gsbench.scene.images import check_picture_names, png_name
 from gsbench.scene.types import Camera, View
 from gsbench.words import counted, some_of
 
@@ -114,8 +115,10 @@ def collect_renders(
             matching = match_by_order(wanted, names)
         else:
             matching = match_pictures(wanted, names, "densify.by_order=true")
+        looks = [(name, look_at(output / matching.pairs[name]), Look()) for name in wanted]
+        find_odd_pictures(looks)
         for name, view in zip(wanted, views, strict=True):
-            picture = read_image(output / matching.pairs[name])  # [H, W, 3]
+            picture = read_picture(output / matching.pairs[name], is_render=True)  # [H, W, 3]
             (height, width), camera = picture.shape[:2], view.camera
             if (width, height) != (camera.width, camera.height):
                 raise InputError(

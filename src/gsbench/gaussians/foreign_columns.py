@@ -1,8 +1,8 @@
-"""Columns that other programs add to 3DGS's PLY, and what they mean for a render."""
+"""Columns, elements and comments that other programs add to 3DGS's PLY, and what they mean."""
 
 import logging
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbench.errors import InputError
+from gsbench.words import some_of
 
 log = logging.getLogger(__name__)
 
@@ -27,6 +28,33 @@ REFUSED = {
 }
 # Found so in exports, and without effect on a render of f_dc and f_rest.
 HARMLESS = re.compile("red|green|blue")
+
+
+# Comments in a PLY's header. Brush writes SplatRenderMode, Postshot antialiased.
+ANTIALIASED = re.compile(r"SplatRenderMode:\s*mip|(antialiased|anti.?aliasing)\W*(1|true)", re.I)
+USUAL = re.compile(
+    r"\s*|(written|generated|exported|created|made|converted|saved|edited)\b.*|vertical axis.*"
+    r"|SplatRenderMode:\s*default|(antialiased|anti.?aliasing)\W*(0|false)|.*https?://.*",
+    re.I,
+)
+
+
+def report_header(comments: Sequence[str], elements: Collection[str], path: Path) -> None:
+    """Log what the header says beyond the columns: a render mode, unknown comments and elements."""
+    for comment in comments:
+        if ANTIALIASED.search(comment):
+            log.warning(
+                "%s: %r: its opacities belong to an antialiased rasterizer (Mip-Splatting); "
+                "gsbench draws them without it, and thin Gaussians come out too opaque",
+                path,
+                comment,
+            )
+    unknown = [text for text in comments if not (ANTIALIASED.search(text) or USUAL.fullmatch(text))]
+    unknown += [f"element {name}" for name in elements if name != "vertex"]
+    if unknown:
+        log.warning(
+            "%s: not known and not used: %s", path, some_of([repr(text[:60]) for text in unknown])
+        )
 
 
 def check_columns(names: Collection[str], known: Collection[str], path: Path) -> None:

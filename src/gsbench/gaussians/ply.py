@@ -14,7 +14,7 @@ from plyfile import PlyData, PlyElement
 
 from gsbench.errors import InputError
 from gsbench.files import DAMAGE, atomic, require_regular
-from gsbench.gaussians.foreign_columns import check_columns, with_filter_applied
+from gsbench.gaussians.foreign_columns import check_columns, report_header, with_filter_applied
 from gsbench.gaussians.model import MAX_SH_DEGREE, NUM_SH_REST, Gaussians
 from gsbench.gaussians.ply_files import read_header, read_ply_data
 from gsbench.normalization import IDENTITY, Normalization
@@ -216,6 +216,8 @@ def read_ply(
 
     if OWN_COMMENT not in content.comments:
         _warn_of_activated(vertices, path)
+        names = [element.name for element in content]
+        report_header([*content.comments, *content.obj_info], names, path)
     vertices = with_filter_applied(vertices, path, MAX_LOGIT)
 
     def columns(names: list[str]) -> torch.Tensor:

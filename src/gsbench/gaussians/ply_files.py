@@ -9,7 +9,7 @@ from pathlib import Path
 
 from plyfile import PlyData, PlyParseError
 
-from gsbench.files import DAMAGE
+from gsbench.files import DAMAGE, GIT_LFS, LFS_REMEDY
 
 MAX_HEADER = 1 << 16  # bytes
 END = b"end_header"
@@ -43,8 +43,16 @@ def read_header(path: Path) -> bytes:
     return header
 
 
+def recognised_format(path: Path) -> str:
+    """Describe the file of a format that is no PLY, and what to do; else ""."""
+    with path.open("rb") as stream:
+        return _other_format(path, stream.read(MAX_HEADER))
+
+
 def _other_format(path: Path, start: bytes) -> str:
     """Describe a file that is no PLY by its first bytes and its name, and what to do; else ""."""
+    if start.startswith(GIT_LFS):
+        return LFS_REMEDY
     suffix = path.suffix.lower()
     if suffix in CHECKPOINT_SUFFIXES or start.startswith(PICKLE):
         return CHECKPOINT

@@ -17,22 +17,63 @@ from gsbench.words import attributes_of, no_such
 
 
 @dataclass
-class AdamState:
-    """Adam's state of one parameter: rate, number of steps, and both moments in its shape."""
+class ParameterState:
+    """The optimiser's state of one parameter: rate, number of steps, and ``tensors``.
+
+    Those of Adam are its moments ``first`` and ``second``, in the parameter's shape. Tensors with a
+    row for each Gaussian follow the edits of densifiers; new rows are 0.
+    """
 
     rate: float
     step: int
-    first: Tensor
-    second: Tensor
+    tensors: dict[str, Tensor]
+
+    @property
+    def first(self) -> Tensor:
+        return self.tensors["first"]
+
+    @property
+    def second(self) -> Tensor:
+        return self.tensors["second"]
 
     @property
     def factors(self) -> tuple[float, float]:
-        """The factors (a, b) of this step t: it is a m / (b sqrt(v) + eps), with the moments m, v.
+        """Factors (a, b) of Adam's step t, which is a m / (b sqrt(v) + eps) for the moments m, v.
 
         With m' = m / (1 - b1^t) and v' = v / (1 - b2^t), it is rate m' / (sqrt(v') + eps).
         """
         beta1, beta2 = ADAM_BETAS
         return self.rate / (1 - beta1**self.step), (1 - beta2**self.step) ** -0.5
+
+    def edit(self, count: int, keep: Tensor | None, added: int) -> None:
+        """Keep the rows at ``keep`` [``count``] (None: all) of each tensor, then add ``added``."""
+        for name, tensor in self.rows(count):
+            new = tensor.new_zeros(added, *tensor.shape[1:]) if added else None
+            self.tensors[name] = _edited(tensor, keep, new)
+
+    def rows(self, count: int) -> list[tuple[str, Tensor]]:
+        """The tensors that have a row for each of ``count`` Gaussians."""
+        return [
+            (name, tensor)
+            for name, tensor in self.tensors.items()
+            if tensor.dim() and len(tensor) == count
+        ]
+
+
+class Optimizer(Protocol):
+    """An optimiser of the user's (``train.optimizer``), instead of Adam.
+
+    ``init`` makes the state of a parameter [N, …] as tensors by name. ``step`` changes the
+    parameter in place by its ``gradient``; ``rate`` is its learning rate at this iteration, and
+    ``count`` the number of its steps (1, 2, …). With the attribute ``groups``, it steps only these
+    fields of `Gaussians`, and Adam the others.
+    """
+
+    def init(self, parameter: Tensor) -> dict[str, Tensor]: ...
+
+    def step(
+        self, parameter: Tensor, gradient: Tensor, state: dict[str, Tensor], rate: float, count: int
+    ) -> None: ...
 
 
 class Update(NamedTuple):
@@ -44,7 +85,7 @@ class Update(NamedTuple):
 
     parameter: Tensor
     gradient: Tensor
-    state: AdamState
+    state: ParameterState
     active: int | None = None
     further: Tensor | None = None
 
@@ -76,7 +117,7 @@ class KnownGradients:
     visible: Tensor | None  # [N]
     sh_degree: int
 
-    def updates(self, states: Sequence[AdamState | None]) -> list[Update]:
+    def updates(self, states: Sequence[ParameterState | None]) -> list[Update]:
         """The updates of the parameters with a state and a gradient; a state None leaves one out.
 
         Harmonics, the last parameter, have gradients up to the degree: at degree 0, none.
@@ -108,25 +149,27 @@ class TrainableGaussians:
         rates: LearningRates,
         spatial_scale: float,
         step_all: StepAll | None = None,
+        optimizer: Optimizer | None = None,
     ) -> None:
-        """``step_all`` applies Adam to whole parameters (None: torch's fused kernel)."""
+        """``step_all`` applies Adam to whole parameters (None: torch's fused kernel).
+
+        ``optimizer`` steps the parameters in its ``groups`` (all, if it has none) instead.
+        """
         self.rates = rates
         self.spatial_scale = spatial_scale
         self.step_all = step_all or torch_adam
+        self.optimizer = optimizer
         # the current parameters; ``edit`` and ``overwrite`` replace its tensors
         self.values = gaussians.map(lambda tensor: tensor.detach().clone().requires_grad_(True))
-        initial = {
-            "means": rates.position(0) * spatial_scale,
-            "log_scales": rates.scale,
-            "quaternions": rates.rotation,
-            "opacity_logits": rates.opacity,
-            "sh_dc": rates.sh_dc,
-            "sh_rest": rates.sh_rest,
-        }
+        initial = self.base_rates(rates.position(0) * spatial_scale)
         self.adam = {}
         for name, tensor in self.values.tensors().items():
-            first, second = torch.zeros_like(tensor.detach()), torch.zeros_like(tensor.detach())
-            self.adam[name] = AdamState(initial[name], 0, first, second)
+            detached = tensor.detach()
+            if (own := self._own(name)) is not None:
+                tensors = own.init(detached)
+            else:
+                tensors = {moment: torch.zeros_like(detached) for moment in ("first", "second")}
+            self.adam[name] = ParameterState(initial[name], 0, tensors)
 
     if not TYPE_CHECKING:  # else a type checker would allow any name
 
@@ -145,6 +188,22 @@ class TrainableGaussians:
     def position_rate(self) -> float:
         """The current learning rate of the means, world units."""
         return self.adam["means"].rate
+
+    def _own(self, name: str) -> Optimizer | None:
+        """The user's optimiser of parameter ``name``; None for Adam."""
+        groups = getattr(self.optimizer, "groups", None)
+        return self.optimizer if groups is None or name in groups else None
+
+    def base_rates(self, position: float) -> dict[str, float]:
+        """The rates of 3DGS by parameter, with ``position`` for the means."""
+        return {
+            "means": position,
+            "log_scales": self.rates.scale,
+            "quaternions": self.rates.rotation,
+            "opacity_logits": self.rates.opacity,
+            "sh_dc": self.rates.sh_dc,
+            "sh_rest": self.rates.sh_rest,
+        }
 
     def set_step(self, step: float) -> None:
         """Set the learning rate of the means for iteration ``step`` (1, 2, …)."""
@@ -169,24 +228,28 @@ class TrainableGaussians:
         updates = []
         for name, parameter in self.values.tensors().items():
             if parameter.grad is not None:
-                self.adam[name].step += 1
-                active = 3 * ((sh_degree + 1) ** 2 - 1) if name == "sh_rest" else None
-                updates.append(Update(parameter, parameter.grad, self.adam[name], active))
+                state = self.adam[name]
+                state.step += 1
+                if (own := self._own(name)) is not None:
+                    own.step(parameter, parameter.grad, state.tensors, state.rate, state.step)
+                else:
+                    active = 3 * ((sh_degree + 1) ** 2 - 1) if name == "sh_rest" else None
+                    updates.append(Update(parameter, parameter.grad, state, active))
                 parameter.grad = None
         self.step_all(updates, None, visible)
 
-    def count_step(self) -> list[AdamState]:
+    def count_step(self) -> list[ParameterState]:
         """Count a step of all parameters, which the caller makes; return their states in order."""
         for state in self.adam.values():
             state.step += 1
         return [*self.adam.values()]
 
-    def advance(self, known: KnownGradients) -> list[AdamState | None]:
+    def advance(self, known: KnownGradients) -> list[ParameterState | None]:
         """Count a step with ``known`` gradients; return the state of each parameter to update.
 
         It is None for a parameter that was replaced since.
         """
-        states: list[AdamState | None] = []
+        states: list[ParameterState | None] = []
         for (name, parameter), own in zip(
             self.values.tensors().items(), known.parameters, strict=True
         ):
@@ -197,7 +260,7 @@ class TrainableGaussians:
         return states
 
     @torch.no_grad()
-    def apply(self, known: KnownGradients, states: list[AdamState | None]) -> None:
+    def apply(self, known: KnownGradients, states: list[ParameterState | None]) -> None:
         """Apply Adam with ``known`` gradients to the parameters with a state from `advance`."""
         self.step_all(known.updates(states), known.seen, known.visible)
 
@@ -220,25 +283,25 @@ class TrainableGaussians:
                 f"overwrite: {name} has shape {tuple(parameter.shape)}, got {tuple(values.shape)}"
             )
         self._replace(name, values.detach().clone())
-        state = self.adam[name]
-        for moment in (state.first, state.second):
-            moment[... if where is None else where] = 0
+        for _, tensor in self.adam[name].rows(len(values)):
+            tensor[... if where is None else where] = 0
 
     def _replace(
         self, name: str, values: Tensor, keep: Tensor | None = None, added: Tensor | None = None
     ) -> None:
-        """Replace parameter ``name`` and edit its moments alike; the step count does not change."""
-        state = self.adam[name]
-        zeros = None if added is None else torch.zeros_like(added)
-        state.first = _edited(state.first, keep, zeros)
-        state.second = _edited(state.second, keep, zeros)
+        """Replace parameter ``name`` and edit its state alike; the step count does not change."""
+        count = len(getattr(self.values, name))
+        self.adam[name].edit(count, keep, 0 if added is None else len(added))
         setattr(self.values, name, values.contiguous().requires_grad_(True))
 
     def state_dict(self) -> dict[str, object]:
         """Return the state for a checkpoint. It shares memory: save it before the next step."""
         return {
             "gaussians": {name: tensor.detach() for name, tensor in self.values.tensors().items()},
-            "adam": {name: vars(state).copy() for name, state in self.adam.items()},
+            "adam": {
+                name: {**vars(state), "tensors": dict(state.tensors)}
+                for name, state in self.adam.items()
+            },
         }
 
     @classmethod
@@ -249,16 +312,15 @@ class TrainableGaussians:
         spatial_scale: float,
         device: torch.device | None = None,
         step_all: StepAll | None = None,
+        optimizer: Optimizer | None = None,
     ) -> TrainableGaussians:
         """Make an object from a copy of ``state_dict``, on ``device`` (None: that of the state)."""
         gaussians = Gaussians(**state["gaussians"]).map(lambda tensor: tensor.to(device))
-        trainable = cls(gaussians, rates, spatial_scale, step_all)
+        trainable = cls(gaussians, rates, spatial_scale, step_all, optimizer)
         for name, saved in state["adam"].items():
             copied = copy.deepcopy(saved)
-            moved = {
-                key: value.to(device) for key, value in copied.items() if isinstance(value, Tensor)
-            }
-            trainable.adam[name] = AdamState(**copied | moved)
+            tensors = {key: value.to(device) for key, value in copied["tensors"].items()}
+            trainable.adam[name] = ParameterState(copied["rate"], copied["step"], tensors)
         return trainable
 
 

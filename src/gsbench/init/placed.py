@@ -9,6 +9,7 @@ from __future__ import annotations
 import shutil
 from abc import abstractmethod
 from dataclasses import asdict, dataclass
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
@@ -216,6 +217,7 @@ def points_in_view(
     return seen, pixels[inside], np.linalg.norm(local[seen], axis=1)
 
 
+MAX_LISTED = 3  # models that an error lists
 GREY = 128  # for points without a colour in the file and out of view of all training cameras
 
 
@@ -228,7 +230,10 @@ class FromFile(GivenCameras):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.file.is_file():
-            raise InputError(f"init.path={self.path} is not a file")
+            # such as the folder of a trained model: point_cloud/iteration_30000/point_cloud.ply
+            models = [str(path) for path in islice(self.file.rglob("*.ply"), MAX_LISTED)]
+            hint = f", but a folder: give {' or '.join(models)}" if models else ""
+            raise InputError(f"init.path={self.path} is not a file{hint}")
 
     @property
     def file(self) -> Path:

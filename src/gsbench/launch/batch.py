@@ -11,8 +11,9 @@ from gsbench.config.schema import COMPONENTS
 from gsbench.errors import InputError
 from gsbench.files import FORBIDDEN, checked_runs_folder, make_runs_folder, storage_errors
 from gsbench.launch.dry_run import unavailable_now
-from gsbench.launch.jobs import Outcome, outcome_of_results, run_local, run_serial
-from gsbench.launch.record import add_to_plan, declare, declared_metrics
+from gsbench.launch.jobs import run_local, run_serial
+from gsbench.launch.outcomes import Outcome, outcome_of_results
+from gsbench.launch.record import asked_metrics, record
 from gsbench.launch.slurm import run_slurm
 from gsbench.runs.freshness import Change
 from gsbench.runs.keys import STAGES
@@ -22,20 +23,23 @@ from gsbench.runs.store import Store
 from gsbench.runs.user_code import PERMISSIONS
 from gsbench.system.stopping import stop_on_signals
 from gsbench.tracking import Mirror
-from gsbench.tracking.tracker_run import make_sink
+from gsbench.tracking.sync import make_sink
 
 log = logging.getLogger(__name__)
 
 
-def run_batch(trials: Sequence[Trial]) -> list[Outcome]:
-    """Run the unfinished trials by their launcher, and return the outcomes of all."""
+def run_batch(trials: Sequence[Trial], asks: bool = True) -> list[Outcome]:
+    """Run the unfinished trials by their launcher, and return the outcomes of all.
+
+    With ``asks``, their questions are written down first.
+    """
     launcher = trials[0].values["launch"]["name"]
     with storage_errors(checked_runs_folder(trials[0].values["runs"])), stop_on_signals():
         # A wrong folder of weights is an error even if all trials are done.
         if launcher != "slurm" and (missing := missing_weights(trials)):
             raise InputError("; ".join(missing))
         outcomes, unfinished = _skip_finished(trials)
-        _begin(trials, unfinished)
+        _begin(trials, unfinished, asks)
         if unfinished and launcher == "slurm":
             outcomes += run_slurm(unfinished)
         elif unfinished:
@@ -45,15 +49,15 @@ def run_batch(trials: Sequence[Trial]) -> list[Outcome]:
         return outcomes
 
 
-def begin_for_another_launcher(trials: Sequence[Trial]) -> None:
+def begin_for_another_launcher(trials: Sequence[Trial], asks: bool = True) -> None:
     """Check, plan and declare trials that a Hydra plug-in will run, perhaps several at once."""
     with storage_errors(checked_runs_folder(trials[0].values["runs"])):
-        _begin(trials, [trial for trial in trials if _why_not_done(trial)])
+        _begin(trials, [trial for trial in trials if _why_not_done(trial)], asks)
 
 
-def _begin(trials: Sequence[Trial], unfinished: Sequence[Trial]) -> None:
+def _begin(trials: Sequence[Trial], unfinished: Sequence[Trial], asks: bool = True) -> None:
     """Refuse trials known to fail; make the runs folder, tidy the store, write the plan."""
-    declared_metrics(trials)  # raises for two metrics in one experiment, before anything is written
+    asked_metrics(trials)  # raises for two metrics in one experiment, before anything is written
     runs = checked_runs_folder(trials[0].values["runs"])
     # A node of a cluster may have folders and devices that this machine lacks.
     here = trials[0].values["launch"]["name"] != "slurm"
@@ -72,8 +76,7 @@ def _begin(trials: Sequence[Trial], unfinished: Sequence[Trial]) -> None:
         log.info("%s cannot be written to (%s), so its plan stays as it is", runs, error.strerror)
         return
     Store(runs / STORE).sweep(STAGES)
-    add_to_plan(trials)
-    declare(trials)
+    record(trials, asks)
 
 
 def _skip_finished(trials: Sequence[Trial]) -> tuple[list[Outcome], list[Trial]]:

@@ -14,21 +14,23 @@ import secrets
 import signal
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from gsbench.config.compose import Trial
-from gsbench.errors import GsbenchError, InputError
+from gsbench.errors import InputError
 from gsbench.files import DiskFullError, require_no_links
+from gsbench.launch.outcomes import Outcome, outcome_of_error, outcome_of_results
+from gsbench.launch.repeats import Repeats
 from gsbench.launch.states import arm_names, forget_submission, label_of
-from gsbench.logs import set_up_logging
-from gsbench.runs.layout import JOBS, LOG
+from gsbench.logs import bar, set_up_logging
+from gsbench.runs.commands import digest_of
+from gsbench.runs.layout import JOBS
 from gsbench.runs.nested import sha256_of
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.runs.trial_record import TrialRecord
 from gsbench.system.isolate import error_tail
 from gsbench.system.locks import BusyError
 from gsbench.system.own_modules import adopt_modules, allowed_modules
@@ -52,26 +54,6 @@ JOB_LINK = re.compile(r"\.submission_file_.*\.sh")
 
 log = logging.getLogger(__name__)
 
-Status = Literal["done", "failed", "queued"]
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """The end of a trial: ``message`` has its metrics, or why it failed.
-
-    ``bad_input`` says that the user's files or settings are the cause. A "queued" trial was left to
-    Slurm, in the job that ``message`` names; it may be running by now.
-    """
-
-    folder: Path
-    status: Status
-    message: str = ""
-    bad_input: bool = False
-
-    @property
-    def label(self) -> str:
-        return TrialFolder(self.folder).label
-
 
 def say_last(outcomes: Sequence[Outcome], labels: Mapping[Path, str]) -> None:
     """Log the outcome of the trial that ended last, and how many have ended."""
@@ -85,19 +67,6 @@ def labels_of(trials: Sequence[Trial]) -> dict[Path, str]:
     return {folder: label_of(folder, names) for folder in names}
 
 
-def outcome_of_results(folder: Path, results: TrialRecord) -> Outcome:
-    """The outcome of a complete trial."""
-    return Outcome(folder, "done", results.metrics_line)
-
-
-def outcome_of_error(folder: Path, error: Exception) -> Outcome:
-    """The outcome of a trial that raised ``error``."""
-    if isinstance(error, GsbenchError):
-        return Outcome(folder, "failed", str(error), isinstance(error, InputError))
-    text = f"{type(error).__name__}: {error}".splitlines()[0]
-    return Outcome(folder, "failed", f"{text}; the traceback is in {folder / LOG}")
-
-
 def run_serial(trials: Sequence[Trial], mirror: Mirror) -> list[Outcome]:
     """Run the trials in this process, one after the other.
 
@@ -105,12 +74,16 @@ def run_serial(trials: Sequence[Trial], mirror: Mirror) -> list[Outcome]:
     """
     outcomes: list[Outcome] = []
     busy: list[Trial] = []
-    labels = labels_of(trials)
+    labels, repeats = labels_of(trials), Repeats()
     for number, trial in enumerate(trials, 1):
+        if repeated := repeats.of(trial):
+            outcomes.append(repeated)
+            continue
         if len(trials) > 1:
             log.info("%d of %d: %s", number, len(trials), labels[trial.folder])
         try:
             outcomes.append(run_one(trial, mirror, wait=len(trials) == 1))
+            repeats.note(trial, outcomes[-1])
         except BusyError as error:
             log.info("%s; later", error)
             busy.append(trial)
@@ -122,7 +95,7 @@ def run_one(trial: Trial, mirror: Mirror, wait: bool) -> Outcome:
 
     Errors become its outcome, except BusyError, DiskFullError, and exceptions that end the program.
     """
-    mirror.follow(trial.folder, trial.values["tracking"])
+    mirror.follow(trial.folder, trial.values)
     try:
         # imported here, because a finished sweep needs no torch
         from gsbench.pipeline.trial import run_trial
@@ -132,12 +105,15 @@ def run_one(trial: Trial, mirror: Mirror, wait: bool) -> Outcome:
         raise
     except Exception as error:  # noqa: BLE001 - a failed trial does not stop the others
         return outcome_of_error(trial.folder, error)
+    finally:
+        mirror.trial_ended()
 
 
 # ---- processes of this machine
 
 SECONDS_BETWEEN_POLLS = 1.0
 DAYS = 24 * 60  # minutes
+BAR = 1000  # parts of a trial in the bar of a sweep
 
 
 @dataclass
@@ -151,6 +127,7 @@ class TrialJob:
     path: list[str]  # sys.path of the submitting process
     own: dict[str, str]  # the user's modules that may be imported, with their paths
     visible_gpus: str | None  # CUDA_VISIBLE_DEVICES of the submitting process
+    digest: str = ""  # of settings and code when the command was given
 
     def __call__(self) -> Outcome:
         sys.path[:] = [*self.path, *(entry for entry in sys.path if entry not in self.path)]
@@ -177,7 +154,12 @@ class TrialJob:
                 assign_threads(self.values["threads"], launch["parallel"])
                 # With launch=local, the sweep's own process mirrors all of its trials.
                 mirror = stack.enter_context(Mirror(idle=launch["name"] == "local"))
-                outcome = run_one(Trial(self.values, ()), mirror, wait=True)
+                trial = Trial(self.values, ())
+                if self.digest and digest_of(self.values) != self.digest:
+                    error = InputError("code changed since the command; give it again")
+                    outcome = outcome_of_error(trial.folder, error)
+                else:
+                    outcome = run_one(trial, mirror, wait=True)
                 if outcome.status == "failed":
                     # for the job's log: the trial's folder may lack the reason
                     print(outcome.message, file=sys.stderr)
@@ -211,7 +193,19 @@ def run_local(trials: Sequence[Trial], mirror: Mirror) -> list[Outcome]:
     )
     executor = submitit.LocalExecutor(new_job_folder(values))
     executor.update_parameters(timeout_min=values["launch"]["timeout_min"] or 365 * DAYS)
-    return _run(trials, executor, parallel, mirror)
+    with bar(values["name"]) as report:
+
+        def show(ended: int, running: Sequence[Trial]) -> None:
+            done = ended + sum(map(share_done, running))
+            note = f"{ended} of {len(trials)} trials, {len(running)} running"
+            report("trials", round(BAR * done), BAR * len(trials), note)
+
+        return _run(trials, executor, parallel, mirror, show)
+
+
+def share_done(trial: Trial) -> float:
+    """The share of a running trial's iterations that are done."""
+    return min(1.0, trial.files.stage_and_step()[1] / max(1, trial.values["train"]["iterations"]))
 
 
 def job_folder(values: dict[str, Any]) -> Path:
@@ -249,27 +243,38 @@ def new_job_folder(values: dict[str, Any]) -> Path:
 
 
 def _run(
-    trials: Sequence[Trial], executor: Executor, parallel: int, mirror: Mirror
+    trials: Sequence[Trial],
+    executor: Executor,
+    parallel: int,
+    mirror: Mirror,
+    show: Callable[[int, Sequence[Trial]], None] = lambda ended, running: None,
 ) -> list[Outcome]:
     """Run the trials in at most ``parallel`` processes at once.
 
-    If this process is stopped, it stops them; if it is killed, they go on.
+    ``show`` gets the number of ended trials and those that run. If this process is stopped, it
+    stops them; if it is killed, they go on.
     """
     waiting, running, outcomes = clouds_first(trials), dict[Path, "Job[Outcome]"](), list[Outcome]()
-    labels = labels_of(trials)
+    labels, repeats, by_folder = labels_of(trials), Repeats(), {one.folder: one for one in trials}
     try:
         while waiting or running:
             while waiting and len(running) < parallel:
                 trial = waiting.pop(0)
+                if repeated := repeats.of(trial):
+                    outcomes.append(repeated)
+                    continue
                 # Ctrl-C reaches all processes of a terminal: jobs ignore it, and this process
                 # passes it on below.
                 with interrupts_ignored():
                     running[trial.folder] = executor.submit(job_of(trial))
-                mirror.follow(trial.folder, trial.values["tracking"])
+                mirror.follow(trial.folder, trial.values)
             ended = [folder for folder, job in running.items() if job.done()]
             for folder in ended:
                 outcomes.append(collect(running.pop(folder), folder, trials))
+                mirror.trial_ended()
+                repeats.note(by_folder[folder], outcomes[-1])
                 say_last(outcomes, labels)
+            show(len(outcomes), [by_folder[folder] for folder in running])
             if not ended:
                 time.sleep(SECONDS_BETWEEN_POLLS)
     except KeyboardInterrupt:
@@ -324,4 +329,5 @@ def collect(job: Job[Outcome], folder: Path, trials: Sequence[Trial]) -> Outcome
 def job_of(trial: Trial) -> TrialJob:
     """The trial as a job with the environment of this process."""
     path = [entry for entry in sys.path if entry]
-    return TrialJob(trial.values, path, allowed_modules(), os.environ.get("CUDA_VISIBLE_DEVICES"))
+    gpus = os.environ.get("CUDA_VISIBLE_DEVICES")
+    return TrialJob(trial.values, path, allowed_modules(), gpus, digest_of(trial.values))

@@ -9,7 +9,6 @@ from pathlib import Path
 from statistics import fmean
 from typing import TYPE_CHECKING
 
-from gsbench.analysis.declaration import active_declaration
 from gsbench.analysis.quantities import Quantity, asked_quantity
 from gsbench.analysis.results import Experiment, TrialResult, newest_code, read_experiment
 from gsbench.errors import InputError
@@ -139,8 +138,8 @@ def _share_done(state: TrialState) -> float:
 
 def _leader(experiment: Experiment, names: dict[Path, Name]) -> str:
     """The arm with the best mean over those scenes and seeds that all arms have, in words."""
-    trials, declared = experiment.trials, active_declaration(experiment)
-    metric = asked_quantity(declared.metric if declared else "psnr", trials)
+    trials, questions = experiment.trials, experiment.history.questions
+    metric = asked_quantity(questions[-1].metric if questions else "psnr", trials)
     values: dict[str, dict[tuple[str, int], float]] = {arm: {} for arm, _ in names.values()}
     for trial in trials:
         arm, scene = names[trial.path]

@@ -1,221 +1,220 @@
-"""Adding to the plan (`gsbench.runs.plan`) and the declarations (`gsbench.runs.experiments`).
+"""Writing a command and its questions down, before its trials run (`gsbench.runs.commands`).
 
-A command does this before its trials run. Loads no torch.
+Loads no torch.
 """
 
 import logging
 import os
 import shutil
+import sys
 import time
-from collections.abc import Iterable, Sequence
-from dataclasses import replace
-from functools import reduce
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
+import yaml
+
+from gsbench.analysis.cells import with_variants
+from gsbench.analysis.quantities import COSTS, TEXTURED
+from gsbench.analysis.questions import (
+    FIRST_LOOK,
+    Asked,
+    LeastEffect,
+    NamedQuestion,
+    Row,
+    announce,
+    ask,
+    plan_looks,
+    read_least,
+    rows_of,
+)
+from gsbench.analysis.results import group_by, read_experiment
 from gsbench.config.compose import Trial
 from gsbench.errors import InputError
-from gsbench.files import require_no_links, write_text
-from gsbench.runs.experiments import (
-    Declaration,
-    Planned,
-    declared_now,
-    make_home,
-    merge_planned,
-    of_latest_metric,
-    open_question,
-    read_declarations,
-    record_text,
-    unix_time,
-)
-from gsbench.runs.layout import CONFIG, DECLARED, FORGOTTEN, PER_VIEW, RESULTS, SEED
-from gsbench.runs.plan import PlannedTrial, change_plan
-from gsbench.runs.trial_folder import TrialFolder
-from gsbench.system.locks import hold
-from gsbench.words import some_of
+from gsbench.files import require_no_links
+from gsbench.pipeline.metric_facts import facts_for
+from gsbench.runs.commands import Command, History, PlannedTrial, Question, append, digest_of, drop
+from gsbench.runs.experiments import QUESTIONS, metric_and_question
+from gsbench.runs.layout import LEDGER, RESULTS, SEED, TUNING
+from gsbench.runs.nested import flatten
+from gsbench.settings import check_values
 
 log = logging.getLogger(__name__)
 
+DEFAULT_METRIC = "psnr"
+DIRECTIONS = {"higher": 1, "lower": -1, "same": 0}
 
-def add_to_plan(trials: Sequence[Trial]) -> None:
-    """Add the trials to the plans of their experiments.
 
-    A trial without overrides was read from its own record. It is not added, because in a plan no
-    overrides mean the defaults.
+def record(trials: Sequence[Trial], asks: bool = True) -> list[Question]:
+    """Write the trials of a command down, each in its experiment; returns their questions.
+
+    With ``asks``, the questions that no earlier command asked are written, too. A trial that is
+    read from its own record has no words and asks nothing. A repeated command adds no line.
+    Raises InputError if trials of one experiment name different metrics.
     """
-    by_home: dict[Path, dict[Path, PlannedTrial]] = {}
-    for trial in trials:
-        if trial.overrides:
-            planned = PlannedTrial(
-                overrides=tuple(trial.overrides), cwd=os.getcwd(), time=time.time()
+    asked_now: list[Question] = []
+    asked_metrics(trials)
+    for home, own in group_by(trials, lambda trial: trial.files.home).items():
+        typed = [trial for trial in own if trial.overrides]
+        if not typed:
+            continue
+        rows = planned_rows(typed)
+        questions = asks and not any((home / name).exists() for name in (TUNING, LEDGER))
+        asked = asked_of(typed, rows) if questions else None
+        measured = rows_of(read_experiment(home).trials) if asked and home.is_dir() else []
+
+        def make(
+            history: History,
+            home: Path = home,
+            typed: Sequence[Trial] = typed,
+            rows: Sequence[Row] = rows,
+            asked: Asked | None = asked,
+            measured: Sequence[Row] = measured,
+        ) -> Command | None:
+            found, shown = ask(rows, asked, measured, history) if asked else ([], [])
+            asked_now.extend([*found, *(one for one in history.questions if one.id in shown)])
+            if set(shown) <= set().union(*history.newest.values()):
+                shown = []  # they are the newest ones already
+            planned = {
+                trial.folder.relative_to(home).as_posix(): PlannedTrial(
+                    words=tuple(trial.overrides), digest=row.digest
+                )
+                for trial, row in zip(typed, rows, strict=True)
+            }
+            known = history.planned
+            changed = {
+                name: trial
+                for name, trial in planned.items()
+                if (before := known.get(home / name)) is None or before.digest != trial.digest
+            }
+            if not (found or shown or changed):
+                return None
+            return Command(
+                words=tuple(sys.argv[1:]),
+                cwd=os.getcwd(),
+                time=time.time(),
+                trials=planned,
+                questions=tuple(found),
+                shows=tuple(shown),
             )
-            by_home.setdefault(trial.files.home, {})[trial.folder] = planned
-    for home, added in by_home.items():
-        change_plan(home, added)
+
+        line = append(home, make)
+        for question in () if line is None else line.questions:
+            log.info("%s: %s", home.name, announce(question))
+    return asked_now
+
+
+def asked_metrics(trials: Sequence[Trial]) -> dict[Path, str]:
+    """The metric of the verdict (``eval.primary``) by the experiment's folder.
+
+    Raises InputError if trials of one experiment name different ones.
+    """
+    metrics: dict[Path, str] = {}
+    for trial in trials:
+        home, metric = trial.files.home, trial.values["eval"].get("primary") or DEFAULT_METRIC
+        if metrics.setdefault(home, metric) != metric:
+            raise InputError(
+                f"trials of {home.name} name eval.primary={metrics[home]} and "
+                f"eval.primary={metric}: a verdict is about one metric, so give one of them, or "
+                "run two experiments (name=…)"
+            )
+    return metrics
+
+
+def planned_rows(trials: Sequence[Trial]) -> list[Row]:
+    """The trials, each with its variant, as far as questions depend on them."""
+    configs: dict[Path, tuple[str, Mapping[str, Any]]] = {}
+    rows = []
+    for trial in trials:
+        values = trial.values
+        key = trial.folder.parent / trial.folder.name.partition(SEED)[0]
+        if key not in configs:  # all seeds share it
+            configs[key] = digest_of(values), flatten(yaml.safe_load(trial.yaml))
+        digest, config = configs[key]
+        scene, init, densify = (values[group]["name"] for group in ("scene", "init", "densify"))
+        rows.append(Row(scene, init, densify, key.name, values["seed"], config, digest))
+    return with_variants(rows)
+
+
+def asked_of(trials: Sequence[Trial], rows: Sequence[Row]) -> Asked | None:
+    """What trials of one experiment ask; None if their metric has no direction."""
+    values = trials[0].values
+    options, launch = values["eval"], values["launch"]
+    metric, about = metric_and_question(options.get("primary") or DEFAULT_METRIC)
+    facts = facts_for(metric, values)
+    if not facts.direction:
+        log.warning("whether more of %s is better is not known: nothing is tested", metric)
+        return None
+    named = _named(values, metric)
+    split = next((key for key, question in QUESTIONS.items() if question == about), "")
+    return Asked(
+        metric=metric,
+        sign=facts.direction,
+        least=launch.get("least_difference") or facts.worthwhile,
+        baseline=options.get("baseline") or "adc",
+        controls=options.get("controls") or {},
+        looks=(
+            plan_looks(len({row.seed for row in rows})) if launch.get("stop_when_decided") else ()
+        ),
+        split=split,
+        shared=values.get("error_rate") == "shared",
+        named=named,
+    )
+
+
+def _named(
+    values: Mapping[str, Any], metric: str
+) -> tuple[tuple[NamedQuestion, int, LeastEffect | None], ...]:
+    """The questions that the experiment's file names; raises InputError for a wrong one."""
+    found = []
+    for number, entry in enumerate(values.get("questions") or (), 1):
+        where = f"questions[{number}]"
+        if not isinstance(entry, dict) or "idea" not in entry:
+            raise InputError(f"{where} must be a mapping with idea, baseline, metric, …")
+        named = NamedQuestion(**check_values(NamedQuestion, entry, where))
+        asked = named.metric or metric
+        facts = None if asked in (*COSTS, TEXTURED.key) else facts_for(asked, values)
+        sign = DIRECTIONS.get(named.direction, facts.direction if facts else -1)
+        usual = facts.worthwhile if facts else None
+        least = usual if named.least is None else named.least
+        effect = None if least is None else read_least(least, f"{where}.least")
+        if effect is None and named.direction == "same":
+            raise InputError(f"{where}.least is needed: a difference below which both are the same")
+        found.append((named, sign, effect))
+    return tuple(found)
+
+
+def check_looks(trials: Sequence[Trial], rows: Sequence[Row]) -> tuple[int, ...]:
+    """The seeds of a sweep in looks, in order; raises InputError if it cannot be run in looks."""
+    what = "launch.stop_when_decided"
+    if len({trial.files.home for trial in trials}) > 1:
+        raise InputError(f"{what}: all trials of the sweep need one name")
+    first: tuple[int, ...] = ()
+    for (scene, arm), group in group_by(rows, lambda row: (row.scene, row.arm)).items():
+        seeds = tuple(dict.fromkeys(row.seed for row in group))
+        first = first or seeds
+        if seeds != first:
+            raise InputError(
+                f"{what} needs the same seeds everywhere: {arm} on {scene} has "
+                f"{', '.join(map(str, seeds))}, others {', '.join(map(str, first))}"
+            )
+    if len(first) < FIRST_LOOK:
+        raise InputError(
+            f"{what} needs at least {FIRST_LOOK} seeds, as seed=0,1,2,3: the most it adds"
+        )
+    return first
 
 
 def remove(home: Path, folders: Iterable[Path]) -> None:
     """Delete the folders of trials and drop them from the plan of the experiment in ``home``.
 
     The results of stages stay in the store: if the old code comes back, nothing is computed again.
-    What was measured stays in `FORGOTTEN`: it was seen, so verdicts count its code as a version.
+    That they gave results stays known, so they count as tries.
     """
     folders = list(folders)
     for folder in folders:
-        kept = home / FORGOTTEN / folder.relative_to(home)
-        for place in (folder, kept):
-            require_no_links(home.parent, place, below=True)
-        kept.mkdir(parents=True, exist_ok=True)
-        for name in (CONFIG, PER_VIEW, RESULTS):
-            if (folder / name).exists():
-                shutil.copy2(folder / name, kept / name)
+        require_no_links(home.parent, folder, below=True)
         # first: a half-deleted trial must not look complete
         (folder / RESULTS).unlink(missing_ok=True)
         shutil.rmtree(folder)
-    change_plan(home, dropped=folders)
-
-
-# ---- declarations
-
-
-def declared_metrics(trials: Sequence[Trial]) -> dict[Path, str | None]:
-    """The metric that trials declare (``eval.primary``) or None, by the experiment's folder.
-
-    Raises InputError if trials of one experiment declare different metrics.
-    """
-    metrics: dict[Path, str | None] = {}
-    for trial in trials:
-        home = trial.files.home
-        metric, before = trial.values["eval"].get("primary"), metrics.get(home)
-        if metric and before and metric != before:
-            raise InputError(
-                f"trials of {home.name} declare eval.primary={before} and eval.primary={metric}: a "
-                "verdict is about one metric, so give one of them, or run two experiments (name=…)"
-            )
-        metrics[home] = before or metric
-    return metrics
-
-
-def declare(trials: Sequence[Trial]) -> None:
-    """Add a declaration to each experiment's record, unless the latest covers these trials.
-
-    It has the metric (`declared_metrics`) and all trials, done or not. A command without a metric
-    keeps the declared one: the trials that it adds are declared with that metric, with their own
-    time.
-    """
-    for home, given in declared_metrics(trials).items():
-        seeds: dict[str, set[int]] = {}
-        for trial in trials:
-            if trial.files.home == home:
-                seeds.setdefault(trial.files.key, set()).add(trial.values["seed"])
-        asked = {key: tuple(sorted(own)) for key, own in seeds.items()}
-        make_home(home)
-        with hold(home / f".{DECLARED}.lock", "the declarations"):
-            declarations = read_declarations(home)
-            latest = next(
-                (declared for declared in reversed(declarations) if declared.kind == "sweep"), None
-            )
-            metric = given or (None if latest is None else latest.primary)
-            if metric is None:
-                continue
-            # The declared metric stays, since the time of its first declaration decides whether a
-            # verdict was declared before its trials.
-            if latest is not None and given is None:
-                first = of_latest_metric(
-                    [declaration for declaration in declarations if declaration.kind == "sweep"]
-                )[0]
-                log.info("%s: %s stays declared, since %s", home.name, metric, first.when)
-            before = {} if latest is None else latest.planned
-            together = merge_planned(before, asked)
-            # Old declarations name no trials: they cover all of this metric.
-            is_covered = together == before or (latest is not None and not latest.names_trials)
-            same_metric = latest is not None and latest.primary == metric
-            if same_metric and is_covered:
-                continue
-            added = declared_now(questions=(open_question(metric),), trials=dict(together))
-            added = _with_known(added, home)
-            write_text(home / DECLARED, record_text([*declarations, added]))
-        if same_metric:
-            _warn_of_added_seeds(home, metric, before, asked)
-        elif latest is not None:
-            log.warning(
-                "%s: %s decides on arms that have no results yet; on the others, %s does",
-                home.name,
-                metric,
-                latest.primary,
-            )
-
-
-def _with_known(asked: Declaration, home: Path) -> Declaration:
-    """The declaration, which names those of its trials whose results are dated later than itself.
-
-    They are there, so a clock was ahead. By their time, they would look declared beforehand.
-    """
-
-    def is_known(folder: TrialFolder) -> bool:
-        record = folder.sound_record()
-        if record is None:
-            return False
-        moment = unix_time(record.measured)
-        return (moment or (folder.path / RESULTS).stat().st_mtime) >= asked.moment
-
-    known = {
-        key: there
-        for key, seeds in asked.planned.items()
-        if (there := tuple(s for s in seeds if is_known(TrialFolder(home / f"{key}{SEED}{s}"))))
-    }
-    if known:
-        log.warning(
-            "%s: results of %s are dated later than now, so a clock was wrong; they count as "
-            "measured before this command",
-            home.name,
-            some_of(sorted({key.split("/")[1] for key in known})),
-        )
-    return replace(asked, known=known)
-
-
-def _warn_of_added_seeds(home: Path, metric: str, before: Planned, added: Planned) -> None:
-    """Name the arms that get further seeds after their first result.
-
-    Arms without a result are declared in time.
-    """
-    late = {
-        key.split("/")[1]
-        for key, seeds in added.items()
-        if not set(seeds) <= set(before.get(key, ())) and any(home.glob(f"{key}{SEED}*/{RESULTS}"))
-    }
-    if late:
-        log.warning(
-            "%s: seeds are added after the first result of %s: where such an arm is compared with "
-            "a baseline, %s no longer decides alone, but all metrics, adjusted for their number",
-            home.name,
-            some_of(sorted(late)),
-            metric,
-        )
-
-
-def declare_questions(home: Path, asked: Declaration) -> Declaration:
-    """Add the questions of a claims file, a sweep or a round of votes to the experiment's record.
-
-    Returns the recorded declaration: if the latest one of its kind is equal, that one with its
-    earlier time. In a sweep, each arm is judged by the declaration before its own first result.
-    """
-    if not asked.questions:
-        return asked
-    make_home(home)
-    with hold(home / f".{DECLARED}.lock", "the declarations"):
-        declarations = read_declarations(home)
-        same_kind = [declared for declared in declarations if declared.kind == asked.kind]
-        if same_kind and same_kind[-1].hash == asked.hash:
-            return same_kind[-1]
-        asked = _with_known(asked, home)
-        write_text(home / DECLARED, record_text([*declarations, asked]))
-    if same_kind and asked.kind == "sweep":
-        before: Planned = reduce(merge_planned, (declared.planned for declared in same_kind))
-        _warn_of_added_seeds(home, asked.primary, before, asked.planned)
-    if same_kind and asked.kind == "claims":  # votes are judged by their own round alone
-        log.warning(
-            "%s: other questions were declared before: trials that were measured under them count "
-            "as looked at",
-            home.name,
-        )
-    return asked
+    drop(home, folders)

@@ -16,10 +16,10 @@ from pydantic import Field
 from gsbench.errors import InputError
 from gsbench.files import write_json
 from gsbench.parsing import Record, read_if_sound
+from gsbench.runs.commands import PlannedTrial, read_history
 from gsbench.runs.config_hash import determining_settings
 from gsbench.runs.experiments import trial_folders
 from gsbench.runs.layout import CONFIG, FAILED, LOCK, RESULTS, SEED, SUBMITTED
-from gsbench.runs.plan import PlannedTrial, read_plan
 from gsbench.runs.trial_folder import State, TrialFolder
 from gsbench.system.locks import read_holder
 from gsbench.system.programs import answer_of
@@ -43,7 +43,7 @@ class TrialState:
 
 def states_of_experiment(home: Path) -> list[TrialState]:
     """The states of all trials of the experiment in ``home``, planned or with a folder."""
-    plan = read_plan(home)
+    plan = read_history(home).planned
     begun = {
         path
         for path in map(Path, trial_folders(home))
@@ -256,7 +256,7 @@ def arm_names(overrides: Mapping[Path, Iterable[str]]) -> dict[Path, tuple[str, 
 def names_of(states: Sequence[TrialState]) -> dict[Path, tuple[str, str]]:
     """`arm_names` of trials from their entries in the plan."""
     return arm_names(
-        {state.folder: state.planned.overrides if state.planned else () for state in states}
+        {state.folder: state.planned.words if state.planned else () for state in states}
     )
 
 

@@ -29,6 +29,7 @@ from gsbench.scene.options import SceneConfig
 from gsbench.scene.record import SceneReader
 from gsbench.system.device import select_device
 from gsbench.system.resources import available_threads
+from gsbench.train.ideas import Ideas
 from gsbench.train.options import TrainConfig
 from gsbench.train.proof import Proven, create_proven
 
@@ -62,6 +63,11 @@ class Parts:
     @cached_property
     def train(self) -> TrainConfig:
         return TrainConfig(**self.values["train"])
+
+    @cached_property
+    def ideas(self) -> Ideas:
+        """The user's classes for loss, terms, schedule and optimiser."""
+        return build_ideas(self.train, self._allowed)
 
     @cached_property
     def eval(self) -> EvalConfig:
@@ -145,7 +151,7 @@ class Parts:
         With ``on_this_machine`` the trial will run on this machine, so its devices and programs are
         checked too.
         """
-        _ = self.reader, self.initializer, self.trainer, self.metrics
+        _ = self.reader, self.initializer, self.trainer, self.metrics, self.ideas
         name, own = self.values["raster"]["name"], self.own_rasterizer
         if on_this_machine and self.program is not None:
             self.program.executable()
@@ -163,6 +169,24 @@ class Parts:
         extra = getattr(self.trainer, "needs_extra", None)
         if lack := lacks(raster, self.own_rasterizer, footprint, extra):
             raise InputError(f"densify={self.values['densify']['name']} {lack}")
+
+
+def build_ideas(options: TrainConfig, allow_targets: list[str]) -> Ideas:
+    """The classes that the settings ``train`` name, beside the weights of terms."""
+    single = {
+        name: build(f"train.{name}", {TARGET: None} | values, allow_targets)
+        for name in ("loss", "schedule", "optimizer")
+        if (values := getattr(options, name))
+    }
+    terms = []
+    for number, values in enumerate(options.terms):
+        place = f"train.terms.{number}"
+        weight = values.get("weight", 1.0)
+        if isinstance(weight, bool) or not isinstance(weight, int | float):
+            raise InputError(f"{place}.weight must be a number, got {weight!r}")
+        own = {key: value for key, value in values.items() if key != "weight"}
+        terms.append((build(place, {TARGET: None} | own, allow_targets), float(weight)))
+    return Ideas.of(terms=terms, **single)
 
 
 def build_own_rasterizer(values: dict[str, Any], allow_targets: list[str]) -> Rasterizer | None:

@@ -30,7 +30,7 @@ from gsbench.init import Sfm
 from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER, REPORT_FILE
 from gsbench.logs import log_to
 from gsbench.normalization import Normalization
-from gsbench.parsing import read_json, read_typed
+from gsbench.parsing import read_if_sound, read_json, read_typed
 from gsbench.pipeline.parts import Parts
 from gsbench.pipeline.steps.evaluate import evaluate_step
 from gsbench.pipeline.steps.external import external_step
@@ -46,12 +46,12 @@ from gsbench.pipeline.steps.scene import (
 )
 from gsbench.pipeline.steps.train import train_step
 from gsbench.runs import keys, layout
+from gsbench.runs.commands import digest_of, read_history
 from gsbench.runs.config_hash import arm_hash, config_hash
-from gsbench.runs.experiments import read_declarations
 from gsbench.runs.nested import flatten, sha256_of
 from gsbench.runs.rows import read_rows
 from gsbench.runs.store import Store, StoredResult, read_manifest
-from gsbench.runs.trial_files import Failure
+from gsbench.runs.trial_files import AskedBefore, Failure
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import (
     FROM_MODEL,
@@ -60,8 +60,8 @@ from gsbench.runs.trial_record import (
     RENDERS_ALONE,
     Budget,
     Code,
-    Declared,
     Evaluation,
+    Oddity,
     Training,
     TrialRecord,
     TwinViews,
@@ -69,9 +69,11 @@ from gsbench.runs.trial_record import (
 )
 from gsbench.runs.user_code import user_modules
 from gsbench.scene.colmap_files import model_files
+from gsbench.scene.rules import settle
 from gsbench.scene.types import Capture, Scene
 from gsbench.system.install import version_of
 from gsbench.system.locks import hold
+from gsbench.system.resources import lacks_memory
 from gsbench.system.stopping import reinstall_handlers
 from gsbench.train.kernels import compiled_beside
 from gsbench.train.proof import Proven
@@ -181,10 +183,13 @@ def _recorded_failures(values: dict[str, Any], folder: TrialFolder) -> Iterator[
                     "returning"
                 )
                 raise TrainingError(text) from ended
-            except torch.OutOfMemoryError as error:
+            except (RuntimeError, MemoryError) as error:
+                if not lacks_memory(error):
+                    raise
                 raise TrainingError(
-                    f"the memory of device={values['device']} is full: lower scene.max_size or the "
-                    "number of trials at once (launch.parallel), or end other programs there"
+                    f"device={values['device']} has no memory left: lower scene.max_size, "
+                    "densify.max_gaussians or the number of trials at once (launch.parallel), or "
+                    "end other programs there"
                 ) from error
     except Exception as error:
         log.debug("the trial failed", exc_info=True)
@@ -222,6 +227,8 @@ def _run(trial: Trial, folder: TrialFolder) -> TrialRecord:
         trial_steps = TrialSteps(parts, store)
         entries: dict[str, StoredResult] = {}
         code: dict[str, str] = {}
+        asked: list[str] = []
+        digest = digest_of(values)
         on_cpu = parts.program is None and parts.device.type == "cpu"
         with compiled_beside(parts.rasterizer, on_cpu) as kernels_ready:
             for step in trial_steps.steps():
@@ -229,13 +236,14 @@ def _run(trial: Trial, folder: TrialFolder) -> TrialRecord:
                     scene = trial_steps.views.scene
                     counts = len(scene.train), len(scene.test)
                     log.info("%s: %d training and %d test views", folder.label, *counts)
+                    asked = _questions(folder, digest, values, step, store)
                     kernels_ready()
                 entries[step.stage.name] = entry = store.get(step)
                 code |= step.code
                 if step.stage is keys.INIT:
                     link_or_copy(entry.path / REPORT_FILE, folder.path / layout.INIT_REPORT)
         capture, scene = trial_steps.capture, trial_steps.views.scene
-        results = results_of(values, capture, scene, parts.raster, entries, code)
+        results = results_of(values, capture, scene, parts.raster, entries, code, asked)
         published = _publish(folder.path, entries, capture.normalization)
         kept = {name: entry.path for name, entry in entries.items() if name != keys.CAPTURE.name}
         sources = source_files(trial_steps.photographs, store)
@@ -247,6 +255,26 @@ def _run(trial: Trial, folder: TrialFolder) -> TrialRecord:
     if results.learnt_nothing:
         log.warning("%s: %s", folder.label, results.learnt_nothing)
     return results
+
+
+def _questions(
+    folder: TrialFolder, digest: str, values: Mapping[str, Any], step: keys.Step, store: Store
+) -> list[str]:
+    """The ids of the questions that covered a trial when its training began.
+
+    None for a training that is found in the store, unless it began for this experiment: its result
+    may have been seen before a question was written.
+    """
+    file = folder.path / layout.ASKED
+    before = read_if_sound(file, AskedBefore)
+    if before is not None and before.training == step.key:
+        return before.questions
+    history, place = read_history(folder.home), (values["scene"]["name"], values["seed"])
+    if store.find(step) is not None and (digest, place) not in history.results:
+        return []
+    asked = [question.id for question in history.covering(digest, *place)]
+    write_json(file, AskedBefore(training=step.key, questions=asked).to_json())
+    return asked
 
 
 def source_files(capture: Capture, store: Store) -> list[Path]:
@@ -316,18 +344,25 @@ def results_of(
     raster: Proven,
     entries: Mapping[str, StoredResult],
     code: Mapping[str, str],
+    asked: list[str],
 ) -> TrialRecord:
     """The results of the trial with the configuration ``values``.
 
     ``capture`` are the photographs, ``raster`` is the rasterizer, ``entries`` are the steps' store
     entries by stage. ``code`` maps the parts of gsbench's source that the steps used to their
-    states.
+    states. ``asked`` are the ids of the questions that covered the trial before its training.
     """
-    stages = keys.TRAIN, keys.EVALUATE
+    stages = keys.INIT, keys.TRAIN, keys.EVALUATE
     init, trained, evaluated = (entries[stage.name] for stage in stages)
     training = read_typed(trained.path / layout.TRAINING, Training)
     evaluation = read_typed(evaluated.path / layout.METRICS, Evaluation)
     manifest = read_manifest(evaluated.path)
+    init_report = read_json(init.path / REPORT_FILE)
+    of_model = [Oddity(**odd) for odd in init_report.get("oddities", ())]
+    oddities = [*capture.oddities, *scene.oddities, *of_model, *training.oddities]
+    # A stage of the store may have been made with a rule accepted that is not accepted here.
+    refused = [odd for odd in oddities if odd.refused]
+    settle(refused, f"scene {capture.name}", capture.accept)
     is_ready_made = training.trained_by is None and not training.iterations
     seconds = {"init": init.seconds, "train": training.seconds, "evaluate": evaluated.seconds}
     if is_ready_made:
@@ -349,9 +384,10 @@ def results_of(
         protocol=manifest.inputs["protocol"],
         unavailable=evaluation.unavailable | _unknown_costs(training, is_ready_made),
         measured=manifest.created,  # of an evaluation found in the store: when it was put there
-        declared=_declared_sweep(values),
+        questions=asked,
         metric_facts=evaluation.facts,
         metrics_at=evaluation.at,
+        oddities=oddities,
         twins=TwinViews(
             left_out={**capture.left_out, **scene.twins.left_out}, near=dict(scene.twins.near)
         ),
@@ -368,7 +404,7 @@ def results_of(
         held_out=capture.held_out,
         resolution=max((view.camera.width, view.camera.height) for view in views),
         events=sum_events(read_rows(trained.path / layout.EVENTS)),
-        init_report=read_json(init.path / REPORT_FILE),
+        init_report=init_report,
         hashes={
             "config": config_hash(values),
             "arm": arm_hash(values),
@@ -399,17 +435,6 @@ def _unknown_costs(training: Training, is_ready_made: bool) -> dict[str, str]:
         reason = f"{MADE_ELSEWHERE}: not trained here"
         unknown |= {"train_time": reason, "total_time": reason}
     return unknown
-
-
-def _declared_sweep(values: Mapping[str, Any]) -> Declared | None:
-    """The newest declaration of a sweep about this trial's primary metric; None without one."""
-    primary = values["eval"].get("primary")
-    declared = [
-        sweep
-        for sweep in read_declarations(TrialFolder.of(values).home)
-        if sweep.kind == "sweep" and sweep.primary == primary
-    ]
-    return declared[-1].summary() if declared else None
 
 
 def cloud_hash(init: Path) -> str:

@@ -148,6 +148,8 @@ class RenderOutput(NamesAttributes):
     - ``footprint()`` computes the `Footprint` of this view, also after ``backward``;
       ``footprint(values)`` sums ``values`` [H, W] over its pixels, too. None if the rasterizer has
       no footprints.
+    - ``depth`` is the expected depth along the camera's z, [H, W] world units, 0 where alpha is 0;
+      None unless a part of the training asks for it (`gsbench.raster.depth.render_depth`).
     - ``extra`` is a leaf of zeros [N, …], or None if no extra output was requested. After
       ``backward``, its ``.grad`` is the extra output.
     """
@@ -159,6 +161,7 @@ class RenderOutput(NamesAttributes):
     screen_gradient_abs: Tensor | None = None
     footprint: Callable[..., Footprint] | None = None
     extra: Tensor | None = None
+    depth: Tensor | None = None
 
     @property
     def visible(self) -> Tensor:

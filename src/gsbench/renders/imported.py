@@ -19,7 +19,7 @@ from gsbench.analysis.trial_settings import config_if_readable
 from gsbench.config.overrides import parse_word
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator
-from gsbench.eval.pictures import PicturePair
+from gsbench.eval.pictures import PicturePair, read_picture
 from gsbench.files import atomic, file_sha256, write_text
 from gsbench.pipeline.steps.evaluate import summary_of, write_per_view
 from gsbench.pipeline.trial import versions
@@ -30,7 +30,7 @@ from gsbench.runs.nested import sha256_of
 from gsbench.runs.package_code import states_of
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS, RENDERS_ALONE, Code, TrialRecord
-from gsbench.scene.images import png_name, read_image
+from gsbench.scene.images import png_name
 from gsbench.settings import is_folder_name
 
 PerView = Mapping[str, Mapping[str, float]]  # values by metric, by view
@@ -154,7 +154,8 @@ def import_trial(destination: Destination, measured: Measured, runs: Path) -> Pa
                 continue
             (folder / kind).mkdir(parents=True, exist_ok=True)
             with atomic(folder / kind / png_name(pair.view), sync=False) as temporary:
-                Image.fromarray(read_image(file)).save(temporary, format="PNG")
+                pixels = read_picture(file, is_render=kind == RENDERS)
+                Image.fromarray(pixels).save(temporary, format="PNG")
     write_text(folder / CONFIG, yaml.safe_dump(config, sort_keys=False))
     write_per_view(folder / PER_VIEW, measured.per_view)
     TrialFolder(folder).write_finished(config, _results(destination, measured, identity))

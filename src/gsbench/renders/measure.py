@@ -15,8 +15,9 @@ from gsbench.config.compose import compose_one
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator, summarize
 from gsbench.eval.facts import METRICS
+from gsbench.eval.matching import Matching, match_by_order, match_pictures
 from gsbench.eval.options import EvalConfig
-from gsbench.eval.pictures import Matching, PicturePair, match_by_order, match_pictures, measure
+from gsbench.eval.pictures import PicturePair, check_pairs, measure
 from gsbench.files import storage_errors
 from gsbench.logs import progress
 from gsbench.pipeline.parts import build_metrics, make_evaluator
@@ -25,11 +26,11 @@ from gsbench.renders.predictions import opened_renders
 from gsbench.renders.truth import (
     ReferenceImages,
     find_reference_images,
+    picture_names,
     pictures_in,
     reference_images_of,
 )
 from gsbench.runs.user_code import PERMISSIONS
-from gsbench.scene.images import list_images
 from gsbench.system.device import select_device
 from gsbench.system.own_modules import allow_modules
 from gsbench.system.resources import available_threads
@@ -40,6 +41,36 @@ def measure_renders(options: argparse.Namespace, runs: Path) -> None:
     """Measure the renders that the ``options`` of the verb name, and print the values."""
     with opened_renders(Path(options.renders).expanduser()) as (renders, photographs):
         _measure(options, renders, photographs, runs)
+
+
+def measure_folders(
+    root: Path, truth: Path, settings: Sequence[str]
+) -> list[dict[str, str | float]]:
+    """The mean metrics of renders in ``root/METHOD/SCENE/SEED``, a row for each folder.
+
+    The photographs of a scene are in ``truth/SCENE``. Raises InputError for other folders, and for
+    pictures that do not match.
+    """
+    folders = sorted(folder for folder in root.glob("*/*/*") if folder.is_dir())
+    if not folders:
+        raise InputError(f"{root} has no folder METHOD/SCENE/SEED with pictures")
+    rows: list[dict[str, str | float]] = []
+    torch.set_num_threads(available_threads())
+    with progress("evaluate") as report:
+        for done, folder in enumerate(folders, 1):
+            method, scene, seed = folder.relative_to(root).parts
+            images = pictures_in(truth / scene, settings)
+            matching = match_pictures(list(images.photographs), picture_names(folder))
+            pairs = [
+                PicturePair(view, path, folder / matching.pairs[view])
+                for view, path in images.photographs.items()
+            ]
+            check_pairs(pairs)
+            evaluator = _evaluator(images, None, settings)
+            means = summarize(measure(pairs, evaluator), evaluator.unavailable)
+            rows.append({"method": method, "scene": scene, "seed": seed} | means)
+            report("folders", done, len(folders))
+    return rows
 
 
 def _measure(
@@ -60,11 +91,12 @@ def _measure(
         destination = find_destination(options.place, options.scene, options.seed, truth, runs)
         check_destination(destination, truth, runs)
     match = match_by_order if options.by_order else match_pictures
-    matching = match(list(truth.photographs), list_images(renders))
+    matching = match(list(truth.photographs), picture_names(renders))
     pairs = [
         PicturePair(view, path, renders / matching.pairs[view], truth.masks.get(view))
         for view, path in truth.photographs.items()
     ]
+    notes = check_pairs(pairs)
     torch.set_num_threads(available_threads())
     evaluator = _evaluator(truth, options.protocol, options.settings)
     with progress("evaluate") as report:
@@ -72,7 +104,7 @@ def _measure(
     source = {
         "folder": str(Path(options.renders).expanduser().resolve()),
         "names matched": matching.rule or "as they are",
-    }
+    } | ({"notes": "; ".join(notes)} if notes else {})
     measured = Measured(truth, pairs, per_view, evaluator, source)
     folder = None
     if destination is not None:
@@ -148,6 +180,7 @@ def _as_dict(measured: Measured, matching: Matching, folder: Path | None) -> dic
         "views": measured.per_view,
         "pictures": dict(matching.pairs),
         "names_matched": matching.rule,
+        "notes": measured.source.get("notes", ""),
         "left_out": list(matching.left_out),
         "entered": None if folder is None else str(folder),
     }

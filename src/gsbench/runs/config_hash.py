@@ -9,10 +9,26 @@ from gsbench.runs.user_code import PERMISSIONS, user_modules
 # Options that cannot change a result. This holds for gsbench's own classes; a user's class may use
 # the names otherwise.
 WITHOUT_EFFECT = ("threads", "weights", "download", "time_limit_minutes")
-# Settings that only declare how results are read or what an ablation may turn off.
+# Settings that only declare what is accepted, how results are read or what may be turned off.
 # train.steps_scaler has been applied to the steps.
-DECLARED = {"eval": ("primary", "controls"), "densify": ("switches",), "train": ("steps_scaler",)}
-NOT_HASHED = ("name", "seed", "device", "threads", "runs", PERMISSIONS, "tracking", "launch")
+DECLARED = {
+    "scene": ("accept",),
+    "eval": ("primary", "baseline", "controls"),
+    "densify": ("switches",),
+    "train": ("steps_scaler",),
+}
+NOT_HASHED = (
+    "name",
+    "questions",
+    "error_rate",
+    "seed",
+    "device",
+    "threads",
+    "runs",
+    PERMISSIONS,
+    "tracking",
+    "launch",
+)
 # Settings in which trials of one cell may differ: they do not change what is computed.
 # "x" stands for x and all below it (x.y).
 IGNORED_SETTINGS = (

@@ -8,7 +8,6 @@ STORE = "store"  # results of stages by key
 ARTIFACTS, DATABASE = "mlartifacts", "mlflow.db"  # MLflow's files
 TENSORBOARD, WANDB = "tensorboard", "wandb"  # other trackers' files
 IN_RUNS = (STORE, ARTIFACTS, DATABASE, TENSORBOARD, WANDB)
-SEEN = ".seen"  # a file for each experiment: what was ever measured in it
 JOBS = ".jobs"  # output of the jobs of launch=local and launch=slurm, with a folder per experiment
 
 # in the store
@@ -20,9 +19,9 @@ TRAINING = "training.json"  # counts, time and memory of a training
 METRICS = "metrics.json"  # of an evaluation
 
 # in an experiment's folder
-PLAN = "plan.json"  # all trials of the commands so far
-DECLARED = "declared.jsonl"  # declared questions, with their times
-FORGOTTEN = ".forgotten"  # records of removed trials, since what they showed was seen
+COMMANDS = "commands.jsonl"  # all commands, with their trials and questions
+PLAN = "plan.json"  # of earlier versions: the trials of the commands
+DECLARED = "declared.jsonl"  # of earlier versions: declared questions, with their times
 LEDGER = "ledger.jsonl"  # ideas, tests and results in their order (`gsbench ledger`)
 TUNING = "tuning.json"  # of a search: its ranges and points
 SEED = "-seed"  # between hash and seed in the name of a trial's folder
@@ -35,6 +34,7 @@ FAILED = "failed.json"  # the error of the last run
 LOG = "log.txt"
 LOCK = ".lock"
 SUBMITTED = ".submitted.json"  # the trial's Slurm job
+ASKED = "asked.json"  # the questions that covered the trial when its training began
 BUILDING = "building.json"  # the present stage of an unfinished trial, and its folder
 INIT_REPORT = "init_report.json"
 PER_VIEW = "per_view.csv"

@@ -28,9 +28,10 @@ from gsbench.parsing import (
     parse_typed,
     read_bytes,
 )
-from gsbench.runs.experiments import TrialKey
 from gsbench.runs.layout import LEDGER
 from gsbench.system.locks import hold
+
+TrialKey = Annotated[str, Field(pattern=r"^[^/]*/[^/]*/[^/]*$")]
 
 BASELINE = "baseline"  # the name of the ledger's own baseline among the ideas
 

@@ -34,6 +34,7 @@ from gsbench.parsing import (
     read_yaml,
 )
 from gsbench.runs import layout
+from gsbench.runs.commands import make_digest, remember_result
 from gsbench.runs.config_hash import config_hash
 from gsbench.runs.freshness import (
     Change,
@@ -44,7 +45,6 @@ from gsbench.runs.freshness import (
 )
 from gsbench.runs.nested import sha256_of
 from gsbench.runs.rows import Row, read_rows
-from gsbench.runs.seen import remember
 from gsbench.runs.trial_files import Building, Configuration, Failure, MadeOf, ResultsFile
 from gsbench.runs.trial_record import TrialRecord, UnfinishedError, record_from
 from gsbench.runs.user_code import PERMISSIONS
@@ -265,7 +265,10 @@ class TrialFolder:
             finished = (self._origin and self._origin.finished) or before.st_mtime
         origin = origin_of(self.path, content, values, sources, entries or {}, published)
         origin = replace(origin, finished=finished)
-        remember(self.home, record)
+        config_hash = self.path.name.partition(layout.SEED)[0]
+        code = record.code
+        digest = make_digest(self.path.parent.name, config_hash, code.sources, code.packages)
+        remember_result(self.home, self.path, digest)
         with atomic(path) as temporary:
             temporary.write_text(
                 json.dumps(content | {MADE_OF: origin.to_json()}, indent=1, allow_nan=False) + "\n"

@@ -96,6 +96,18 @@ class ExternalTrainer(Record):
     command: list[str] = field(default_factory=list)
 
 
+class Oddity(Record):
+    """What one rule of gsbench.scene.rules found odd about a capture, its model or its points.
+
+    ``refused`` says that the value is not usable, and that the rule was accepted.
+    """
+
+    rule: Text
+    line: Text
+    value: Number
+    refused: bool = False
+
+
 class InitialCloud(Record):
     """Facts of the initial points, measured before the first iteration (`gsbench.train.start`)."""
 
@@ -107,7 +119,7 @@ class InitialCloud(Record):
     far: Count
     # the median distance of points from their median place, over that of the training cameras
     spread: Amount
-    warnings: list[str]  # about points and training cameras, as logged
+    warnings: list[str] = field(default_factory=list)  # of earlier versions
 
 
 class TwinViews(Record):
@@ -171,7 +183,9 @@ class TrialRecord(Record):
     evaluated_from: Literal["model", "renders"] | None = None  # None if gsbench trained it
     trained_by: ExternalTrainer | None = None
     measured: str | None = None  # time at which the evaluation was stored
-    declared: Declared | None = None
+    # ids of the questions that covered the trial when its training began
+    questions: list[str] = field(default_factory=list)
+    declared: Declared | None = None  # in files of earlier versions
     awaited: list[str] = field(default_factory=list)
     metric_facts: dict[str, MetricRecord] = field(default_factory=dict)
     metrics_at: dict[Iteration, Earlier] = field(default_factory=dict)
@@ -181,6 +195,7 @@ class TrialRecord(Record):
     causes: dict[str, Count] = field(default_factory=dict)
     scene_extent: Amount | None = None  # units of the given coordinates
     initial_cloud: InitialCloud | None = None
+    oddities: list[Oddity] = field(default_factory=list)
     twins: TwinViews | None = None  # None: not looked for
     # from the given coordinates to those of the training; None: the same
     normalization: Normalization | None = None
@@ -274,6 +289,7 @@ class Training(Record):
     # gsbench's commit, and whether files were edited
     checkout: dict[str, Any] = field(default_factory=dict)
     initial_cloud: InitialCloud | None = None
+    oddities: list[Oddity] = field(default_factory=list)  # of the initial points
     # compiling kernels for it, in no other time; None if another program trained
     compile_seconds: Amount | None = None
     evaluated_from: Literal["model", "renders"] | None = None

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from gsbench.errors import InputError
-from gsbench.files import MAX_NAME_BYTES, require_regular
+from gsbench.files import GIT_LFS, LFS_REMEDY, MAX_NAME_BYTES, require_regular
 from gsbench.scene.names import IMAGE_SUFFIXES
 from gsbench.scene.options import Backdrop
 from gsbench.words import counted, is_one_line, some_of
@@ -34,7 +34,6 @@ NOT_READ |= {".exr": "EXR", ".gif": "GIF"} | dict.fromkeys((".mp4", ".mov", ".in
 # on every file.
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")  # JPEG includes MPO, which holds several JPEGs
 EXIF_ORIENTATION = 0x0112
-GIT_LFS = b"version https://git-lfs"
 _FILTERS = {
     "lanczos": Image.Resampling.LANCZOS,
     "area": Image.Resampling.BOX,
@@ -75,7 +74,9 @@ def list_images(folder: Path) -> list[str]:
     if unread:
         files = " and ".join(counted(count, f"{kind} file") for kind, count in unread.items())
         is_one = unread.total() == 1
-        log.warning("%s: %s %s not read: save as JPEG", folder, files, "is" if is_one else "are")
+        log.warning(
+            "%s: %s %s not read: save as PNG or JPEG", folder, files, "is" if is_one else "are"
+        )
     if strange := sorted(name for name in names if not is_one_line(name)):
         advice = "rename them"
         if sys.getfilesystemencoding() != "utf-8":
@@ -177,8 +178,6 @@ def resize_image(
     ``bicubic`` is Pillow's with a = -0.5, widened too. ``area`` is the mean over each new pixel's
     area.
     """
-    if resample not in _FILTERS:
-        raise InputError(f"scene.resample must be one of {', '.join(_FILTERS)}, got {resample!r}")
     if image.shape[:2] == (height, width):
         return image
     return np.array(Image.fromarray(image).resize((width, height), _FILTERS[resample]))
@@ -222,7 +221,7 @@ def open_image(path: Path) -> Image.Image:
         reason = "not a readable image" if isinstance(error, UnidentifiedImageError) else str(error)
         with path.open("rb") as stream:
             if stream.read(len(GIT_LFS)) == GIT_LFS:
-                reason += ", but a pointer of Git LFS (git lfs pull)"
+                reason += f", but {LFS_REMEDY}"
         raise InputError(f"{path}: {reason}: replace or remove it") from error
 
 

@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from gsbench.eval.facts import find_metric
-from gsbench.parsing import read_if_sound
 from gsbench.runs import layout
+from gsbench.runs.commands import read_history
 from gsbench.runs.keys import TRAIN
 from gsbench.runs.nested import flatten, sha256_of
-from gsbench.runs.plan import PlanFile
 from gsbench.runs.rows import read_rows
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import TrialRecord
@@ -143,6 +142,12 @@ class TrackedTrial:
         results = self.folder.sound_record()
         return None if results is None else sha256_of(results.to_json())
 
+    def ending(self) -> str:
+        """How a trial without results has ended: when it failed, or where it was stopped."""
+        if self.folder.has_failed():
+            return f"failed at {self.folder.failure().time}"
+        return "stopped in {} at {}".format(*self.folder.stage_and_step())
+
     def curves(
         self, logged: Mapping[str, int], live: bool
     ) -> Iterator[tuple[str, int, list[Scalar]]]:
@@ -220,10 +225,9 @@ class TrackedTrial:
             markdown_text(f"{', '.join(texts)} after {results.iterations:,} iterations."),
             f"Folder: {markdown_code(self.path)}",
         ]
-        plan = read_if_sound(self.folder.home / layout.PLAN, PlanFile)
-        place = self.folder.path.relative_to(self.folder.home).as_posix()
-        if plan and (planned := plan.trials.get(place)):
-            lines.append(f"Again: {markdown_code(command(*planned.overrides))}")
+        planned = read_history(self.folder.home).planned.get(self.folder.path)
+        if planned is not None:
+            lines.append(f"Again: {markdown_code(command(*planned.words))}")
         return "\n\n".join(lines)
 
     def _pictures(self, count: int) -> dict[str, Array]:

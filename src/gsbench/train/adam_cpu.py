@@ -33,20 +33,23 @@ class CpuAdam:
         if visible is not None:
             torch_adam(updates, seen, visible)
             return
-        for parameter, gradient, state, active, _ in updates:
-            count, width = len(parameter), parameter.shape[1:].numel()
-            arrays = [
-                tensor.detach().numpy().reshape(count, width)
-                for tensor in (parameter, state.first, state.second, gradient.contiguous())
-            ]
-            factors = map(np.float32, state.factors)
-            numbers = (width if active is None else active, *factors)
+        for update in updates:
+            self._step(update)
 
-            def step(first: int, past: int, arrays=arrays, count=count, numbers=numbers) -> None:  # type: ignore[no-untyped-def]
-                begin, end = count * first // SHARDS, count * past // SHARDS
-                adam_rows(np.empty(64, np.float32), begin, end, *arrays, *numbers)
+    def _step(self, update: Update) -> None:
+        parameter, gradient, state, active, _ = update
+        count, width = len(parameter), parameter.shape[1:].numel()
+        arrays = [
+            tensor.detach().numpy().reshape(count, width)
+            for tensor in (parameter, state.first, state.second, gradient.contiguous())
+        ]
+        numbers = (width if active is None else active, *map(np.float32, state.factors))
 
-            self._runner.run(SHARDS, step)
+        def step(first: int, past: int) -> None:
+            begin, end = count * first // SHARDS, count * past // SHARDS
+            adam_rows(np.empty(64, np.float32), begin, end, *arrays, *numbers)
+
+        self._runner.run(SHARDS, step)
 
 
 class FusedStep:

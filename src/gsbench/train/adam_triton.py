@@ -42,7 +42,7 @@ def adam_step(
 ):
     """Apply Adam (Kingma and Ba 2015, algorithm 1) to ``values`` [count, WIDTH], in place.
 
-    ``first`` and ``second`` are the moments, ``factors`` [2] `AdamState.factors`. The gradient
+    ``first`` and ``second`` are the moments, ``factors`` [2] `ParameterState.factors`. The gradient
     is 0 from column ``ACTIVE`` on and, if ``HAS_SEEN``, where ``seen`` [count] is 0; ``gradients``
     is not read there and may be undefined. If ``HAS_FURTHER``, ``further`` is added to it. If
     ``HAS_VISIBLE``, rows where ``visible`` [count] is 0 do not change.

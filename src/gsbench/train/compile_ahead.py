@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 import torch
 import triton
 
-from gsbench.gaussians.trainable import AdamState, Update
+from gsbench.gaussians.trainable import ParameterState, Update
 from gsbench.raster.contract import Case
 from gsbench.raster.staged import Lifetime, RenderRequest
 from gsbench.raster.triton.executor import (
@@ -77,7 +77,7 @@ def _launch_step(
 
     updates = []
     for tensor, gradient in zip(values.tensors().values(), gradients, strict=True):
-        state = AdamState(0.1, 1, gradient, gradient)
+        state = ParameterState(0.1, 1, {"first": gradient, "second": gradient})
         active = 3 * ((degree + 1) ** 2 - 1) if tensor.dim() == 3 else None
         updates.append(Update(tensor, gradient, state, active, gradient if extended else None))
     adam, seen = TritonAdam(), frame.projected.row_counts

@@ -9,6 +9,7 @@ from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 from gsbench.gaussians.paper_values import LearningRates
 from gsbench.settings import MISSING, Fraction, check_settings
 
+IDEAS = ("loss", "terms", "schedule", "optimizer")  # settings that name classes of the user's
 WITHOUT_EFFECT_ON_MODEL = (
     "name",
     "log_every",
@@ -39,6 +40,12 @@ class TrainConfig(LearningRates):
     iterations: NonNegativeInt = 30_000  # 0: evaluate the initial Gaussians without training
     sh_interval: PositiveInt = 1000  # iterations after which spherical harmonics gain a degree
     ssim_weight: Fraction = 0.2  # loss = 0.8 L1 + 0.2 (1 - SSIM)
+    # classes of your own (docs/ideas.md): _target_ and options, instead of the loss above
+    loss: dict[str, Any] = field(default_factory=dict)
+    # terms added to the loss: a list of _target_, weight and options
+    terms: list[dict[str, Any]] = field(default_factory=list)
+    schedule: dict[str, Any] = field(default_factory=dict)  # of the learning rates
+    optimizer: dict[str, Any] = field(default_factory=dict)  # instead of Adam
     background: tuple[Fraction, Fraction, Fraction] = (0.0, 0.0, 0.0)
     densify_start: NonNegativeInt = 500  # the densification window; densifiers read it from here
     densify_stop: NonNegativeInt = 15_000

@@ -3,6 +3,7 @@
 import json
 import math
 from collections import deque
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -14,6 +15,7 @@ from gsbench.files import write_text
 from gsbench.raster.staged import Readback
 from gsbench.runs.rows import whole_lines
 
+PHOTOMETRIC = ("loss", "l1", "ssim")  # what the built-in loss gives
 SMOOTHING = 0.9  # weight of the previous mean in the smoothed loss
 LOG_VOLUME_BINS = np.linspace(-18, 3, 85)  # log10 of world units^3, in steps of 0.25
 
@@ -24,23 +26,24 @@ class LossLog:
     ``smoothed`` is the exponential mean of the losses that have arrived; NaN before the first.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, names: Sequence[str] = PHOTOMETRIC) -> None:
+        self.names = tuple(names)
         self.smoothed = math.nan
         self._pending: deque[tuple[int, Readback]] = deque()
         self._latest: dict[str, float] = {}
 
     def add(self, step: int, scalars: Tensor) -> None:
-        """Add the ``scalars`` of iteration ``step``.
+        """Add the ``scalars`` of iteration ``step``, in the order of ``names``.
 
-        They are loss, L1, SSIM and, if there is a regulariser, the loss plus it. Raises
-        FloatingPointError if such a total that has arrived by now is not finite.
+        One number more is the total with the densifier's regulariser. Raises FloatingPointError if
+        one that has arrived by now is not finite.
         """
         self._pending.append((step, Readback(scalars)))
         while self._pending and self._pending[0][1].arrived:
             self._take()
 
     def wait(self) -> dict[str, float]:
-        """Wait for all losses; return ``step``, ``loss``, ``l1``, ``ssim`` of the last iteration.
+        """Wait for all losses; return ``step`` and those of the last iteration by name.
 
         Raises FloatingPointError, which names the first iteration whose total was not finite.
         """
@@ -50,14 +53,16 @@ class LossLog:
 
     def _take(self) -> None:
         step, readback = self._pending.popleft()
-        loss, l1, ssim, *more = readback.values().tolist()
-        for total in more or [loss]:
-            if not math.isfinite(total):
-                raise FloatingPointError(f"the loss became {total} at iteration {step}")
+        values = readback.values().tolist()
+        for name, value in zip((*self.names, "loss"), values, strict=False):
+            # L1 and SSIM are only shown: a loss that counts is finite, or the training ends.
+            if not math.isfinite(value) and name not in ("l1", "ssim"):
+                raise FloatingPointError(f"the {name} became {value} at iteration {step}")
+        loss = values[0]
         is_first = math.isnan(self.smoothed)
         mean = SMOOTHING * self.smoothed + (1 - SMOOTHING) * loss
         self.smoothed = loss if is_first else mean
-        self._latest = {"step": step, "loss": loss, "l1": l1, "ssim": ssim}
+        self._latest = {"step": step, **dict(zip(self.names, values, strict=False))}
 
 
 def volume_histogram(step: int, log_scales: Tensor) -> dict[str, Any]:

@@ -4,8 +4,9 @@ import logging
 import time
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
+from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,24 +15,34 @@ from torch import Tensor
 
 from gsbench.densify import Densifier, DensifyContext, NoDensifier, Refinement
 from gsbench.errors import InputError, TrainingError
-from gsbench.eval.images import replace_ignored
+from gsbench.eval.images import as_unit_range, replace_ignored
 from gsbench.events import FEWEST_ROUNDS, RefineEvent, few_rounds
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
 from gsbench.gaussians.ply import write_ply
 from gsbench.gaussians.trainable import StepAll, TrainableGaussians
 from gsbench.raster import Rasterizer
 from gsbench.raster.base import RenderOutput
+from gsbench.raster.depth import render_depth
 from gsbench.raster.executors import find_executor, lacks
 from gsbench.runs.layout import CURVES, EVENTS, HISTOGRAMS
-from gsbench.scene.types import Scene
+from gsbench.scene.types import Camera, Scene
 from gsbench.system.compile_clock import CLOCK
 from gsbench.system.device import free_bytes
 from gsbench.system.stopping import deferred, requested
 from gsbench.train.checkpoint import CheckpointWriter, load_checkpoint
 from gsbench.train.growth import GrowthWatch
+from gsbench.train.ideas import (
+    NO_IDEAS,
+    Ideas,
+    Schedule,
+    Step,
+    TrainedView,
+    scheduled,
+    value_of,
+)
 from gsbench.train.loss import PhotometricLoss
 from gsbench.train.options import TrainConfig
-from gsbench.train.records import LossLog, append, drop_after, volume_histogram
+from gsbench.train.records import PHOTOMETRIC, LossLog, append, drop_after, volume_histogram
 from gsbench.train.resolution import Resolution, ScaledViews
 from gsbench.train.views import CameraOrder, SceneViews, Targets, generators
 
@@ -74,12 +85,20 @@ class Trainer:
         options: TrainConfig,
         seed: int,
         snapshot_at: Collection[int] = (),
+        ideas: Ideas = NO_IDEAS,
     ) -> None:
         needs = densifier.needs_footprint, densifier.needs_extra
         if lack := lacks(rasterizer.name, rasterizer, *needs):
             raise InputError(f"{type(densifier).__name__} {lack}")
+        if options.visible_adam and ideas.optimizer is not None:
+            raise InputError(
+                "train.visible_adam is a setting of Adam: leave it out with train.optimizer"
+            )
         self.scene = scene
         self.densifier = densifier
+        self.ideas = ideas
+        self.needs_depth = ideas.needs_depth or densifier.needs_depth
+        self.shows_view = "view" in signature(densifier.observe).parameters
         self.rasterizer = rasterizer
         self.options = options
         self.snapshot_at = frozenset(snapshot_at)
@@ -91,12 +110,17 @@ class Trainer:
         self.direct, step_all = fast_steps(rasterizer, self.loss, options, self.background)
         self.fused = fused_step(rasterizer, self.loss, options, self.background)
         self.stepped = False  # whether the fused step of this iteration has applied Adam
-        self.gaussians = TrainableGaussians(initial, options, scene.extent, step_all)
+        if ideas.reads_renders or ideas.optimizer is not None or self.needs_depth:
+            self.direct = self.fused = None  # such parts need autograd
+        self.gaussians = TrainableGaussians(
+            initial, options, scene.extent, step_all, ideas.optimizer
+        )
         self.rngs = generators(seed)
         self.order = CameraOrder(len(scene.train), self.rngs["cameras"])
         self.step = 0
         self.seconds = 0.0
-        self.losses = LossLog()
+        of_loss = PHOTOMETRIC if ideas.loss is None else ("loss",)
+        self.losses = LossLog([*of_loss, *(f"term_{one.label}" for one in ideas.terms)])
         self.growth = GrowthWatch()
         free = free_bytes(self.device)
         image_budget = None if free is None else int(SHARE_FOR_IMAGES * free)
@@ -200,6 +224,8 @@ class Trainer:
         self.gaussians.set_step(
             step if self.resolution is None else self.resolution.position_step(step)
         )
+        if self.ideas.schedule is not None:
+            self._schedule(self.ideas.schedule)
         index = self.order.next()
         try:
             render, scalars = self._differentiate(index)
@@ -211,7 +237,8 @@ class Trainer:
             return None
         if step in self.snapshot_at:
             write_ply(self.gaussians.values, folder / snapshot_file(step))
-        self.densifier.observe(step, render)
+        more = {"view": self._view(index)} if self.shows_view else {}
+        self.densifier.observe(step, render, **more)
         if options.step_after_refine:
             self._optimize(render)
         event = self.densifier.refine(step, self.gaussians, self.rngs["densify"])
@@ -254,16 +281,67 @@ class Trainer:
             wanted = self.densifier.needs_absolute_gradient
             return self.fused(self.gaussians, cameras[index], target, self.sh_degree, wanted)
         render = self.render(index)
-        loss, l1, ssim = self.loss(replace_ignored(render.image, target, mask), target)
-        scalars, total = [loss, l1, ssim], loss
-        loss.backward()
+        depth_points = self._add_depth(render, cameras[index]) if self.needs_depth else None
+        total, scalars = self._loss(render, index, replace_ignored(render.image, target, mask))
+        total.backward()
+        if depth_points is not None and depth_points.grad is not None:
+            # Terms on depth move the projected means, too: densifiers see the sum.
+            of_image = render.screen_points.grad
+            render.screen_points.grad = depth_points.grad + (0 if of_image is None else of_image)
+        self.ideas.optimize()
         if regularizer is not None:
             # Direct steps, too, add its whole gradient to that of the loss: the same bits.
             if regularizer.requires_grad:
                 regularizer.backward()
-            total = loss + regularizer
+            total = total + regularizer
             scalars.append(total)
         return render, torch.stack([scalar.detach().to(total) for scalar in scalars])
+
+    def _loss(self, render: RenderOutput, index: int, image: Tensor) -> tuple[Tensor, list[Tensor]]:
+        """The sum to differentiate, and the scalars of `LossLog`, for a render with ``image``."""
+        ideas, target = self.ideas, self.scaled_views.at(self.scale)[1].get(index)
+        if not ideas.reads_renders:
+            loss, *shown = self.loss(image, target)
+            return loss, [loss, *shown]
+        step = Step(
+            self.step,
+            replace(render, image=image),
+            self._view(index),
+            self.gaussians.values,
+            self.rngs["ideas"],
+        )
+        if ideas.loss is None:
+            total, *shown = self.loss(image, target)
+        else:
+            total, shown = value_of(ideas.loss, step, "train.loss"), []
+        scalars = [total, *shown]
+        for one in ideas.terms:
+            value = value_of(one.term, step, f"the term {one.label} of train.terms")
+            total = total + one.weight * value
+            scalars.append(value)
+        return total, scalars
+
+    def _add_depth(self, render: RenderOutput, camera: Camera) -> Tensor:
+        """Add the depth to a render; returns the projected means [N, 2] that get its gradient."""
+        render.depth, of_depth = render_depth(self.rasterizer, self.gaussians.values, camera)
+        return of_depth.screen_points
+
+    def _view(self, index: int) -> TrainedView:
+        """The training view ``index`` at the current size."""
+        cameras, targets = self.scaled_views.at(self.scale)
+        view = self.scene.train[index]
+        return TrainedView(
+            view.name,
+            cameras[index],
+            as_unit_range(targets.get(index), torch.float32),
+            targets.mask(index),
+        )
+
+    def _schedule(self, schedule: Schedule) -> None:
+        """Set the rates of this iteration by the user's ``schedule``."""
+        base = self.gaussians.base_rates(self.gaussians.position_rate)
+        for name, rate in scheduled(schedule, self.step, base).items():
+            self.gaussians.set_rate(name, rate)
 
     def render(self, index: int) -> RenderOutput:
         """Render the training view ``index`` as in the current iteration, with gradients."""
@@ -317,7 +395,7 @@ class Trainer:
             return False
         if step == self.options.iterations or step in self.snapshot_at:
             return False
-        if densifier.needs_footprint or densifier.needs_extra is not None:
+        if self.shows_view or densifier.needs_footprint or densifier.needs_extra is not None:
             return False
         event = RefineEvent(step=step, before=len(self.gaussians))
         return not densifier.rules(Refinement(step, self.gaussians, self.rngs["densify"], event))
@@ -341,6 +419,7 @@ class Trainer:
             "gaussians": self.gaussians.state_dict(),
             "densifier": self.densifier.state_dict(),
             "rngs": {name: rng.get_state() for name, rng in self.rngs.items()},
+            "ideas": self.ideas.state_dict(),
             "remaining_views": list(self.order.remaining),
         }
 
@@ -352,8 +431,14 @@ class Trainer:
             self.losses.smoothed = state["smoothed_loss"]
             old = self.gaussians
             self.gaussians = TrainableGaussians.load(
-                state["gaussians"], old.rates, old.spatial_scale, self.device, old.step_all
+                state["gaussians"],
+                old.rates,
+                old.spatial_scale,
+                self.device,
+                old.step_all,
+                old.optimizer,
             )
+            self.ideas.load_state_dict(state["ideas"])
             self.densifier.load_state_dict(state["densifier"], self.context)
             for name, rng in self.rngs.items():
                 rng.set_state(state["rngs"][name])

@@ -17,7 +17,7 @@ from gsbench.train.loss import PhotometricLoss
 from gsbench.words import readable_bytes
 
 # every random number of a training comes from one of these streams
-STREAMS = ("cameras", "densify")
+STREAMS = ("cameras", "densify", "ideas")
 
 
 def generators(seed: int) -> dict[str, torch.Generator]:

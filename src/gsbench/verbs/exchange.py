@@ -158,10 +158,11 @@ def export_results(name: str, runs: Path, out: Path | None, pictures: bool = Fal
     if file.is_dir():
         file = file / f"{name}.zip"
     with writable_output(file) if file == out else own_output(file):
-        left_out = write_archive(load_all_trials(runs, name), file, pictures)
+        left_out, still_open = write_archive(load_all_trials(runs, name), file, pictures)
     for line in left_out:
         log.warning("left out: %s", line)
-    print(f"{file}: results of {name}, {readable_bytes(file.stat().st_size)}")
+    facts = [f"results of {name}", readable_bytes(file.stat().st_size), still_open]
+    print(f"{file}: {', '.join(filter(None, facts))}")
 
 
 def check_form(out: Path) -> None:

@@ -7,19 +7,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from gsbench.analysis.cells import select_trials
-from gsbench.analysis.comparison import unused_trials
-from gsbench.analysis.notes import texts
 from gsbench.analysis.results import TrialResult, group_by
-from gsbench.analysis.verdict_words import reason, with_notes
+from gsbench.analysis.sentences import reason, with_notes
 from gsbench.app.command import one_trial_per_scene, run_trials
 from gsbench.claims import gate as gates
 from gsbench.claims.archive import unpack_archive
-from gsbench.claims.stopping import KeyAndSeed, finished_trials
+from gsbench.claims.stopping import Needed, finished_trials
 from gsbench.config.compose import Trial, with_seed
 from gsbench.errors import GsbenchError, InputError, TrainingError
 from gsbench.files import checked_runs_folder, make_runs_folder
-from gsbench.launch.record import declare_questions
-from gsbench.runs.experiments import trial_key
 from gsbench.verbs.arguments import ArgumentParser, add_question, add_where, path
 from gsbench.words import listed, printable
 
@@ -70,13 +66,11 @@ def _result(options: argparse.Namespace) -> str:
         archived = unpack_archive(options.archive, Path(folder)).trials
         baseline = _baseline(select_trials(archived, dict(options.where)), by_scene)
         seeds = _seeds(baseline, options.seeds)
-        arms = {
-            scene: (str(old[0].arm), by_scene[scene].folder.parent.name)
-            for scene, old in baseline.items()
-        }
-        declaration = gates.declare_gate(options.metric, options.least, arms, seeds, example.values)
+        question = gates.declare_gate(
+            options.metric, options.least, baseline, seeds, example.values
+        )
         trials = {
-            (trial_key(scene, arms[scene][1], gates.NEW), seed): with_seed(trial, seed)
+            (scene, gates.NEW, seed): with_seed(trial, seed)
             for scene, trial in by_scene.items()
             for seed in seeds
         }
@@ -84,13 +78,13 @@ def _result(options: argparse.Namespace) -> str:
         old = [trial for of_scene in baseline.values() for trial in of_scene if trial.seed in seeds]
 
         def new() -> list[TrialResult]:
-            return finished_trials(home, trials.values())
+            return finished_trials(trials.values())
 
-        asked = gates.ask_gate(declare_questions(home, declaration), lambda: old, new)
+        asked = gates.ask_gate(question, lambda: old, new)
 
-        def run(planned: Sequence[KeyAndSeed]) -> None:
+        def run(planned: Sequence[Needed]) -> None:
             try:
-                code = run_trials([trials[key] for key in planned if key in trials])
+                code = run_trials([trials[key] for key in planned if key in trials], asks=False)
             except InputError as error:  # code of a commit that cannot be imported, too
                 raise (TrainingError if options.bisect else InputError)(str(error)) from error
             if code:
@@ -99,14 +93,13 @@ def _result(options: argparse.Namespace) -> str:
                 )
 
         (verdict,) = asked.answer(run)
-        if verdict.answer is None and not verdict.equal:
+        if verdict.test is None and not verdict.equal:
             why = with_notes(reason(verdict), verdict)
             raise InputError(f"the versions cannot be compared: {why}")
         made = [*asked.read()]
-        left_out = texts(unused_trials(made, [verdict]))
-        new_trials = [trial for trial in made if trial.config_hash == gates.NEW]
+        new_trials = [trial for trial in made if trial.alias == gates.NEW]
         deviations = map(str, gates.deviations(old, new_trials))
-        print("\n".join([gates.describe(verdict), *left_out, *deviations]))
+        print("\n".join([gates.describe(verdict), *deviations]))
     return gates.result_of(verdict)
 
 

@@ -7,12 +7,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from gsbench.analysis.judgement import judge
 from gsbench.analysis.ledger_table import describe_ledger, difference_text, ledger_tables, why
-from gsbench.analysis.notes import texts
 from gsbench.analysis.results import read_experiment
 from gsbench.analysis.table_formats import to_markdown
-from gsbench.analysis.unfinished import unfinished
+from gsbench.analysis.verdicts import judge
 from gsbench.app.command import run_trials
 from gsbench.app.ledger_trials import (
     Trials,
@@ -26,15 +24,15 @@ from gsbench.app.ledger_trials import (
 from gsbench.claims import ledger as rules
 from gsbench.claims.gate import asked_difference
 from gsbench.claims.ledger import IDEAS, RATE
-from gsbench.claims.stopping import KeyAndSeed, finished_trials
-from gsbench.config.compose import Trial
+from gsbench.claims.stopping import Needed, finished_trials
 from gsbench.config.overrides import key_of
 from gsbench.errors import GsbenchError, InputError
 from gsbench.eval.options import EvalConfig
 from gsbench.files import checked_runs_folder, make_runs_folder
 from gsbench.runs import ledger as records
+from gsbench.runs.commands import Question
 from gsbench.runs.config_hash import config_hash
-from gsbench.runs.experiments import Declaration, make_home, stamp_now
+from gsbench.runs.experiments import make_home, stamp_now
 from gsbench.runs.layout import IN_RUNS, LEDGER
 from gsbench.runs.ledger import BASELINE, DROPPED, FAILED, KEPT, UNDECIDED, Ledger
 from gsbench.settings import OpenFraction, is_folder_name
@@ -205,7 +203,7 @@ def _start(
 
 def _screen(home: Path, book: Ledger, idea: str, trials: Trials) -> Ledger:
     """Compare the idea on the seeds of all ideas; write its result, or its test if it passes."""
-    ended = _answer(home, book, idea, rules.screening_of(book, idea), trials)
+    ended = _answer(book, idea, rules.screening_of(book, idea), trials)
 
     def make(now: Ledger) -> records.Entry | None:
         # A process that ran the same command may have been faster.
@@ -228,33 +226,31 @@ def _test(home: Path, book: Ledger, idea: str, trials: Trials) -> Ledger:
         test.seeds[-1],
         test.level,
     )
-    ended = _answer(home, book, idea, rules.test_of(book, idea), trials)
+    ended = _answer(book, idea, rules.test_of(book, idea), trials)
     return records.append(home, lambda now: None if now.is_decided(idea) else ended)
 
 
-def _answer(
-    home: Path, book: Ledger, idea: str, declaration: Declaration, trials: Trials
-) -> records.Ended:
+def _answer(book: Ledger, idea: str, question: Question, trials: Trials) -> records.Ended:
     """Train the idea and what it is compared with, look by look; the result, not yet written."""
     fails = ""
 
-    def run(planned: Sequence[KeyAndSeed]) -> None:
+    def run(planned: Sequence[Needed]) -> None:
         nonlocal fails
         try:
-            code = run_trials([trials[key] for key in planned])
+            code = run_trials([trials[key, seed] for _, key, seed in planned], asks=False)
         except GsbenchError as error:
             fails = str(error)
         else:
             fails = "its trials fail" if code else ""
 
-    asked = rules.ask_idea(declaration, lambda: finished_trials(home, trials.values()))
+    asked = rules.ask_idea(question, lambda: finished_trials(trials.values()))
     (verdict,) = asked.answer(run)
     tested = idea in book.tests
     if not fails or verdict.final:
         return rules.end_of(idea, verdict, stamp_now(), tested)
     of_idea = set(book.keys_of(idea).values())
     failed = {key for key, trial in trials.items() if trial.files.has_failed()}
-    measured = {trial.key for trial in finished_trials(home, trials.values())}
+    measured = {trial.key for trial in finished_trials(trials.values())}
     # An idea of which something is known cannot be tried anew as if it were not.
     if tested or of_idea & measured or not {key for key, _ in failed} <= of_idea:
         raise GsbenchError(f"{idea}: {fails}; to go on, give the same command again")
@@ -310,9 +306,10 @@ def _run_confirmation(
     rules.check_untouched(book, read_experiment(home).trials, asked)
     trials = {key: trial for of_idea in by_idea.values() for key, trial in of_idea.items()}
     _run_all(trials)
-    declaration = rules.confirmation_of(book.opened, asked)
-    done = finished_trials(home, trials.values())
-    verdicts = judge(done, declaration, unfinished(read_experiment(home)))
+    done = rules.named_by_key(finished_trials(trials.values()))
+    unfinished = [one.by_key for one in read_experiment(home).unfinished]
+    questions = rules.confirmation_of(book.opened, asked)
+    verdicts = [judge(done, question, unfinished) for question in questions]
 
     def make(now: Ledger) -> records.Confirmed | None:
         if now.confirmations[number][1] is not None:  # by a process that ran the same command
@@ -334,9 +331,7 @@ def show(options: argparse.Namespace, home: Path) -> int:
         values = {"opened": book.opened.to_json(), "ideas": ideas, "confirmations": confirmations}
         print(json.dumps(values | _left(book), indent=1))
         return 0
-    left_out = texts(rules.unused(book, trials))
-    tables = map(to_markdown, ledger_tables(book))
-    print("\n".join([*describe_ledger(book), "", *tables, *left_out]))
+    print("\n".join([*describe_ledger(book), "", *map(to_markdown, ledger_tables(book))]))
     return 0
 
 
@@ -359,8 +354,8 @@ ACTIONS = {  # with the options that each of them takes
 }
 
 
-def _run_all(trials: Mapping[KeyAndSeed, Trial]) -> None:
-    if code := run_trials(list(trials.values())):
+def _run_all(trials: Trials) -> None:
+    if code := run_trials(list(trials.values()), asks=False):
         raise (InputError if code == 2 else GsbenchError)("trials fail: nothing is confirmed")
 
 

@@ -11,14 +11,15 @@ from pydantic import PositiveFloat
 from gsbench.analysis.comparison import compare
 from gsbench.analysis.designs import Components, Design, estimate_components
 from gsbench.analysis.notes import texts
-from gsbench.analysis.pairing import BASELINE, pair
+from gsbench.analysis.pairs import BASELINE
 from gsbench.analysis.planning import COMMANDS, UNSURE, Plan, Purpose, make_plan
 from gsbench.analysis.quantities import Quantity, quantity
-from gsbench.analysis.results import TrialResult, load_experiment
+from gsbench.analysis.results import Arm, TrialResult, load_experiment
 from gsbench.analysis.statistics import MIN_SCENES
+from gsbench.analysis.verdicts import interval_of
 from gsbench.claims.ledger import GIVE_UP, IDEAS, RATE, SCREEN, level_of_test
 from gsbench.errors import InputError
-from gsbench.runs.experiments import ERROR_RATE, Question
+from gsbench.runs.commands import ERROR_RATE
 from gsbench.verbs.arguments import ArgumentParser, number, whole_number
 from gsbench.words import counted
 
@@ -28,8 +29,6 @@ MOST_QUESTIONS = 10_000
 PLANNED = {
     "sweep": "Planned for a sweep: each question errs in {:.3g} %; all seeds are judged at once.",
     "looks": "Planned for a sweep that stops when decided: each question errs in {:.3g} %.",
-    "check": "Planned for a check of claims: each claim errs in {:.3g} %. It is shown for each, "
-    "not for all at once.",
     "gate": "Planned for a gate: it calls a version worse that is worse by the difference.",
     "ledger": "Planned for a ledger: an idea is kept, at {:.3g} % with both sides, after a quarter "
     "of the ideas were tested and none was kept.",
@@ -53,8 +52,8 @@ def _parser() -> ArgumentParser:
         dest="command",
         choices=COMMANDS,
         default=COMMANDS[0],
-        help="what is planned: a sweep (the default), a sweep that stops when decided (looks), a "
-        "check of claims, a gate, or a ledger of ideas",
+        help="what is planned: a sweep (the default), a sweep that stops when decided (looks), "
+        "a gate, or a ledger of ideas",
     )
     parser.add_argument(
         "--questions",
@@ -80,7 +79,7 @@ def plan(argv: Sequence[str], runs: Path) -> int:
     """Run the verb; raises InputError for bad input."""
     options = _parser().parse_args(argv)
     experiment = load_experiment(runs, options.experiment)
-    comparison = compare(experiment, options.baseline)
+    comparison = compare(experiment, None if options.baseline == BASELINE else options.baseline)
     trials = comparison.trials
     metric = quantity(options.metric, trials)
     if metric.cost:
@@ -100,9 +99,8 @@ def plan(argv: Sequence[str], runs: Path) -> int:
     lines = [*comparison.sentences, *texts(comparison.remarks), *experiment.warnings]
     for baseline, arm in comparison.pairs:
         plans.append({"arm": str(arm), "baseline": str(baseline)})
-        question = Question(metric=metric.key, baseline=baseline, arm=arm)
         try:
-            components = _components(trials, question, metric)
+            components = _components(trials, baseline, arm, metric)
         except InputError as error:
             if len(comparison.pairs) == 1:  # with several, the others may be planned for
                 raise
@@ -126,10 +124,12 @@ def plan(argv: Sequence[str], runs: Path) -> int:
     return 0
 
 
-def _components(trials: Sequence[TrialResult], question: Question, metric: Quantity) -> Components:
-    """The variation of a question's differences; raises InputError if its trials cannot tell."""
-    paired = pair(trials, question)
-    arms = f"{question.baseline} and {question.arm}"
+def _components(
+    trials: Sequence[TrialResult], baseline: Arm, arm: Arm, metric: Quantity
+) -> Components:
+    """The variation of two arms' differences; raises InputError if their trials cannot tell."""
+    paired = interval_of(trials, baseline, arm, metric.key).pairs
+    arms = f"{baseline} and {arm}"
     if not paired.rows:
         reason = next(map(str, paired.left_out), "they share no scene and seed")
         raise InputError(f"no trials of {arms} can be paired in {metric.name}: {reason}")

@@ -7,17 +7,21 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from gsbench.analysis.addresses import CELL, trials_of_arm
 from gsbench.analysis.cells import (
     check_averageable,
     make_cell,
     select_trials,
+    side_by_side,
+    swept_settings,
     to_frame,
+    where_words,
     with_variants,
 )
 from gsbench.analysis.fairness import fairness_table
-from gsbench.analysis.pairing import BASELINE
+from gsbench.analysis.pairs import BASELINE
 from gsbench.analysis.paper import (
     layout_of,
     load_published,
@@ -43,6 +47,9 @@ from gsbench.runs.package_code import edited
 from gsbench.verbs.arguments import ArgumentParser, add_where, names, path
 from gsbench.words import some_of, split_outside_brackets
 
+if TYPE_CHECKING:
+    from gsbench.analysis.comparison import Comparison
+
 TRIALS, JSON = "trials", "json"
 FAIRNESS = "fairness"
 PAPER_NOTES = "paper"  # `gsbench tables paper` shows the paper's own inconsistencies
@@ -61,15 +68,22 @@ def tables(argv: Sequence[str], runs: Path) -> int:
         print("\n".join(f"- {line}" for line in load_published().contradictions))
         return 0
     experiment = load_experiment(runs, options.experiment)
+    other = None if options.other is None else load_experiment(runs, options.other)
+    if other is not None:
+        experiment, other = side_by_side(experiment, other)
     for warning in experiment.warnings:
         print(f"left out: {warning}", file=sys.stderr)
-    trials = select_trials(experiment.trials, dict(options.where))
-    if options.format == JSON:
-        texts = _verdicts(experiment, options)
-    elif options.format == TRIALS:
+    where = dict(options.where)
+    trials = select_trials([*experiment.trials, *(other.trials if other else ())], where)
+    if options.format == TRIALS:
         texts = _trials(trials, options)
     else:
-        texts = _tables(experiment, trials, options)
+        comparison = _comparison([experiment, *([other] if other else [])], trials, where)
+        if options.format == JSON:
+            _refuse_options_of_tables(options, f"--format {JSON} shows the verdicts")
+            texts = {f".{JSON}": json.dumps(comparison.to_json(), indent=1) + "\n"}
+        else:
+            texts = _tables(comparison, trials, options)
     _write(texts, options.out, experiment.name)
     return 0
 
@@ -83,13 +97,15 @@ def _format_of(out: Path | None) -> str:
     return "md"
 
 
-def _verdicts(experiment: Experiment, options: argparse.Namespace) -> dict[str, str]:
-    """The verdicts as JSON. Raises InputError for options that only a table has."""
+def _comparison(
+    experiments: Sequence[Experiment], trials: Sequence[TrialResult], where: Mapping[str, str]
+) -> "Comparison":
+    """The verdicts of one experiment or two, about the chosen trials."""
     # here, since SciPy is slow to import
-    from gsbench.analysis.comparison import compare
+    from gsbench.analysis.comparison import chosen, compare, joined
 
-    _refuse_options_of_tables(options, f"--format {JSON} shows the verdicts")
-    return {f".{JSON}": json.dumps(compare(experiment).to_json(), indent=1) + "\n"}
+    comparison = joined([compare(experiment) for experiment in experiments])
+    return chosen(comparison, trials, where_words(where)) if where else comparison
 
 
 def _refuse_options_of_tables(options: argparse.Namespace, what: str) -> None:
@@ -105,21 +121,23 @@ def _trials(trials: Sequence[TrialResult], options: argparse.Namespace) -> dict[
 
 
 def _tables(
-    experiment: Experiment, trials: Sequence[TrialResult], options: argparse.Namespace
+    comparison: "Comparison", trials: Sequence[TrialResult], options: argparse.Namespace
 ) -> dict[str, str]:
     """The texts of the tables, by the ending of their file's name."""
-    layout, metrics = options.layout, options.metrics
+    experiment, layout, metrics = comparison.experiment, options.layout, options.metrics
     if layout is None and options.rows is None and options.columns is None:
         layout = layout_of(experiment.name)
     if layout == FAIRNESS:
-        return _fairness_sheets(experiment, options.format)
+        return _fairness_sheets(comparison, options.format)
     if layout in (None, "plain"):
         rows, columns = options.rows, options.columns or ()
         if both := sorted(set(rows or ()) & set(columns)):
             raise InputError(f"{', '.join(both)} is in --rows and --columns: choose one")
-        tables = [build_table(experiment, trials, rows, columns, metrics)]
+        if options.other is not None and rows is None:
+            rows = (*DEFAULT_ROWS, "experiment", *swept_settings(trials))
+        tables = [build_table(experiment, trials, rows, columns, metrics, comparison=comparison)]
     else:
-        tables = paper_tables(experiment, layout, trials, metrics)
+        tables = paper_tables(experiment, layout, trials, metrics, comparison)
     suffix, writer = FORMATS[options.format]
     named = dict(zip(("", "-difference"), with_agreement(tables), strict=False))
     if options.paper is not None:
@@ -127,22 +145,18 @@ def _tables(
     return {f"{end}.{suffix}": writer(table) for end, table in named.items()}
 
 
-def _fairness_sheets(experiment: Experiment, format_name: str) -> dict[str, str]:
-    """The fairness sheets of all compared pairs of arms, from all trials of the experiment."""
-    # here, since SciPy is slow to import
-    from gsbench.analysis.comparison import pair_arms
-
-    arms = pair_arms(experiment)
-    trials, pairs = arms.trials, arms.pairs
-    if not pairs:
+def _fairness_sheets(comparison: "Comparison", format_name: str) -> dict[str, str]:
+    """The fairness sheets of all compared pairs of arms."""
+    experiment = comparison.experiment
+    if not comparison.pairs:
         raise InputError(
             f"experiment {experiment.name} has one arm, so there is nothing to compare"
         )
     suffix, writer = FORMATS[format_name]
     sheets = {}
-    for first, second in pairs:
+    for first, second in comparison.pairs:
         end = f"-{FAIRNESS}-{_as_file(second)}-{_as_file(first)}.{suffix}"
-        sheets[end] = writer(fairness_table(trials, first, second, experiment.older))
+        sheets[end] = writer(fairness_table(comparison.trials, first, second, experiment.older))
     return sheets
 
 
@@ -161,6 +175,7 @@ def _tables_parser() -> ArgumentParser:
         help="its name (without one: lists them); table1, table2 and their _own look as in the "
         "paper, with its values",
     )
+    parser.add_argument("other", nargs="?", help="another one, beside it on the same scenes")
     parser.add_argument(
         "--format",
         choices=[*FORMATS, TRIALS, JSON],
@@ -246,7 +261,7 @@ def report(argv: Sequence[str], runs: Path) -> int:
     output = writable_output if options.out in (None, file) else own_output
     for warning in experiment.warnings:
         print(f"left out: {warning}", file=sys.stderr)
-    text = build_report(experiment, options.baseline or BASELINE, dict(options.where))
+    text = build_report(experiment, options.baseline, dict(options.where))
     with output(file):
         write_text(file, text)
     print(file)
@@ -345,8 +360,6 @@ def _origin(trial: TrialResult) -> dict[str, str]:
         origin["machine"] = machine
     if code := trial.code_texts:
         origin["code"] = ", ".join(code)
-    if edits := trial.edits:
-        origin["since"] = "; ".join(map(str, edits))
     if record.code.commit:
         origin["commit"] = f"{record.code.commit}{', edited' if record.code.edited else ''}"
     packages = record.code.packages

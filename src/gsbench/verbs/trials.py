@@ -25,14 +25,15 @@ from gsbench.launch.dry_run import describe_plan
 from gsbench.launch.progress import Progress, progress_of
 from gsbench.launch.record import remove
 from gsbench.launch.states import TrialState, label_of, names_of, states_of_experiment
+from gsbench.runs.commands import PlannedTrial, drop
 from gsbench.runs.experiments import experiment_home, list_experiments, trial_folders
-from gsbench.runs.plan import PlannedTrial, change_plan
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS
 from gsbench.runs.user_code import PERMISSIONS
 from gsbench.system.own_modules import allow_modules
-from gsbench.tracking.tracker_run import MirrorError
-from gsbench.tracking.tracker_run import sync as send_missing
+from gsbench.tracking.beside import end_with
+from gsbench.tracking.sync import MirrorError
+from gsbench.tracking.sync import sync as send_missing
 from gsbench.verbs.arguments import ArgumentParser
 from gsbench.words import counted, readable_time
 
@@ -83,7 +84,7 @@ def status(argv: Sequence[str], runs: Path) -> int:
         return 0
     if options.forget:
         missing = [trial.folder for trial in trials if trial.state == "missing"]
-        change_plan(home, dropped=missing)
+        drop(home, missing)
         print(f"{counted(len(missing), 'trial')} removed from the plan")
         return 0
     if options.json:
@@ -240,7 +241,7 @@ def retry(argv: Sequence[str], runs: Path) -> int:
             TrialFolder(old.folder).label,
         )
     code = run_trials(trials)
-    change_plan(home, dropped=[old.folder for old in replaced if old.planned is not None])
+    drop(home, [old.folder for old in replaced if old.planned is not None])
     return code
 
 
@@ -257,8 +258,8 @@ def recompose(
             # relative paths were meant from there, and the trials are run from there
             os.chdir(planned.cwd)
         replaced = {PERMISSIONS, *map(key_of, changes)}
-        kept = [word for word in planned.overrides if key_of(word) not in replaced]
-        added = set(changes) - set(planned.overrides)
+        kept = [word for word in planned.words if key_of(word) not in replaced]
+        added = set(changes) - set(planned.words)
         if any(change.startswith("launch=") for change in added):
             # Planned settings of a launcher were meant for the other one.
             kept = [word for word in kept if not word.startswith("launch.")]
@@ -295,18 +296,31 @@ def sync(argv: Sequence[str], runs: Path) -> int:
         "--uri",
         help="such as http://127.0.0.1:5000; default: $MLFLOW_TRACKING_URI, or the runs folder's",
     )
+    parser.add_argument(
+        "--trial",
+        action="append",
+        metavar="SCENE/ARM/FOLDER",
+        help="only this trial of the experiment (repeatable)",
+    )
+    parser.add_argument(
+        "--beside", type=int, metavar="PID", help="end soon after this process has ended"
+    )
     options = parser.parse_args(argv)
     words = [options.experiment or "", *options.permissions]
     experiment = "" if "=" in words[0] else words.pop(0)
     if unread := [word for word in words if key_of(word) != PERMISSIONS]:
         raise InputError(f"sync reads only {PERMISSIONS}, not {unread[0]}")
     allow_modules(allowed := typed_permissions(words))
+    if options.beside:
+        end_with(options.beside)
     names = [experiment] if experiment else list_experiments(runs)
     homes = [experiment_home(runs, name) for name in names]
     try:
         folders: list[TrialFolder] = []
         for home in homes:
-            folders += [TrialFolder(Path(place)) for place in sorted(trial_folders(home))]
+            places = [TrialFolder(Path(place)) for place in sorted(trial_folders(home))]
+            wanted = {str(home / trial) for trial in options.trial or ()}
+            folders += [one for one in places if not wanted or str(one.path) in wanted]
         for line in send_missing(folders, options.uri, allowed):
             print(line, flush=True)
     except (MirrorError, OSError) as error:

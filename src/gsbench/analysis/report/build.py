@@ -8,26 +8,28 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from gsbench.analysis import verdict_words
-from gsbench.analysis.cells import select_trials
-from gsbench.analysis.comparison import VERDICT, compare
+from gsbench.analysis import sentences
+from gsbench.analysis.cells import select_trials, where_words
+from gsbench.analysis.comparison import Answer, chosen, compare
+from gsbench.analysis.designs import seeds_needed
 from gsbench.analysis.differences import between_scenes_notes
 from gsbench.analysis.fairness import caveats, counts_notes, fairness_table, limit_notes
 from gsbench.analysis.images import choose_views, png_uri
-from gsbench.analysis.judgement import Verdict
 from gsbench.analysis.ledger_table import describe_ledger, ledger_tables
 from gsbench.analysis.notes import texts
-from gsbench.analysis.pairing import BASELINE, pair_trials
+from gsbench.analysis.pairs import pair_trials
 from gsbench.analysis.paper import layout_of, load_published, paper_tables
 from gsbench.analysis.quantities import COSTS, choose_quantities, relative_change
 from gsbench.analysis.ranks import rank_all
 from gsbench.analysis.report.charts import ForestRow, forest_plot, line_chart, rank_plot
 from gsbench.analysis.report.curves import event_charts, event_table, training_charts
+from gsbench.analysis.report.quality import quality_charts
+from gsbench.analysis.report.sweeps import sweep_charts
 from gsbench.analysis.report.volumes import volume_charts
 from gsbench.analysis.results import Experiment, TrialResult, group_by, trials_of
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry, fill
 from gsbench.analysis.tables import build_table, with_agreement
-from gsbench.analysis.verdicts import PairVerdicts, seeds_to_resolve
+from gsbench.analysis.verdicts import Verdict
 from gsbench.errors import InputError
 from gsbench.eval.facts import find_metric
 from gsbench.parsing import read_if_sound
@@ -42,27 +44,27 @@ COSTS_COMPARED = ("gaussians", "train_time")
 
 def build_report(
     experiment: Experiment,
-    baseline: str = BASELINE,
+    baseline: str | None = None,
     where: Mapping[str, str] = MappingProxyType({}),
 ) -> str:
-    """The report as HTML, from files alone; every densifier is compared with ``baseline``.
+    """The report as HTML, from files alone.
 
-    With ``where`` (`select_trials`) it shows only these trials and their arms. The verdicts stay
-    those of all trials: the choice may have been made after seeing results. Raises InputError if
-    no trial is left.
+    With ``baseline``, a densifier, all others are shown against it, without a test.
+
+    With ``where`` (`select_trials`) it shows only these trials. Verdicts that lose trials by it are
+    intervals: the choice may have been made after seeing results. Raises InputError if no trial is
+    left.
     """
     comparison = compare(experiment, baseline)
     trials = select_trials(comparison.trials, where)
-    shown = {trial.arm for trial in trials}
-    judged = [answer for answer in comparison.answers if {answer.first, answer.second} <= shown]
-    pairs = [pair for pair in comparison.pairs if set(pair) <= shown]
-    chosen = ", ".join(f"{key}={values}" for key, values in where.items())
+    if where:
+        comparison = chosen(comparison, trials, where_words(where))
     arms = sorted({trial.arm for trial in trials})
     paper_table = layout_of(experiment.name)
     if paper_table is None:
-        tables = [build_table(experiment, trials if where else None)]
+        tables = [build_table(experiment, trials, comparison=comparison)]
     else:
-        tables = paper_tables(experiment, paper_table, trials if where else None)
+        tables = paper_tables(experiment, paper_table, trials, comparison=comparison)
     volumes, volume_notes = volume_charts(trials, arms)
     return fill(
         "report.html.j2",
@@ -73,20 +75,29 @@ def build_report(
         scenes=sorted({trial.scene for trial in trials}),
         seeds=experiment.seeds,
         trials=trials,
-        versus=[compare_arms(trials, own, experiment.older) for own in judged],
+        versus=[compare_arms(trials, own, experiment.older) for own in comparison.answers],
         ledger=show_ledger(experiment.folder),
-        declared=texts([*comparison.declared_notes, *verdict_words.families(judged)]),
-        unused=[*([CHOSEN.format(chosen)] if where else []), *texts(comparison.remarks)],
-        tables=[_without_verdicts(table) for table in with_agreement(tables)],
+        risk=comparison.risk,
+        sweeps=sweep_charts(comparison),
+        unused=texts(comparison.remarks),
+        # the top of the page has the verdicts
+        tables=[replace(table, verdicts=()) for table in with_agreement(tables)],
         ranks=[
-            rank_plot(ranking) for ranking in rank_all(trials, choose_quantities(trials)) if pairs
+            rank_plot(ranking)
+            for ranking in rank_all(trials, choose_quantities(trials))
+            if comparison.answers
         ],
         contradictions=[] if paper_table is None else load_published().contradictions,
         search=search_summary(experiment.folder),
-        say=verdict_words,
+        say=sentences,
         seeds_to_resolve=seeds_to_resolve,
         signed=lambda value, decimals: "–" if value is None else signed(value, f".{decimals}f"),
-        training=training_charts(trials, arms),
+        training=[
+            *quality_charts(
+                trials, dict.fromkeys(one.verdict.quantity for one in comparison.answers)
+            ),
+            *training_charts(trials, arms),
+        ],
         event_table=event_table(trials, arms),
         events=event_charts(trials, arms),
         volumes=volumes,
@@ -96,15 +107,6 @@ def build_report(
         warnings=experiment.warnings,
         left_out=experiment.left_out,
     )
-
-
-CHOSEN = "Tables, curves and pictures show only trials with {}; verdicts rest on all trials."
-
-
-def _without_verdicts(table: Table) -> Table:
-    """The table without the notes on verdicts, which the top of the page has."""
-    notes = [note for note in table.notes if not note.startswith(VERDICT)]
-    return replace(table, notes=tuple(notes))
 
 
 def trial_figures(trials: Sequence[TrialResult]) -> list[tuple[str, str]]:
@@ -124,19 +126,21 @@ def trial_figures(trials: Sequence[TrialResult]) -> list[tuple[str, str]]:
 
 
 def compare_arms(
-    trials: Sequence[TrialResult], judged: PairVerdicts, older: Sequence[TrialResult]
+    trials: Sequence[TrialResult], judged: Answer, older: Sequence[TrialResult]
 ) -> dict[str, Any]:
     """Everything that the page shows of two arms; notes say what could not be compared or read.
 
     ``older`` are the trials of earlier code.
     """
-    first, second = judged.first, judged.second
+    first, second = judged.baseline, judged.arm
+    verdicts = [judged.verdict, *judged.metrics]
     baseline, other = trials_of(trials, first), trials_of(trials, second)
     views, faults = choose_views(pair_trials(trials, first, second))
     return {
         "judged": judged,
         "title": f"{second} against {first}",
-        "has_like_these": any(verdict.like_these is not None for verdict in judged.verdicts),
+        "verdicts": verdicts,
+        "has_like_these": judged.verdict.like_these is not None,
         "caveats": " ".join(
             texts(
                 [
@@ -148,10 +152,20 @@ def compare_arms(
         ),
         "fairness": fairness_table(trials, first, second, older),
         "facts": [*_costs(baseline, other), *between_scenes_notes(baseline, other)],
-        "forests": [_forest(verdict) for verdict in judged.verdicts],
+        "forests": [_forest(verdict) for verdict in verdicts],
         "views": views,
-        "notes": texts([*judged.notes, *faults]),
+        "notes": texts([*judged.verdict.notes, *faults]),
     }
+
+
+def seeds_to_resolve(verdict: Verdict) -> int | None:
+    """The number of seeds that would resolve the worthwhile difference.
+
+    None if that is unknown, or if there would be too many to run.
+    """
+    if verdict.deviation is None or verdict.quantity.worthwhile is None:
+        return None
+    return seeds_needed(verdict.deviation, len(verdict.scenes), verdict.quantity.worthwhile)
 
 
 def show_ledger(folder: Path) -> dict[str, Any] | None:

@@ -6,18 +6,21 @@ write the elements.
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from statistics import median
+from types import MappingProxyType
 
 from gsbench.analysis.ranks import Ranking
+from gsbench.analysis.sentences import p_text
 from gsbench.analysis.statistics import Interval
 from gsbench.analysis.table_formats import fill
-from gsbench.analysis.verdict_words import p_text
 from gsbench.words import true_minus
 
 WIDTH, HEIGHT = 380, 250  # px at full size; text is 12 px
 LEFT, RIGHT, TOP, BOTTOM = 58, 18, 26, 44  # margins
 FOREST_LEFT, FOREST_TOP, FOREST_ROW = 132, 12, 26
+STRETCH = 3.0  # times the median reach of its rows, beyond which intervals of a forest are cut
 # distinct for colour-blind readers
 COLORS = ("#4477aa", "#cc3311", "#228833", "#aa3377", "#b8860b", "#0099a8")
 DASHES = ("", "6 3", "2 3", "8 3 2 3", "1 2", "10 4")
@@ -49,10 +52,14 @@ def line_chart(
     y_label: str,
     log: bool = False,
     marker: float | None = None,
+    log_x: bool = False,
+    bars: Mapping[float, Interval] = MappingProxyType({}),
+    level: tuple[float, str] | None = None,
 ) -> str:
     """Named lines over common axes, linear or logarithmic (``log``); "" without points.
 
-    ``marker`` is the x of a vertical line. Points that a logarithmic axis cannot show are dropped.
+    ``marker`` is the x of a vertical line, ``level`` the y of a named horizontal one, ``bars`` are
+    intervals of y by x. Points that a logarithmic axis cannot show are dropped.
     """
     shown = [
         (name, [(x, y) for x, y in points if not log or (x > 0 and y > 0)])
@@ -63,9 +70,14 @@ def line_chart(
         return ""
     all_points = [point for _, points in shown for point in points]
     x = Axis(
-        [x for x, _ in all_points] + ([] if marker is None else [marker]), log, LEFT, WIDTH - RIGHT
+        [x for x, _ in all_points] + ([] if marker is None else [marker]),
+        log or log_x,
+        LEFT,
+        WIDTH - RIGHT,
     )
-    y = Axis([y for _, y in all_points], log, HEIGHT - BOTTOM, TOP)
+    heights = [y for _, y in all_points] + ([] if level is None else [level[0]])
+    heights += [end for bar in bars.values() for end in (bar.low, bar.high)]
+    y = Axis(heights, log, HEIGHT - BOTTOM, TOP)
     lines = [
         {
             "name": name,
@@ -92,6 +104,8 @@ def line_chart(
         x_label=x_label,
         y_label=y_label,
         marker=marked,
+        bars=[(x.to_px(at), y.to_px(bar.low), y.to_px(bar.high)) for at, bar in bars.items()],
+        level=None if level is None else (y.to_px(level[0]), level[1]),
         width=WIDTH,
         height=HEIGHT,
         few=TICKS,
@@ -99,14 +113,24 @@ def line_chart(
 
 
 def forest_plot(title: str, rows: Sequence[ForestRow], x_label: str, better: int) -> str:
-    """Differences with intervals, one per row, and a line at 0; ``better`` is a gain's sign."""
+    """Differences with intervals, one per row, and a line at 0; ``better`` is a gain's sign.
+
+    An interval much wider than the others is cut, so that it does not stretch the axis.
+    """
     if not rows:
         return ""
-    intervals = [row.interval for row in rows if row.interval is not None]
-    ends = [
-        0.0,
-        *(row.mean for row in rows),
-        *(end for interval in intervals for end in (interval.low, interval.high)),
+    reach = [
+        max(map(abs, (row.mean, row.interval.low, row.interval.high)))
+        for row in rows
+        if row.interval
+    ]
+    most = max([STRETCH * median(reach or [0.0]), *(abs(row.mean) for row in rows)])
+    ends = [0.0, *(row.mean for row in rows)]
+    ends += [
+        min(max(end, -most), most)
+        for row in rows
+        if row.interval
+        for end in (row.interval.low, row.interval.high)
     ]
     words = [
         f"{row.label} {short_number(row.mean)}"
@@ -123,7 +147,7 @@ def forest_plot(title: str, rows: Sequence[ForestRow], x_label: str, better: int
         title=title,
         words=f"{title}. {x_label}. {'; '.join(words)}.",
         rows=[
-            (FOREST_TOP + FOREST_ROW * (k + 0.5), row, row.color(better))
+            (FOREST_TOP + FOREST_ROW * (k + 0.5), row, row.color(better), _cut(row, most))
             for k, row in enumerate(rows)
         ],
         x=Axis(ends, False, FOREST_LEFT, WIDTH - RIGHT, ticks=3),
@@ -133,6 +157,13 @@ def forest_plot(title: str, rows: Sequence[ForestRow], x_label: str, better: int
         top=FOREST_TOP,
         bottom=bottom,
     )
+
+
+def _cut(row: ForestRow, most: float) -> tuple[float, float] | None:
+    """The ends of a row's interval, at most ``most`` from 0; None without an interval."""
+    if row.interval is None:
+        return None
+    return max(row.interval.low, -most), min(row.interval.high, most)
 
 
 RANK_TOP, GROUP_STEP = 44, 9  # px: rows of a rank plot begin here; between the bars of its groups

@@ -24,13 +24,13 @@ from gsbench.logs import progress
 from gsbench.pipeline.steps.scene import Views
 from gsbench.runs.keys import TRAIN, Step, options_of, rasterizer_inputs, step_of
 from gsbench.runs.layout import LINEAGE, POINT_CLOUD, TRAINING
-from gsbench.runs.trial_record import InitialCloud
+from gsbench.runs.trial_record import InitialCloud, Oddity
 from gsbench.scene.types import Capture
 from gsbench.system.compile_clock import CLOCK
 from gsbench.system.install import own_checkout
 from gsbench.system.machine import describe_machine
 from gsbench.system.resources import peak_memory_mb, reset_peak_memory
-from gsbench.train.options import WITHOUT_EFFECT_ON_MODEL
+from gsbench.train.options import IDEAS, WITHOUT_EFFECT_ON_MODEL
 from gsbench.train.start import check_start
 from gsbench.train.trainer import Status, Trainer
 
@@ -50,8 +50,19 @@ def train_step(views: Views, parts: Parts) -> Step:
     assert isinstance(densifier, Densifier)
     device, snapshot_at, user = parts.device, parts.measured_earlier, parts.user_code
     effective = dataclasses.asdict(options)
-    for name in WITHOUT_EFFECT_ON_MODEL:
+    for name in (*WITHOUT_EFFECT_ON_MODEL, *IDEAS):
         del effective[name]
+    ideas = parts.ideas
+    effective |= {
+        name: options_of("train", part, user, f"train.{name}")
+        for name in ("loss", "schedule", "optimizer")
+        if (part := getattr(ideas, name)) is not None
+    }
+    if ideas.terms:
+        effective["terms"] = [
+            {"weight": one.weight} | options_of("train", one.term, user, f"train.terms.{number}")
+            for number, one in enumerate(ideas.terms)
+        ]
     inputs: dict[str, Any] = {
         "scene": views.inputs,
         "init": views.init.key,
@@ -69,7 +80,7 @@ def train_step(views: Views, parts: Parts) -> Step:
         _log_normalization(views.capture, densifier)
         points, colors = initial.means.double().cpu().numpy(), dc_to_bytes(initial.sh_dc)
         start = check_points(points, colors, views, parts)
-        trainer = Trainer(scene, initial, densifier, rasterizer, options, seed, snapshot_at)
+        trainer = Trainer(scene, initial, densifier, rasterizer, options, seed, snapshot_at, ideas)
         reset_peak_memory(device)
         with progress("train") as report:
 
@@ -95,11 +106,14 @@ def train_step(views: Views, parts: Parts) -> Step:
 
 def check_points(
     points: NDArray[np.float64], colors: NDArray[np.uint8], views: Views, parts: Parts
-) -> InitialCloud:
+) -> tuple[InitialCloud, tuple[Oddity, ...]]:
     """Check the points that training starts from against the training views (`check_start`)."""
     # A user's initialiser may lack the attribute.
     is_random = getattr(parts.initializer, "random_points", False)
-    return check_start(points, colors, views.scene, is_random, views.capture.normalization)
+    capture = views.capture
+    return check_start(
+        points, colors, views.scene, is_random, capture.normalization, capture.accept
+    )
 
 
 def _log_normalization(capture: Capture, densifier: Densifier) -> None:
@@ -129,7 +143,7 @@ def write_training(
     lineage: Lineage | None,
     views: Views,
     device: torch.device,
-    start: InitialCloud,
+    start: tuple[InitialCloud, tuple[Oddity, ...]],
 ) -> None:
     """Write a trained model's lineage, and the ``summary`` of the training with more facts."""
     if lineage is not None:
@@ -138,7 +152,8 @@ def write_training(
     facts = {
         "causes": {} if lineage is None else lineage.causes_of_living(),
         "scene_extent": views.scene.extent / views.capture.normalization.scale,
-        "initial_cloud": start.to_json(),
+        "initial_cloud": start[0].to_json(),
+        "oddities": [odd.to_json() for odd in start[1]],
         "machine": describe_machine(device),
         "checkout": own_checkout(),
     }

@@ -1,6 +1,6 @@
 """Adam (Kingma and Ba 2015, algorithm 1) for rows of parameters, 16 numbers at a time.
 
-The two factors of a step are those of `gsbench.gaussians.trainable.AdamState.factors`.
+The two factors of a step are those of `gsbench.gaussians.trainable.ParameterState.factors`.
 """
 
 import numpy as np

@@ -75,7 +75,7 @@ class AdamStep(NamedTuple):
 
     first: Parameters  # moments
     second: Parameters
-    # [6, 2] of each parameter, `AdamState.factors`; [0, 2]: no step
+    # [6, 2] of each parameter, `ParameterState.factors`; [0, 2]: no step
     factors: NDArray[np.float32]
     active: int  # columns of ``sh_rest`` that can have a gradient
 

@@ -1,0 +1,177 @@
+"""Train the paper's tables in small over several days and machines, in a clone of one commit.
+
+    python findings/scripts/paper_tables.py train CLONE EXPERIMENT
+    python findings/scripts/paper_tables.py save CLONE EXPERIMENT
+
+``CLONE`` is a checkout of the commit that the page names, with its own environment in ``.venv``.
+``train`` first unpacks ``findings/archives/EXPERIMENT.zip`` into ``$GSBENCH_RUNS``, if nothing of
+the experiment is there. It then trains one after the other what has no result yet, and can be
+killed and started again at any time. ``save`` writes the archive, with all trials so far, and
+beside it what archives lack and a machine that is gone cannot tell: ``EXPERIMENT.csv`` (CPU time,
+the share of volumes below V_th) and ``EXPERIMENT_regions.npz`` (the mean squared errors of regions
+of 32 px by trial and view, `gsbench.analysis.regions`).
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import re
+import resource
+import subprocess
+import sys
+import zipfile
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from gsbench.analysis.regions import region_errors
+
+FINDINGS = Path(__file__).resolve().parents[1]
+LINE = re.compile(r"^(\w+) +(?P<scene>\S+?)/\S+-(?P<densify>\S+) seed (?P<seed>\d+) \(\w+\)")
+THRESHOLD = 0.03  # V_th of the paper
+PAGE = FINDINGS / "paper_tables.md"
+STATE, END = "<!-- state -->", "<!-- end -->"
+PICTURES = ("renders", "ground_truth")
+MEASURED = "measured_here.csv"  # in the experiment's folder: CPU time of each training
+FIELDS = ("trial", "cpu_seconds", "gaussians", "share_below_threshold")
+
+
+def gsbench(clone: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    """Run the clone's gsbench; its output is returned only if it is not written to a log."""
+    return subprocess.run(
+        [clone / ".venv/bin/gsbench", *words], cwd=clone, check=False, text=True, stdout=-1
+    )
+
+
+def words_of(clone: Path, experiment: str) -> list[str]:
+    return [f"hydra.searchpath=['file://{clone}/findings']", f"+experiment={experiment}"]
+
+
+def missing(clone: Path, experiment: str) -> list[re.Match[str]]:
+    """The trials without a result, in the order of the experiment's file."""
+    listed = gsbench(clone, *words_of(clone, experiment), "--dry-run").stdout.splitlines()
+    lines = [found for line in listed if (found := LINE.match(line))]
+    return [found for found in lines if found[1] != "done"]
+
+
+def train(clone: Path, experiment: str) -> None:
+    home = Path(os.environ["GSBENCH_RUNS"]) / experiment
+    archive = FINDINGS / "archives" / f"{experiment}.zip"
+    if archive.exists() and not home.exists():
+        code = "import sys, pathlib; from gsbench.claims.archive import unpack_archive;"
+        code += "unpack_archive(*map(pathlib.Path, sys.argv[1:]))"
+        python = clone / ".venv/bin/python"
+        subprocess.run([python, "-c", code, archive, home.parent], check=True)
+    while todo := missing(clone, experiment):
+        first, before = todo[0], resource.getrusage(resource.RUSAGE_CHILDREN)
+        print(f"{len(todo)} trials to go: {first[0]}", flush=True)
+        one = [f"scene.path={os.environ['GSBENCH_DATA']}/{first['scene']}"]
+        one += [f"seed={first['seed']}", f"densify={first['densify']}"]
+        done = gsbench(clone, *words_of(clone, experiment), *one)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        spent = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+        trial = f"{first['scene']}-{first['densify']}-{first['seed']}"
+        with (home / MEASURED).open("a") as stream:
+            stream.write(f"{trial},{spent:.0f}\n")
+        if done.returncode:
+            sys.exit(done.returncode)
+
+
+def share_below(model: Path) -> tuple[int, float]:
+    """How many Gaussians a PLY of 3DGS has, and the share with a volume of at most V_th.
+
+    The volume is that of eq. 5 of the paper: 4/3 π times the three scales.
+    """
+    from plyfile import PlyData
+
+    vertex = PlyData.read(model)["vertex"]
+    volumes = (
+        4 / 3 * np.pi * np.exp(sum(vertex[f"scale_{axis}"].astype(float) for axis in range(3)))
+    )
+    return len(volumes), float((volumes <= THRESHOLD).mean())
+
+
+def regions_of(folder: Path) -> dict[str, NDArray[np.float32]]:
+    """The errors of the regions of a trial's test views, by view."""
+    found = {}
+    for path in sorted((folder / "renders").glob("*.png")):
+        pair = (np.asarray(Image.open(folder / kind / path.name)) for kind in PICTURES)
+        found[path.stem] = region_errors(*pair).astype(np.float32)
+    return found
+
+
+def save(clone: Path, experiment: str) -> None:
+    home = Path(os.environ["GSBENCH_RUNS"]) / experiment
+    archives = FINDINGS / "archives"
+    exported = gsbench(
+        clone, "export", "--results", experiment, "--out", str(archives / f"{experiment}.zip")
+    )
+    print(exported.stdout, end="")
+    table, maps = archives / f"{experiment}.csv", archives / f"{experiment}_regions.npz"
+    rows = dict[str, dict[str, str]]()
+    if table.exists():
+        with table.open() as stream:
+            rows = {row["trial"]: row for row in csv.DictReader(stream)}
+    regions = dict(np.load(maps)) if maps.exists() else {}
+    spent = Counter[str]()  # a training that was killed and continued has several lines
+    if (home / MEASURED).exists():
+        for line in (home / MEASURED).read_text().split():
+            trial, seconds = line.split(",")
+            spent[trial] += int(seconds)
+    for results in sorted(home.glob("*/*/*-seed*/results.json")):
+        scene, arm, trial = results.relative_to(home).parts[:3]
+        name = f"{scene}-{arm.partition('-')[2]}-{trial.partition('-seed')[2]}"
+        model = results.parent / "point_cloud.ply"
+        if model.exists():  # else it was trained elsewhere, and is in the files already
+            count, share = share_below(model)
+            values = (name, str(spent.get(name, "")), str(count), f"{share:.6f}")
+            rows[name] = dict(zip(FIELDS, values, strict=True))
+            of_views = regions_of(results.parent)
+            regions |= {f"{name}/{view}": errors for view, errors in of_views.items()}
+    with table.open("w", newline="") as stream:
+        writer = csv.DictWriter(stream, FIELDS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows.values())
+    np.savez_compressed(maps, **regions)
+    PAGE.write_text(with_state(PAGE.read_text(encoding="utf-8"), experiment), encoding="utf-8")
+
+
+def state_table(experiment: str) -> str:
+    """The page's table of all trials in the archive."""
+    archives = FINDINGS / "archives"
+    with zipfile.ZipFile(archives / f"{experiment}.zip") as archive:
+        lines = archive.read("results.jsonl").splitlines()
+    with (archives / f"{experiment}.csv").open() as stream:
+        beside = {row["trial"]: row for row in csv.DictReader(stream)}
+    table = ["| trial | PSNR | SSIM | LPIPS VGG raw | Gaussians | volumes ≤ V_th | CPU-s |"]
+    table += ["|---|--:|--:|--:|--:|--:|--:|"]
+    for trial in sorted((json.loads(line)["results"] for line in lines), key=_order):
+        own = beside[f"{trial['scene']}-{trial['densify']}-{trial['seed']}"]
+        psnr, ssim, lpips = (trial["metrics"][key] for key in ("psnr", "ssim", "lpips_vgg_raw"))
+        share = 100 * float(own["share_below_threshold"])
+        table.append(
+            f"| {trial['scene']}, {trial['densify']}, seed {trial['seed']} | {psnr:.2f} | "
+            f"{ssim:.3f} | {lpips:.4f} | {trial['num_gaussians']:,} | {share:.2f} % | "
+            f"{own['cpu_seconds'] or '–'} |"
+        )
+    return "\n".join(table) + "\n"
+
+
+def _order(trial: dict[str, Any]) -> tuple[str, int, str]:
+    return trial["scene"], trial["seed"], trial["densify"]
+
+
+def with_state(page: str, experiment: str) -> str:
+    """The page with the table of the archive's trials between its marks."""
+    before, _, rest = page.partition(STATE)
+    return f"{before}{STATE}\n{state_table(experiment)}{END}{rest.partition(END)[2]}"
+
+
+if __name__ == "__main__":
+    {"train": train, "save": save}[sys.argv[1]](Path(sys.argv[2]).resolve(), sys.argv[3])

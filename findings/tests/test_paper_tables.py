@@ -1,0 +1,58 @@
+"""The paper's tables in small: what lies beside their archives, and A/A of the regions."""
+
+import csv
+import json
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from gsbench.analysis.regions import compare_regions, discoveries
+
+FINDINGS = Path(__file__).parents[1]
+ARCHIVES = FINDINGS / "archives"
+sys.path.append(str(FINDINGS / "scripts"))
+import paper_tables  # noqa: E402
+
+
+def regions_of(file):
+    """The errors of regions by trial and view."""
+    trials = {}
+    for name, errors in np.load(ARCHIVES / file).items():
+        trial, _, view = name.partition("/")
+        trials.setdefault(trial, {})[view] = errors.astype(float)
+    return trials
+
+
+def test_regions_light_up_in_at_most_five_of_a_hundred_reports_of_one_arm():
+    """Eight trainings of adc on treehill (192 px, 900 iterations, 30,000 Gaussians), in pairs."""
+    trials, rng = list(regions_of("paper_aa_regions.npz").values()), np.random.default_rng(0)
+    assert len(trials) == 8
+    for seeds in (3, 4):
+        lit = 0
+        for _ in range(100):
+            chosen = [trials[index] for index in rng.permutation(8)[: 2 * seeds]]
+            found = compare_regions(chosen[:seeds], chosen[seeds:])
+            lit += any(each.any() for each in discoveries(list(found.p.values())))
+        assert lit <= 5, seeds
+
+
+def test_what_lies_beside_the_archive_has_its_trials():
+    with zipfile.ZipFile(ARCHIVES / "paper_table1.zip") as archive:
+        lines = [json.loads(line) for line in archive.read("results.jsonl").splitlines()]
+    results = {
+        f"{line['results']['scene']}-{line['results']['densify']}-{line['results']['seed']}": line
+        for line in lines
+    }
+    with (ARCHIVES / "paper_table1.csv").open() as stream:
+        rows = {row["trial"]: row for row in csv.DictReader(stream)}
+    assert rows.keys() == results.keys() == regions_of("paper_table1_regions.npz").keys()
+    for trial, row in rows.items():
+        assert int(row["gaussians"]) == results[trial]["results"]["num_gaussians"]
+        assert 0.5 < float(row["share_below_threshold"]) < 1
+
+
+def test_the_table_on_the_page_follows_from_the_archive():
+    page = paper_tables.PAGE.read_text(encoding="utf-8")
+    assert paper_tables.with_state(page, "paper_table1") == page

@@ -1,0 +1,262 @@
+"""Results of any trainer in a table (method, scene, seed, metrics), judged as trials are.
+
+Nobody wrote the question down before these results, so its sentence states the condition. A file of
+`Declared`, written before the training, takes the condition away.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from gsbench.analysis.comparison import Comparison, compare
+from gsbench.analysis.quantities import asked_quantity
+from gsbench.analysis.questions import LeastEffect, read_least
+from gsbench.analysis.results import Experiment, TrialResult, group_by
+from gsbench.analysis.sentences import DECLARED_TABLE, TABLE
+from gsbench.analysis.verdicts import Verdict
+from gsbench.errors import InputError
+from gsbench.eval.facts import find_metric
+from gsbench.files import write_text
+from gsbench.parsing import Count, Record, Text, read_typed
+from gsbench.runs.commands import Command, History, Question
+from gsbench.runs.experiments import Arm
+from gsbench.runs.trial_record import MetricRecord, TrialRecord
+from gsbench.words import did_you_mean, listed
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+METHOD, SCENE, SEED = COLUMNS = ("method", "scene", "seed")
+DIRECTIONS = {"": 0, "higher": 1, "lower": -1}
+
+
+class Declared(Record):
+    """A question that was written before the training: ``methods`` against ``baseline``."""
+
+    baseline: Text
+    methods: tuple[Text, ...]
+    metric: Text
+    better: str
+    least: Text | None
+    scenes: tuple[Text, ...]
+    seeds: tuple[Count, ...]
+
+    def write(self, file: Path) -> None:
+        """Write it; raises InputError if the file is there, since a question is never changed."""
+        if file.exists():
+            raise InputError(f"{file} is there already: a question is not changed")
+        write_text(file, json.dumps(self.to_json(), indent=1) + "\n")
+
+
+def read_declared(file: Path) -> Declared:
+    """The question in a file; raises InputError if it is damaged or missing."""
+    try:
+        return read_typed(file, Declared)
+    except FileNotFoundError:
+        raise InputError(f"{file}: no such file: judge --declare writes it") from None
+
+
+def judge(
+    frame: pd.DataFrame,
+    baseline: str,
+    metric: str,
+    least: float | str | None = None,
+    direction: int = 0,
+) -> dict[str, Verdict]:
+    """The verdict on each method of a ``frame`` against ``baseline`` in ``metric``, by its name.
+
+    The frame has the columns method, scene, seed and metrics, a row for each training; a missing
+    value is a training that failed. ``least`` is the least difference that matters, such as 0.1 or
+    "10%"; by default the metric's usual one. ``direction`` (1: more is better, -1: less) is needed
+    for metrics that gsbench does not know. A verdict has 5 %, and holds if metric, scenes and seeds
+    were chosen before.
+
+    Raises InputError, one line, for a frame that lacks a column, has a training twice, or has no
+    such baseline.
+
+    Examples:
+        >>> import pandas as pd
+        >>> rows = [("base", "garden", k, 26.0 + k / 10) for k in range(3)]
+        >>> rows += [("mine", "garden", k, 27.0 + k / 9) for k in range(3)]
+        >>> frame = pd.DataFrame(rows, columns=["method", "scene", "seed", "psnr"])
+        >>> judge(frame, "base", "psnr")["mine"].outcome
+        'supported'
+    """
+    answers = compare_methods(frame, baseline, metric, least, direction).answers
+    return {answer.arm.densify: answer.verdict for answer in answers}
+
+
+def compare_methods(
+    frame: pd.DataFrame,
+    baseline: str,
+    metric: str,
+    least: float | str | None = None,
+    direction: int = 0,
+    declared: Declared | None = None,
+    name: str = "results",
+) -> Comparison:
+    """The answers on all methods of a table, as `judge` gives them, or to a ``declared`` question.
+
+    Raises InputError for a table or question that cannot be judged.
+    """
+    trials = _trials(frame, metric, direction, name)
+    methods = list(dict.fromkeys(trial.densify for trial in trials))
+    if baseline not in methods:
+        raise InputError(
+            f"no method {baseline!r}{did_you_mean(baseline, methods)} (there are {listed(methods)})"
+        )
+    ideas = [method for method in methods if method != baseline]
+    if declared is not None:
+        ideas = list(declared.methods)
+    if not ideas:
+        raise InputError(f"the table has one method, {baseline}: nothing to compare")
+    sign = asked_quantity(metric, trials).direction
+    if not sign:
+        raise InputError(
+            f"{metric}: say whether more is better (--better higher, direction 1) or less"
+        )
+    size = _least(metric, trials, least)
+    questions = [
+        _question(trials, baseline, idea, metric, sign, size, declared).with_id(TABLE)
+        for idea in ideas
+    ]
+    folder = Path(name)
+    command = Command(words=(), cwd="", time=0.0, questions=tuple(questions))
+    return compare(Experiment(name, folder, tuple(trials), (), history=History(folder, (command,))))
+
+
+def _least(
+    metric: str, trials: Sequence[TrialResult], least: float | str | None
+) -> LeastEffect | None:
+    if least is not None:
+        return read_least(least, "--least")
+    usual = asked_quantity(metric, trials).worthwhile
+    return None if usual is None else LeastEffect(usual, relative=False)
+
+
+def _question(
+    trials: Sequence[TrialResult],
+    baseline: str,
+    idea: str,
+    metric: str,
+    sign: int,
+    least: LeastEffect | None,
+    declared: Declared | None,
+) -> Question:
+    """The question about all trials of a method, or about those that were declared."""
+    places: dict[tuple[str, str], list[int]] = {}
+    for trial in trials:
+        places.setdefault((trial.densify, trial.scene), []).append(trial.seed)
+    seeds = {scene: tuple(sorted(own)) for (method, scene), own in places.items() if method == idea}
+    untested = ""
+    if declared is not None:
+        seeds = dict.fromkeys(declared.scenes, declared.seeds)
+    else:
+        for scene, own in seeds.items():
+            first = sorted(places.get((baseline, scene), []))[: len(own)]
+            if not set(own) >= set(first):
+                untested = f"it leaves out seeds of {baseline} on {scene}"
+    return Question(
+        idea=Arm("", idea),
+        baseline=Arm("", baseline),
+        metric=metric,
+        sign=sign,  # type: ignore[arg-type]
+        least=None if least is None else least.size,
+        relative=least is not None and least.relative,
+        digests={scene: (_digest(baseline), _digest(idea)) for scene in seeds},
+        seeds=seeds,
+        rule=TABLE if declared is None else DECLARED_TABLE,
+        untested=untested,
+    )
+
+
+def _digest(method: str) -> str:
+    return method.replace("+", "_")  # what follows a plus stands for code
+
+
+def _trials(frame: pd.DataFrame, metric: str, direction: int, name: str) -> list[TrialResult]:
+    """The rows as trials; raises InputError for missing columns, repeated rows and no numbers."""
+    columns = [str(column) for column in frame.columns]
+    for column in (*COLUMNS, metric):
+        if column not in columns:
+            raise InputError(
+                f"the table has no column {column!r}{did_you_mean(column, columns)} (it has "
+                f"{listed(columns)}; a row needs {listed(COLUMNS)} and metrics)"
+            )
+    if not len(frame):
+        raise InputError("the table has no rows")
+    values = {key: _numbers(frame[key]) for key in columns if key not in COLUMNS}
+    metrics = {key: column for key, column in values.items() if column is not None}
+    if metric not in metrics:
+        raise InputError(f"the column {metric} has a value that is no number")
+    sign: Literal[-1, 0, 1] = 1 if direction > 0 else -1 if direction else 0
+    facts = {
+        key: MetricRecord(label=key, direction=sign if key == metric else 0)
+        for key in metrics
+        if find_metric(key) is None
+    }
+    trials = []
+    for number, row in enumerate(frame[list(COLUMNS)].itertuples(index=False)):
+        method, scene, seed = str(row[0]), str(row[1]), _seed(row[2])
+        own = {key: column[number] for key, column in metrics.items()}
+        trials.append(_trial(name, method, scene, seed, own, facts))
+    for place, same in group_by(trials, lambda one: (one.densify, one.scene, one.seed)).items():
+        if len(same) > 1:
+            raise InputError(f"{place[0]}, {place[1]}, seed {place[2]} is twice in it")
+    return trials
+
+
+def _numbers(column: Any) -> list[float] | None:
+    """The values of a column, NaN for none; None if one is no number."""
+    try:
+        found = [float(value) for value in column]
+    except (TypeError, ValueError):
+        return None
+    return None if any(map(math.isinf, found)) else found
+
+
+def _seed(value: Any) -> int:
+    try:
+        if float(value) == int(value) >= 0:
+            return int(value)
+    except (TypeError, ValueError, OverflowError):
+        pass
+    raise InputError(f"seed must be a whole number from 0 on, got {value!r}")
+
+
+def _trial(
+    name: str,
+    method: str,
+    scene: str,
+    seed: int,
+    values: Mapping[str, float],
+    facts: Mapping[str, MetricRecord],
+) -> TrialResult:
+    record = TrialRecord(
+        status="complete",
+        experiment=name,
+        scene=scene,
+        init="",
+        densify=method,
+        seed=seed,
+        raster="",
+        protocol="of the table",
+        iterations=0,
+        metrics={key: value for key, value in values.items() if not math.isnan(value)},
+        unavailable={key: "no value" for key, value in values.items() if math.isnan(value)},
+        seconds={},
+        num_init_points=None,
+        num_gaussians=None,
+        peak_memory_mb=None,
+        hashes={},
+        versions={},
+        evaluated_from="renders",
+        metric_facts=dict(facts),
+    )
+    path = Path(name, scene, method, f"seed{seed}")
+    return replace(TrialResult(path, "", record), alias=_digest(method))

@@ -1,0 +1,158 @@
+"""Declarations of gsbench 0.1 (``declared.jsonl``), read as questions.
+
+They were written before their trials, too, but without levels: 5 % is divided by the arms of a
+declaration and by the versions of an arm's code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import field, replace
+
+from gsbench.analysis.cells import with_variants
+from gsbench.analysis.quantities import asked_quantity
+from gsbench.analysis.questions import Asked, choose_pairs, level_of, rows_of
+from gsbench.analysis.results import Experiment, TrialResult
+from gsbench.parsing import Amount, Count, Record
+from gsbench.runs.commands import ERROR_RATE, Question, code_in
+from gsbench.runs.experiments import Arm, unix_time
+from gsbench.runs.layout import DECLARED
+from gsbench.runs.rows import read_rows
+
+OLD = "declaration"  # the rule of these questions
+
+
+class _OldQuestion(Record):
+    metric: str
+    sign: int = 1
+    least: Amount | None = None
+    relative: bool = False
+    baseline: Arm | None = None
+    arm: Arm | None = None
+    scenes: dict[str, tuple[str, str]] = field(default_factory=dict)
+    seeds: tuple[Count, ...] = ()
+    about: str = ""
+    name: str = ""
+
+
+class _OldDeclaration(Record):
+    time: str
+    questions: tuple[_OldQuestion, ...] = ()
+    error_rate: Amount = ERROR_RATE
+    looks: tuple[Count, ...] = ()
+    trials: dict[str, tuple[Count, ...]] | None = None
+
+
+def all_questions(experiment: Experiment) -> list[Question]:
+    """All questions of an experiment, the newest last."""
+    return [*old_questions(experiment), *experiment.history.questions]
+
+
+def old_questions(experiment: Experiment) -> list[Question]:
+    """The questions of the experiment's old declarations; the last about each pair counts."""
+    declarations = read_rows(experiment.folder / DECLARED, _OldDeclaration)
+    if not declarations:
+        return []
+    trials = [*with_variants(experiment.trials), *experiment.older]
+    found: dict[object, Question] = {}
+    for declaration in declarations:
+        for asked in declaration.questions:
+            if asked.scenes:
+                own = [_named(asked, declaration, trials)]
+            else:
+                own = _of_sweep(asked, declaration, trials)
+            for question in own:
+                found[question.baseline, question.idea, question.metric, question.name] = question
+    return [
+        replace(question, n=n, level=level_of(n, rate=question.level)).with_id(OLD)
+        for question in found.values()
+        for n in [_version(question, trials)]
+    ]
+
+
+def _named(
+    asked: _OldQuestion, declaration: _OldDeclaration, trials: Sequence[TrialResult]
+) -> Question:
+    """A question that names its trials, as of a file of claims or of planned looks."""
+    digests = {trial.key: trial.digest for trial in trials}
+    known = [trial for trial in trials if trial.digest in digests.values()]
+    sides: list[Arm] = []
+    for side, arm in enumerate((asked.baseline, asked.arm)):
+        keys = {both[side] for both in asked.scenes.values()}
+        of_side = next((trial.arm for trial in known if trial.key in keys), None)
+        sides.append(of_side or arm or Arm("", asked.name))
+    return Question(
+        idea=sides[1],
+        baseline=sides[0],
+        metric=asked.metric,
+        sign=asked.sign,  # type: ignore[arg-type]
+        least=asked.least,
+        relative=asked.relative,
+        digests={
+            scene: (digests.get(one, one), digests.get(two, two))
+            for scene, (one, two) in asked.scenes.items()
+        },
+        seeds=dict.fromkeys(asked.scenes, asked.seeds),
+        looks=declaration.looks,
+        level=declaration.error_rate / len(declaration.questions),
+        rule=OLD,
+        name=asked.name,
+    )
+
+
+def _of_sweep(
+    asked: _OldQuestion, declaration: _OldDeclaration, trials: Sequence[TrialResult]
+) -> list[Question]:
+    """The questions of a sweep's metric about all compared arms."""
+    planned = declaration.trials
+    own = [
+        trial
+        for trial in trials
+        if (planned is None or trial.seed in planned.get(trial.key, ()))
+        and asked.about in ("", trial.question)
+    ]
+    metric = asked_quantity(asked.metric, own)
+    pairs = choose_pairs(rows_of(own), Asked(metric=asked.metric)) if own else []
+    known, moment = {trial.arm for trial in own}, unix_time(declaration.time) or 0
+    questions = []
+    for baseline, idea in pairs:
+        if not metric.direction or not known.issuperset((baseline, idea)):
+            continue
+        sides = [[trial for trial in own if trial.arm == arm] for arm in (baseline, idea)]
+        first = {trial.scene: trial.digest for trial in sides[0]}
+        second = {trial.scene: trial.digest for trial in sides[1] if trial.scene in first}
+        late = min(trial.measured for trial in sides[1]) < moment
+        questions.append(
+            Question(
+                idea=idea,
+                baseline=baseline,
+                metric=asked.metric,
+                sign=metric.direction,  # type: ignore[arg-type]
+                least=metric.worthwhile,
+                digests={scene: (first[scene], digest) for scene, digest in second.items()},
+                seeds={
+                    scene: tuple(
+                        planned[key]
+                        if planned is not None
+                        else sorted({t.seed for t in sides[1] if t.scene == scene})
+                    )
+                    for scene in second
+                    for key in [next(t.key for t in sides[1] if t.scene == scene)]
+                },
+                level=declaration.error_rate / len(pairs),
+                rule=OLD,
+                untested="it was declared after the first result" if late else "",
+            )
+        )
+    return questions
+
+
+def _version(question: Question, trials: Sequence[TrialResult]) -> int:
+    """The number of versions of the idea's code that were measured on the question's places."""
+    own = [
+        trial
+        for trial in trials
+        if f"{trial.init}-{trial.densify}" == question.idea.name
+        and trial.seed in question.seeds.get(trial.scene, ())
+    ]
+    return max(1, len({code_in(trial.digest) for trial in own}))

@@ -1,0 +1,252 @@
+"""Pairs of trials of one scene and seed: all verdicts pair trials here."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import takewhile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsbench.analysis.cells import check_averageable
+from gsbench.analysis.differences import differing_conditions
+from gsbench.analysis.notes import Note
+from gsbench.analysis.quantities import asked_quantity, value_of
+from gsbench.analysis.results import TrialPair, TrialResult, group_by
+from gsbench.errors import InputError
+from gsbench.runs.commands import Question
+from gsbench.runs.experiments import Arm
+
+BASELINE = "adc"
+SAME_CAPTURE = "same capture"  # the kind of a note
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ScenePairs:
+    """The pairs of trials of one scene, one per seed, with both arms' values [K].
+
+    Seeds are in the order in which they are added.
+    """
+
+    scene: str
+    seeds: tuple[int, ...]
+    trials: tuple[TrialPair, ...]
+    baseline: Array
+    arm: Array
+
+    def subset(self, indices: Sequence[int]) -> ScenePairs:
+        chosen = list(indices)
+        return ScenePairs(
+            self.scene,
+            tuple(self.seeds[k] for k in chosen),
+            tuple(self.trials[k] for k in chosen),
+            self.baseline[chosen],
+            self.arm[chosen],
+        )
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """The pairs of trials of a question by scene.
+
+    ``left_out`` has a note on each thing that could not be paired.
+    """
+
+    rows: tuple[ScenePairs, ...]
+    left_out: tuple[Note, ...] = ()
+    relative: bool = False  # compare logarithms
+
+    @property
+    def scenes(self) -> tuple[str, ...]:
+        return tuple(row.scene for row in self.rows)
+
+    @property
+    def seeds(self) -> int:
+        """The number of seeds that all scenes have."""
+        return min((len(row.seeds) for row in self.rows), default=0)
+
+    @cached_property
+    def differences(self) -> Array:
+        """Arm minus baseline [S, K]; the logarithm of their ratio if ``relative``.
+
+        Seeds that some scenes lack are dropped, so that all scenes weigh the same.
+        """
+        changes = [
+            np.log(row.arm / row.baseline) if self.relative else row.arm - row.baseline
+            for row in self.rows
+        ]
+        return np.array([change[: self.seeds] for change in changes])
+
+    @property
+    def baseline(self) -> float:
+        """The baseline's mean over the same trials, in the metric's own unit."""
+        return float(np.mean([row.baseline[: self.seeds].mean() for row in self.rows]))
+
+    @property
+    def counting(self) -> tuple[TrialPair, ...]:
+        """The pairs that count, scene by scene."""
+        return tuple(pair for row in self.rows for pair in row.trials[: self.seeds])
+
+    @property
+    def of_baseline(self) -> tuple[TrialResult, ...]:
+        """The baseline's trials that count."""
+        return tuple(baseline for baseline, _ in self.counting)
+
+    @property
+    def of_arm(self) -> tuple[TrialResult, ...]:
+        """The arm's trials that count, each in the place of its partner in `of_baseline`."""
+        return tuple(arm for _, arm in self.counting)
+
+    @property
+    def trials(self) -> tuple[TrialResult, ...]:
+        """The trials that count, pair by pair."""
+        return tuple(trial for pair in self.counting for trial in pair)
+
+    def first(self, seeds: int) -> Pairs:
+        """The pairs of the first ``seeds`` seeds of every scene."""
+        return replace(
+            self, rows=tuple(row.subset(range(min(seeds, len(row.seeds)))) for row in self.rows)
+        )
+
+
+def pair(trials: Sequence[TrialResult], question: Question) -> Pairs:
+    """Pair the trials of a question by scene and seed.
+
+    The result also says which trials cannot be compared. Trials are compared only under equal
+    conditions. If seeds come in looks, those after the first missing one do not count: a seed that
+    comes late cannot change what an earlier look saw. One capture under two names is one scene: its
+    trainings would count twice.
+    """
+    return pair_sides(_sides(trials, question), question)
+
+
+def pair_sides(
+    sides_by_scene: Mapping[str, tuple[Sequence[TrialResult], Sequence[TrialResult]]],
+    question: Question,
+) -> Pairs:
+    """The same, for the trials of baseline and idea by scene."""
+    rows, left_out = [], list[Note]()
+    captures: dict[object, str] = {}
+    for scene, sides in sides_by_scene.items():
+        try:
+            row, faults = _pair_scene(scene, *sides, question)
+        except InputError as error:
+            left_out.append(Note.of("unlike", text=str(error)))
+            continue
+        left_out += faults
+        if not row.seeds:
+            continue
+        first = row.trials[0][0]
+        data = first.record.hashes.get("data")
+        known = captures.setdefault((data, first.split) if data else scene, scene)
+        if known == scene:
+            rows.append(row)
+        else:
+            left_out.append(Note.of(SAME_CAPTURE, scene=scene, other=known))
+    if uneven := {
+        len(row.seeds) for row in rows if len(row.seeds) > min(len(row.seeds) for row in rows)
+    }:
+        least = min(len(row.seeds) for row in rows)
+        few = [row.scene for row in rows if len(row.seeds) == least]
+        left_out.append(Note.of("uneven", least=least, scenes=few, most=max(uneven)))
+    return Pairs(tuple(rows), tuple(left_out), question.relative)
+
+
+def _sides(
+    trials: Sequence[TrialResult], question: Question
+) -> dict[str, tuple[list[TrialResult], list[TrialResult]]]:
+    """The trials of the baseline and of the idea, by scene."""
+    by_scene = group_by(trials, lambda trial: (trial.scene, trial.digest))
+
+    def side(scene: str, digest: str) -> list[TrialResult]:
+        own = by_scene.get((scene, digest), [])
+        return [trial for trial in own if trial.seed in question.seeds[scene]]
+
+    return {
+        scene: (side(scene, first), side(scene, second))
+        for scene, (first, second) in question.digests.items()
+    }
+
+
+def pair_trials(trials: Sequence[TrialResult], baseline: Arm, arm: Arm) -> list[TrialPair]:
+    """The pairs of trials of two arms, sorted by scene and seed, without regard to metrics."""
+    pairs: list[TrialPair] = []
+    for scene, own in sorted(group_by(trials, lambda trial: trial.scene).items()):
+        sides = (
+            [trial for trial in own if trial.arm == baseline],
+            [trial for trial in own if trial.arm == arm],
+        )
+        seeds = sorted({trial.seed for side in sides for trial in side})
+        with suppress(InputError):  # the verdict on these arms reports it
+            pairs += _match_seeds(scene, *sides, seeds).values()
+    return pairs
+
+
+def _match_seeds(
+    scene: str,
+    baseline: Sequence[TrialResult],
+    arm: Sequence[TrialResult],
+    seeds: Sequence[int],
+    budgets: bool = True,
+    code: bool = True,
+) -> dict[int, TrialPair]:
+    """The pairs of one scene by seed, in the order of ``seeds``.
+
+    Raises InputError if trials of one arm cannot be averaged, or if the arms' conditions
+    differ; ``budgets`` and ``code`` are conditions if they are asked for.
+    """
+    for own in (baseline, arm):
+        if own:
+            check_averageable(own, f"scene={scene} {own[0].arm}")
+    baseline_by_seed, arm_by_seed = (
+        {trial.seed: trial for trial in own} for own in (baseline, arm)
+    )
+    shared = baseline_by_seed.keys() & arm_by_seed.keys()
+    pairs = {seed: (baseline_by_seed[seed], arm_by_seed[seed]) for seed in seeds if seed in shared}
+    if pairs:
+        differing = differing_conditions([*baseline, *arm], code=code)
+        if not budgets:
+            differing.pop("budget", None)
+        if differing:
+            raise InputError(str(Note.of("conditions", scene=scene, conditions=list(differing))))
+    return pairs
+
+
+def _pair_scene(
+    scene: str, baseline: Sequence[TrialResult], arm: Sequence[TrialResult], question: Question
+) -> tuple[ScenePairs, list[Note]]:
+    """The pairs of one scene that have values, and a note on each thing that was not paired."""
+    wanted = question.seeds[scene]
+    # a claim may be about arms with different budgets, which its question then names
+    pairs = _match_seeds(scene, baseline, arm, wanted, not question.name, not question.versions)
+    values: dict[int, tuple[float, float]] = {}
+    reasons: dict[str, list[str]] = {}
+    for seed, trials in pairs.items():
+        try:
+            values[seed] = _values(question, *trials)
+        except InputError as error:
+            reasons.setdefault(str(error), []).append(f"{scene} seed {seed}")
+    faults = [Note.of("valueless", places=own, reason=why) for why, own in reasons.items()]
+    in_order = [*takewhile(values.__contains__, wanted)] if question.looks else [*values]
+    of_baseline, of_arm = (np.array([values[seed][side] for seed in in_order]) for side in (0, 1))
+    chosen = tuple(pairs[seed] for seed in in_order)
+    return ScenePairs(scene, tuple(in_order), chosen, of_baseline, of_arm), faults
+
+
+def _values(question: Question, baseline: TrialResult, arm: TrialResult) -> tuple[float, float]:
+    asked = asked_quantity(question.metric, [baseline, arm])
+    values = value_of(asked, baseline), value_of(asked, arm)
+    if question.relative and min(values) <= 0:
+        raise InputError(f"{asked.name} is {min(values):g}, and a ratio needs numbers above 0")
+    return values
+
+
+def are_equal(one: TrialResult, other: TrialResult) -> bool:
+    """Return whether two trials have the same metrics and number of Gaussians."""
+    same_count = one.record.num_gaussians == other.record.num_gaussians
+    return bool(one.metrics) and one.metrics == other.metrics and same_count

@@ -1,0 +1,20 @@
+"""The facts of a metric that trials compute, of gsbench or of the user's own."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from gsbench.eval.facts import MetricFacts, facts_of, find_metric
+
+
+def facts_for(metric: str, values: Mapping[str, Any]) -> MetricFacts:
+    """The facts of a metric of trials with the configuration ``values``.
+
+    Raises InputError for an unknown metric.
+    """
+    shipped = find_metric(metric)
+    if shipped is not None:
+        return shipped
+    # here, since only a user's own metric needs it
+    from gsbench.pipeline.parts import build_metrics
+
+    return facts_of(metric, build_metrics(values["eval"], values["allow_targets"])[metric])

@@ -1,0 +1,409 @@
+"""The commands of an experiment and their questions: ``<runs>/<experiment>/commands.jsonl``.
+
+A command adds a line before its trials run: its words, its trials, and the questions that no
+earlier command asked, each with its level. A finished trial adds a line, too, so that what was seen
+is known when its folder is gone. Lines are never changed; each has the digest of the one before.
+Loads no torch.
+"""
+
+import json
+import os
+import time
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from hashlib import sha256
+from itertools import chain
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator
+
+from gsbench.files import open_plain, require_no_links
+from gsbench.parsing import (
+    Amount,
+    Count,
+    DamagedError,
+    Raw,
+    Record,
+    parse_typed,
+    read_bytes,
+    read_typed,
+)
+from gsbench.runs.config_hash import config_hash
+from gsbench.runs.experiments import Arm, make_home
+from gsbench.runs.keys import CODE_OF_STAGE
+from gsbench.runs.layout import COMMANDS, PLAN, SEED
+from gsbench.runs.nested import SHOWN, sha256_of
+from gsbench.runs.package_code import edited, states_of
+from gsbench.runs.user_code import user_modules
+from gsbench.settings import ARM_BYTES, is_folder_name
+from gsbench.system.locks import hold
+
+ERROR_RATE = 0.05
+BY_COMMAND = "command"  # the rule that gives a question its level
+ID_CHARACTERS, LINK_CHARACTERS = 12, 16
+LEVELS = 3  # folders of scene, arm and trial
+Place = tuple[str, int]  # scene and seed
+# arm, hash of the settings and, after a plus, that of the code: ``sfm-mine/3fa9c1d2+9ab01c22``
+Digest = str
+
+
+def _checked_folder(name: str) -> str:
+    parts = name.split("/")
+    if len(parts) != LEVELS or not all(is_folder_name(part, ARM_BYTES) for part in parts):
+        raise ValueError("it is not a folder of a trial")
+    return name
+
+
+Folder = Annotated[str, AfterValidator(_checked_folder)]  # of a trial, in its experiment's
+
+
+def make_digest(arm: str, config_hash: str, sources: Mapping[str, str], packages: Any) -> Digest:
+    """The digest of an arm on a scene: its settings, the user's modules, and edited packages.
+
+    What is as released does not count, so an update of gsbench changes nothing.
+    """
+    code = code_digest(sources, packages)
+    return f"{arm}/{config_hash}{code and '+'}{code}"
+
+
+def code_digest(sources: Mapping[str, str], packages: Mapping[str, str]) -> str:
+    """The digest of a user's modules and of the packages that differ from the release, or ""."""
+    changed = edited(packages)
+    return sha256_of([dict(sources), changed])[:SHOWN] if sources or changed else ""
+
+
+def digest_of(values: Mapping[str, Any]) -> Digest:
+    """The digest of a trial with the configuration ``values``, by the code as it is now."""
+    arm = f"{values['init']['name']}-{values['densify']['name']}"
+    packages = states_of(chain(*CODE_OF_STAGE.values()))
+    return make_digest(arm, config_hash(values)[:SHOWN], user_modules(values), packages)
+
+
+def code_in(digest: Digest) -> str:
+    """The part of a digest that is about the code."""
+    return digest.partition("+")[2]
+
+
+class Question(Record):
+    """A question: is ``idea`` better than ``baseline`` in ``metric``, by trials yet to come?
+
+    - ``sign``: of the claimed difference, idea minus baseline; 0 if no difference is claimed.
+    - ``least``: the least difference that matters, in the metric's unit or (``relative``) as a
+      fraction of the baseline's value; None if it is not known.
+    - ``digests``: of the baseline and of the idea on each scene; that of a baseline is "" until a
+      later command trains it.
+    - ``seeds``: of each scene, in the order of adding them.
+    - ``looks``: the rising numbers of seeds at which it may be decided; all at once without.
+    - ``rule``: what gave the ``level``, for the ``n``-th command about the idea on these seeds.
+    - ``untested``: why no test is valid, since it was asked in view of results; "" if one is.
+    """
+
+    idea: Arm
+    baseline: Arm
+    metric: str
+    sign: Literal[-1, 0, 1] = 1
+    least: Amount | None = None
+    relative: bool = False
+    digests: dict[str, tuple[Digest, Digest]] = field(default_factory=dict)
+    seeds: dict[str, tuple[Count, ...]] = field(default_factory=dict)
+    looks: tuple[Count, ...] = ()
+    rule: str = BY_COMMAND
+    n: Count = 1
+    level: Amount = ERROR_RATE
+    untested: str = ""
+    name: str = ""
+    says: str = ""
+    where: str = ""
+    versions: bool = False  # the two are versions of one trainer, so their code may differ
+    id: str = ""
+
+    def __post_init__(self) -> None:
+        if self.digests.keys() != self.seeds.keys():
+            raise ValueError("digests and seeds are of other scenes")
+
+    @property
+    def places(self) -> set[Place]:
+        return {(scene, seed) for scene, seeds in self.seeds.items() for seed in seeds}
+
+    @property
+    def trials(self) -> int:
+        """The number of its trials, of both sides."""
+        return 2 * len(self.places)
+
+    def covers(self, other: "Question") -> bool:
+        """Return whether this asks the same, about all trials of ``other``."""
+
+        def same(mine: Digest, asked: Digest) -> bool:
+            return mine == asked or "" in (mine, asked)
+
+        return (
+            (self.metric, self.sign, self.baseline.name, self.rule)
+            == (other.metric, other.sign, other.baseline.name, other.rule)
+            and other.places <= self.places
+            and all(
+                same(self.digests[scene][0], first) and self.digests[scene][1] == second
+                for scene, (first, second) in other.digests.items()
+            )
+        )
+
+    def has(self, digest: Digest, scene: str, seed: int) -> bool:
+        """Return whether it is about the trial with this digest, of either side."""
+        return digest in self.digests.get(scene, ()) and seed in self.seeds[scene]
+
+    def with_id(self, salt: object) -> "Question":
+        return replace(self, id=sha256_of([self.to_json(), salt])[:ID_CHARACTERS])
+
+
+class PlannedTrial(Record):
+    """A planned trial: its words and digest, and folder and Unix time of its command."""
+
+    words: tuple[Raw, ...]
+    digest: Digest = ""
+    cwd: Raw = ""
+    time: Amount = 0.0
+
+
+class Command(Record):
+    """A command: its trials by their folders, and the questions that it asked first.
+
+    ``shows`` are the ids of earlier questions that it repeats: these are its idea's newest.
+    """
+
+    words: tuple[Raw, ...]
+    cwd: Raw
+    time: Amount
+    trials: dict[Folder, PlannedTrial] = field(default_factory=dict)
+    questions: tuple[Question, ...] = ()
+    shows: tuple[str, ...] = ()
+    dropped: tuple[Folder, ...] = ()  # trials that are no longer planned
+    previous: str = ""
+
+
+class Finished(Record):
+    """A trial that gave a result."""
+
+    finished: Folder
+    digest: Digest
+    previous: str = ""
+
+    @property
+    def place(self) -> Place:
+        scene, _, trial = self.finished.split("/")
+        return scene, int(trial.partition(SEED)[2])
+
+
+Line = Command | Finished
+
+
+class _OldTrial(Record):
+    overrides: tuple[Raw, ...]
+    cwd: Raw
+    time: Amount
+
+
+class _OldPlan(Record):
+    trials: dict[Folder, _OldTrial]
+
+
+@dataclass(frozen=True)
+class History:
+    """All that was asked in an experiment, and what gave results, in order.
+
+    ``faults`` name damaged lines and broken links; other lines stay valid.
+    """
+
+    home: Path
+    commands: tuple[Command, ...] = ()
+    results: frozenset[tuple[Digest, Place]] = frozenset()
+    faults: tuple[str, ...] = ()
+
+    @cached_property
+    def planned(self) -> dict[Path, PlannedTrial]:
+        """The planned trials by their folders."""
+        found: dict[str, PlannedTrial] = {}
+        for one in self.commands:
+            for name, trial in one.trials.items():
+                found[name] = replace(trial, cwd=one.cwd, time=one.time)
+            for name in one.dropped:
+                found.pop(name, None)
+        return {self.home / name: trial for name, trial in sorted(found.items())}
+
+    @cached_property
+    def questions(self) -> tuple[Question, ...]:
+        """All questions, those that were asked or repeated last at the end.
+
+        An awaited baseline has the digest that the first later command gives it.
+        """
+        by_id: dict[str, Question] = {}
+        for number, one in enumerate(self.commands):
+            for question in one.questions:
+                by_id[question.id] = self._with_baseline(question, self.commands[number:])
+            for name in one.shows:
+                if name in by_id:
+                    by_id[name] = by_id.pop(name)
+        return tuple(by_id.values())
+
+    @cached_property
+    def newest(self) -> dict[str, set[str]]:
+        """The ids of the questions that the last command about each idea asked or repeated."""
+        ideas, found = {one.id: one.idea.name for one in self.questions}, dict[str, set[str]]()
+        for command in self.commands:
+            own: dict[str, set[str]] = {}
+            for name in (*(one.id for one in command.questions), *command.shows):
+                own.setdefault(ideas.get(name, ""), set()).add(name)
+            found |= own
+        return found
+
+    def _with_baseline(self, question: Question, later: Sequence[Command]) -> Question:
+        if all(first for first, _ in question.digests.values()):
+            return question
+        trained: dict[str, Digest] = {}
+        for name, trial in chain(*(one.trials.items() for one in later)):
+            scene, arm, _ = name.split("/")
+            if arm == question.baseline.name and trial.digest:
+                trained.setdefault(scene, trial.digest)
+        digests = {
+            scene: (first or trained.get(scene, ""), second)
+            for scene, (first, second) in question.digests.items()
+        }
+        return replace(question, digests=digests)
+
+    def covering(self, digest: Digest, scene: str, seed: int) -> list[Question]:
+        """The questions about a trial."""
+        return [one for one in self.questions if one.has(digest, scene, seed)]
+
+    def gave_result(self, digest: Digest, places: Iterable[Place]) -> bool:
+        """Return whether a trial with this digest at one of these places gave a result."""
+        return any((digest, place) in self.results for place in places)
+
+
+def read_history(home: Path) -> History:
+    """What was asked in the experiment in ``home``; nothing without a file."""
+    content = _content(home / COMMANDS)
+    commands, results, faults = _of_old_plan(home), set[tuple[Digest, Place]](), list[str]()
+    before = ""
+    for number, text in enumerate(content.splitlines(), 1):
+        try:
+            line = _parsed(text, home / COMMANDS)
+        except DamagedError as error:
+            faults.append(f"{home.name}: line {number} of {error.path.name} {error.reason}")
+        else:
+            if line.previous != before:
+                faults.append(
+                    f"{home.name}: line {number} of {COMMANDS} does not follow the one before it: "
+                    "a line was changed, added or removed"
+                )
+            if isinstance(line, Command):
+                commands.append(line)
+            else:
+                results.add((line.digest, line.place))
+        before = _link(text)
+    return History(home, tuple(commands), frozenset(results), tuple(faults))
+
+
+def _of_old_plan(home: Path) -> list[Command]:
+    """The trials in ``plan.json`` of an earlier gsbench, each as a command of its own."""
+    try:
+        planned = read_typed(home / PLAN, _OldPlan).trials
+    except (FileNotFoundError, DamagedError):
+        return []
+    return [
+        Command(
+            words=trial.overrides,
+            cwd=trial.cwd,
+            time=trial.time,
+            trials={name: PlannedTrial(words=trial.overrides)},
+        )
+        for name, trial in planned.items()
+    ]
+
+
+def read_lines(home: Path) -> list[Line]:
+    """The sound lines of the file, in order."""
+    lines = list[Line]()
+    for text in _content(home / COMMANDS).splitlines():
+        with suppress(DamagedError):
+            lines.append(_parsed(text, home / COMMANDS))
+    return lines
+
+
+def append(home: Path, make: Callable[[History], Command | None]) -> Command | None:
+    """Add the command that ``make`` makes of the history so far; None adds none.
+
+    One process at a time does so; the line is on the disk when this returns.
+    """
+    with _held(home) as path:
+        line = make(read_history(home))
+        if line is not None:
+            _write(path, line)
+    return line
+
+
+def remember_result(home: Path, folder: Path, digest: Digest) -> None:
+    """Record that the trial in ``folder`` gave a result, unless that is known."""
+    done = Finished(finished=folder.relative_to(home).as_posix(), digest=digest)
+    with _held(home) as path:
+        # not parsed, since each of thousands of trials comes here
+        if _text(done).removesuffix("}").encode() not in _content(path):
+            _write(path, done)
+
+
+@contextmanager
+def _held(home: Path) -> Iterator[Path]:
+    make_home(home)
+    path = home / COMMANDS
+    require_no_links(home.parent, path)
+    with hold(home / f".{COMMANDS}.lock", "the experiment's commands"):
+        yield path
+
+
+def _write(path: Path, line: Line) -> None:
+    content = _content(path)
+    torn = bool(content) and not content.endswith(b"\n")  # by a kill or a full disk
+    last = _link(content.splitlines()[-1]) if content else ""
+    text = _text(replace(line, previous=last)).encode()
+    flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND
+    with os.fdopen(open_plain(path, flags), "wb") as file:
+        file.write(b"\n" * torn + text + b"\n")
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def drop(home: Path, folders: Collection[Path]) -> None:
+    """Plan the trials in ``folders`` no longer."""
+    names = tuple(folder.relative_to(home).as_posix() for folder in folders)
+    now = Command(words=(), cwd=os.getcwd(), time=time.time(), dropped=names)
+    append(home, lambda history: now if history.planned.keys() & set(folders) else None)
+
+
+def chained(lines: Iterable[Line]) -> str:
+    """The text of a file with these lines, linked anew."""
+    texts, before = list[str](), ""
+    for line in lines:
+        texts.append(_text(replace(line, previous=before)))
+        before = _link(texts[-1].encode())
+    return "".join(f"{text}\n" for text in texts)
+
+
+def _content(path: Path) -> bytes:
+    try:
+        return read_bytes(path)
+    except FileNotFoundError:
+        return b""
+
+
+def _parsed(text: bytes, path: Path) -> Line:
+    if text.startswith(b'{"finished"'):
+        return parse_typed(text, Finished, path)
+    return parse_typed(text, Command, path)
+
+
+def _text(line: Line) -> str:
+    return json.dumps(line.to_json())
+
+
+def _link(text: bytes) -> str:
+    return sha256(text).hexdigest()[:LINK_CHARACTERS]

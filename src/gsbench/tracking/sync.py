@@ -1,0 +1,278 @@
+"""Sending to trackers what they lack of trials (`gsbench sync`), while they run and later."""
+
+from __future__ import annotations
+
+import os
+import time
+import uuid
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, chdir, closing, nullcontext
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from gsbench.config.build import build
+from gsbench.config.trust import foreign_address
+from gsbench.errors import InputError
+from gsbench.files import write_json
+from gsbench.parsing import read_if_sound
+from gsbench.runs.layout import CONFIG, FAILED, LOG
+from gsbench.runs.nested import GSBENCH
+from gsbench.runs.trial_folder import TrialFolder
+from gsbench.system.locks import BusyError, hold
+from gsbench.system.programs import own_folder
+from gsbench.tracking.ideas import show_ideas
+from gsbench.tracking.mlflow_sink import VARIABLE, absolute_address
+from gsbench.tracking.sinks import Run, Sink
+from gsbench.tracking.trial import TrackedTrial
+from gsbench.words import counted
+
+OWN = "gsbench.tracking."
+MLFLOW = f"{OWN}MLflow"
+# The settings ``tracking`` that are not options of the tracker's class; configurations of earlier
+# versions name it by ``sink``.
+NOT_OPTIONS = ("name", "enabled", "flush_seconds", "patience_seconds", "images", "model", "sink")
+
+
+def class_of(options: Mapping[str, Any]) -> str:
+    """The import path of the tracker's class that the settings ``tracking`` name."""
+    return str(options.get("_target_") or MLFLOW)
+
+
+def place_for(options: Mapping[str, Any]) -> AbstractContextManager[str | Path]:
+    """The folder to call a tracker in: an empty one, but a user's own tracker stays here.
+
+    Trackers' clients read settings in the current folder: W&B would take its server's address from
+    a stranger's ``wandb/settings``.
+    """
+    return own_folder() if class_of(options).startswith(GSBENCH) else nullcontext(Path.cwd())
+
+
+def tracker_name(options: Mapping[str, Any]) -> str:
+    """The tracker's name in messages."""
+    return class_of(options).removeprefix(OWN)
+
+
+def make_sink(options: Mapping[str, Any], allowed: Sequence[str]) -> Sink:
+    """The tracker that the settings ``tracking`` describe.
+
+    ``allowed`` are the modules whose code may run. Raises InputError naming a wrong setting.
+    """
+    own = {key: value for key, value in options.items() if key not in NOT_OPTIONS}
+    if own.get("uri") is None:
+        own.pop("uri", None)
+    sink: Sink = build("tracking", own | {"_target_": class_of(options)}, list(allowed))
+    return sink
+
+
+# the errors of a tracker's client; a user's class may even end the process
+ERRORS = (Exception, SystemExit)
+
+
+def with_absolute_address(options: dict[str, Any]) -> dict[str, Any]:
+    """The settings ``tracking`` for a process in another folder than the command's."""
+    uri = options.get("uri")
+    if not uri and class_of(options) == MLFLOW:
+        uri = os.environ.get(VARIABLE)
+    return options | {"uri": absolute_address(uri)} if uri else options
+
+
+class MirrorError(Exception):
+    """The error of a mirror that could not be written. Its text is the reason, in one line."""
+
+
+# in the trial's folder: one process at a time mirrors a trial, to any tracker
+LOCK = ".mlflow.lock"
+
+
+class TrackerRun:
+    """The tracker's run of the trial in ``folder``, new or continued, locked until it is closed.
+
+    ``options`` are the settings ``tracking``, ``values`` the whole configuration; ``allowed`` are
+    the modules whose code may run. Raises BusyError if another process mirrors the trial, and any
+    error of the tracker.
+    """
+
+    def __init__(
+        self,
+        folder: TrialFolder,
+        options: Mapping[str, Any],
+        values: dict[str, Any],
+        allowed: Sequence[str] = (),
+    ) -> None:
+        folder.require_no_links()
+        self._options, self._trial = options, TrackedTrial(folder, values)
+        self._file = _state_file(folder, options)
+        with ExitStack() as held:
+            held.enter_context(hold(folder.path / LOCK, "mirroring", wait=False))
+            self._sink = make_sink(options, allowed)
+            self._open(read_if_sound(self._file, Run) or Run())
+            self._held = held.pop_all()
+
+    def close(self) -> None:
+        """Let other processes mirror the trial."""
+        self._held.close()
+
+    @property
+    def is_complete(self) -> bool:
+        """Return whether the run shows how the trial ended, and its present results."""
+        results = self._trial.results_hash()
+        if results is None:
+            return self._run.ended == self._trial.ending()
+        return self._run.complete == results
+
+    def add_curves(self, live: bool = True) -> None:
+        """Log the records that were written since the last call.
+
+        A run that shows results is left as it is.
+        """
+        if self._run.complete is not None:
+            return
+        for name, newest, scalars in self._trial.curves(self._run.logged, live):
+            self._sink.metrics(scalars)
+            self._keep(replace(self._run, logged=self._run.logged | {name: newest}))
+
+    def end(self) -> None:
+        """Log the rest, and close the run as the trial's files say: failed, done, else killed."""
+        if self.is_complete:
+            return
+        # the run shows earlier results, which new ones have replaced
+        if self._run.complete is not None:
+            self._open(self._run)
+        self.add_curves(live=False)
+        folder, sink = self._trial.folder, self._sink
+        if folder.has_failed():
+            sink.artifacts(self._trial.files((CONFIG, FAILED, LOG)), ())
+            sink.close("FAILED", folder.failure().reason)
+            self._keep(replace(self._run, ended=self._trial.ending()))
+        elif (results := folder.sound_record()) is None:
+            sink.close("KILLED", None)
+            self._keep(replace(self._run, ended=self._trial.ending()))
+        else:
+            images, with_model = int(self._options["images"]), bool(self._options.get("model"))
+            summary = self._trial.summary(results, images, with_model)
+            sink.metrics(summary.scalars)
+            sink.tags(summary.tags)
+            sink.artifacts(summary.files, summary.pictures)
+            sink.close("FINISHED", None)
+            self._keep(replace(self._run, complete=self._trial.results_hash()))
+
+    def _open(self, run: Run) -> None:
+        """Open ``run``, or a new one in its place if it shows results that are not the trial's."""
+        if run.token is None or run.complete not in (None, self._trial.results_hash()):
+            now = int(time.time() * 1000)
+            run = Run(token=uuid.uuid4().hex, started=now, replaces=run.token)
+        # Kept before the tracker creates the run, so that the token finds it even if the tracker's
+        # answer is lost.
+        self._keep(run)
+        name = self._sink.open(self._trial, run)
+        if name != run.id:
+            run = Run(token=run.token, started=run.started, id=name)
+        if not run.described:
+            self._sink.params(self._trial.params())
+            self._sink.tags(self._trial.tags())
+        self._keep(replace(run, described=True))
+
+    def _keep(self, run: Run) -> None:
+        self._run = run
+        write_json(self._file, run.to_json())
+
+
+def sync(
+    folders: Iterable[TrialFolder], uri: str | None, allowed: Sequence[str] = ()
+) -> Iterator[str]:
+    """Send what trackers lack of these trials; yields a line for each ended one, and a summary.
+
+    Of a trial that runs, the curves are sent. ``allowed`` are the modules whose code may run, and
+    the addresses that may get results. Raises MirrorError if the tracker refuses a trial.
+    """
+    new = already_there = 0
+    pages: Pages = {}
+    for folder in folders:
+        state = folder.state()
+        if state == "damaged":
+            yield f"left out: {folder.label}: damaged, see gsbench status"
+        if state in ("damaged", "missing"):
+            continue
+        try:
+            values = folder.configuration()
+        except InputError as error:
+            yield f"left out: {error}"
+            continue
+        options = values["tracking"] | ({"uri": uri} if uri else {})
+        # The runs folder may be a stranger's. It must not make gsbench send files or passwords to
+        # the stranger's address.
+        if address := foreign_address(options, [*allowed, *([uri] if uri else [])]):
+            yield (
+                f"left out: {folder.label}: its configuration names the tracker {address}, and "
+                f"--uri {address} was not typed"
+            )
+            continue
+        options = with_absolute_address(options)
+        if state == "partial" and not _state_file(folder, options).exists():
+            continue  # it never began to be sent
+        try:  # a class of a user's is run only with permission
+            make_sink(options, allowed)
+        except InputError as error:
+            yield f"left out: {folder.label}: {error}"
+            continue
+        try:
+            with place_for(options) as place, chdir(place):
+                is_new = mirror(folder, options, values, allowed, live=state == "running")
+        except BusyError:
+            yield f"{folder.label} is being mirrored by another process"
+            continue
+        except ERRORS as error:
+            raise refusal(folder, options, error) from error
+        if state == "running":
+            continue
+        if class_of(options) == MLFLOW:
+            pages[folder.home, options["uri"]] = folder, options
+        new, already_there = new + is_new, already_there + (not is_new)
+        if is_new:
+            yield f"mirrored {folder.label}"
+    for folder, options in pages.values():
+        try:
+            show_ideas(folder.home, options["uri"])
+        except Exception as error:  # any error of the tracker's client
+            raise refusal(folder, options, error) from error
+    yield f"{counted(new, 'trial')} mirrored now, {already_there} before"
+
+
+# for each experiment and tracker, a trial and its settings ``tracking``
+Pages = dict[tuple[Path, str | None], tuple[TrialFolder, dict[str, Any]]]
+
+
+def mirror(
+    folder: TrialFolder,
+    options: Mapping[str, Any],
+    values: dict[str, Any],
+    allowed: Sequence[str] = (),
+    live: bool = False,
+) -> bool:
+    """Send a trial that has ended or (``live``) runs; returns False if the tracker lacks nothing.
+
+    Raises the errors of `TrackerRun`.
+    """
+    with closing(TrackerRun(folder, options, values, allowed)) as run:
+        if live:
+            run.add_curves()
+        elif run.is_complete:
+            return False
+        else:
+            run.end()
+        return True
+
+
+def _state_file(folder: TrialFolder, options: Mapping[str, Any]) -> Path:
+    """The file in a trial's folder that says what its tracker has got."""
+    name = tracker_name(options)
+    own = class_of(options).startswith(OWN)
+    return folder.path / f"{name.lower() if own else f'tracker-{name}'}.json"
+
+
+def refusal(folder: TrialFolder, options: Mapping[str, Any], error: BaseException) -> MirrorError:
+    """A MirrorError, in one line, for an ``error`` of the tracker's client about a trial."""
+    lines = str(error).strip().splitlines()
+    reason = f"{type(error).__name__}: {lines[0][:200] if lines else ''}"
+    return MirrorError(f"{folder.label} could not be sent to {tracker_name(options)} ({reason})")

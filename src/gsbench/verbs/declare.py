@@ -1,0 +1,31 @@
+"""``gsbench declare``: write a sweep's questions and train nothing (docs/verdict.md)."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from gsbench.app.command import compose_trials
+from gsbench.files import checked_runs_folder, make_runs_folder
+from gsbench.launch.record import check_looks, planned_rows, record
+from gsbench.verbs.arguments import ArgumentParser
+from gsbench.words import counted
+
+
+def declare(argv: Sequence[str], runs: Path) -> int:
+    """Run the verb; raises InputError for a wrong sweep."""
+    parser = ArgumentParser(
+        "declare",
+        "It writes the questions of a sweep and trains nothing: for loops and arrays of jobs that "
+        "train its trials one by one. Each of these commands then asks nothing more.",
+    )
+    parser.add_argument("settings", nargs="*", metavar="KEY=VALUE", help="as of a sweep")
+    parser.add_argument("-m", "--multirun", action="store_true", help="is understood")
+    trials = compose_trials(parser.parse_args(argv).settings, multirun=True)
+    if any(trial.values["launch"]["stop_when_decided"] for trial in trials):
+        check_looks(trials, planned_rows(trials))
+    make_runs_folder(checked_runs_folder(trials[0].values["runs"]))
+    questions = record(trials)  # which says them
+    print(
+        f"{trials[0].values['name']}: {counted(len(trials), 'trial')} and "
+        f"{counted(len(questions), 'question')}"
+    )
+    return 0

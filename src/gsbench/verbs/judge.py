@@ -1,0 +1,169 @@
+"""``gsbench judge``: the verdict on results of any trainer, from a table or a folder of renders."""
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gsbench.analysis.frames import (
+    COLUMNS,
+    DIRECTIONS,
+    METHOD,
+    Declared,
+    compare_methods,
+    read_declared,
+)
+from gsbench.errors import InputError
+from gsbench.files import require_regular, writable_output, write_text
+from gsbench.verbs.arguments import ArgumentParser, comma_separated, names, path, whole_number
+from gsbench.words import counted, listed, printable
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+MOST_SEED = 10**9
+
+
+def judge(argv: Sequence[str], runs: Path) -> int:
+    """Run the verb; raises InputError for bad input."""
+    options = _parser().parse_args(argv)
+    if options.declare is not None:
+        return _declare(options)
+    if options.results is None:
+        raise InputError("judge needs RESULTS: a table (.csv) or a folder {arm}/{scene}/{seed}")
+    declared = None if options.declared is None else read_declared(options.declared)
+    if declared is not None:
+        _require_as_declared(options, declared)
+    elif options.baseline is None:
+        raise InputError("judge needs --baseline NAME, one of the methods")
+    frame = _frame(options, declared.metric if declared else options.metric)
+    comparison = compare_methods(
+        frame,
+        declared.baseline if declared else options.baseline,
+        declared.metric if declared else options.metric,
+        declared.least if declared else options.least,
+        DIRECTIONS[(declared.better if declared else options.better) or ""],
+        declared,
+        options.results.stem,
+    )
+    if options.json:
+        print(json.dumps(comparison.to_json(), indent=1))
+    else:
+        from gsbench.analysis.table_formats import to_markdown
+        from gsbench.analysis.tables import build_table
+
+        table = build_table(comparison.experiment, rows=("scene", "densify"), comparison=comparison)
+        print(to_markdown(replace(table, row_headings=("scene", METHOD))), end="")
+    if options.out is not None:
+        from gsbench.analysis.report.build import build_report
+
+        with writable_output(options.out):
+            write_text(options.out, build_report(comparison.experiment))
+        print(options.out, file=sys.stderr)
+    return 0
+
+
+def _parser() -> ArgumentParser:
+    parser = ArgumentParser(
+        "judge",
+        "RESULTS is a table with the columns method, scene, seed and metrics, or a folder of "
+        "renders {arm}/{scene}/{seed} (docs/other_trainers.md). A missing value is a training that "
+        "failed. The verdict has 5 %; it holds if metric, scenes and seeds were chosen before.",
+    )
+    parser.add_argument("results", nargs="?", type=path, metavar="RESULTS")
+    parser.add_argument(
+        "settings", nargs="*", metavar="KEY=VALUE", help="eval.… for a folder of renders"
+    )
+    parser.add_argument("--baseline", metavar="NAME", help="the method to compare with")
+    parser.add_argument("--metric", default="psnr", help="a column that decides (psnr)")
+    parser.add_argument(
+        "--better",
+        choices=[name for name in DIRECTIONS if name],
+        help="which values are better, for a metric that gsbench does not know",
+    )
+    parser.add_argument(
+        "--least", help="the least difference that matters, as 0.1 or 10%%; default: the metric's"
+    )
+    parser.add_argument(
+        "--truth", type=path, metavar="DIR", help="of a folder of renders: photographs by scene"
+    )
+    parser.add_argument("--out", type=path, metavar="FILE.html", help="write the report, too")
+    parser.flag("--json", "print a JSON object instead of the table")
+    parser.add_argument(
+        "--declared", type=path, metavar="FILE", help="the question that --declare wrote"
+    )
+    before = parser.add_argument_group("before the training")
+    before.add_argument(
+        "--declare", type=path, metavar="FILE", help="write the question, and judge nothing"
+    )
+    before.add_argument("--methods", type=names, metavar="A,B", help="all but the baseline")
+    before.add_argument("--scenes", type=names, metavar="A,B")
+    before.add_argument(
+        "--seeds",
+        type=comma_separated(lambda text: whole_number(MOST_SEED)(text) if text != "0" else 0),
+        metavar="0,1",
+    )
+    return parser
+
+
+def _declare(options: argparse.Namespace) -> int:
+    """Write the question of trainings to come."""
+    needed = ("baseline", "methods", "scenes", "seeds")
+    if lacking := [f"--{name}" for name in needed if not getattr(options, name)]:
+        raise InputError(f"judge --declare needs {listed(lacking)}, too")
+    if options.results is not None or options.declared is not None:
+        raise InputError("judge --declare comes before the results: leave them out")
+    asked = Declared(
+        baseline=options.baseline,
+        methods=options.methods,
+        metric=options.metric,
+        better=options.better or "",
+        least=options.least,
+        scenes=options.scenes,
+        seeds=tuple(options.seeds),
+    )
+    asked.write(options.declare)
+    trials = (1 + len(asked.methods)) * len(asked.scenes) * len(asked.seeds)
+    print(f"{options.declare}: {counted(len(asked.methods), 'question')}, {trials} trainings")
+    return 0
+
+
+def _require_as_declared(options: argparse.Namespace, declared: Declared) -> None:
+    """Raise InputError for an option that says something else than what was declared."""
+    given = {"baseline": options.baseline, "least": options.least, "better": options.better}
+    if options.metric != "psnr":
+        given["metric"] = options.metric
+    for name, value in given.items():
+        if value is not None and value != getattr(declared, name):
+            raise InputError(
+                f"--{name} {value}: {getattr(declared, name)} was declared: leave the option out"
+            )
+
+
+def _frame(options: argparse.Namespace, metric: str) -> "pd.DataFrame":
+    """The table of results; that of a folder is measured now."""
+    import pandas as pd  # here, since it is slow to import
+
+    place = options.results
+    if place.is_dir():
+        from gsbench.renders.measure import measure_folders
+
+        if options.truth is None:
+            raise InputError("a folder of renders needs --truth DIR: photographs by scene")
+        return pd.DataFrame(measure_folders(place, options.truth, options.settings))
+    if options.settings or options.truth is not None:
+        raise InputError("KEY=VALUE and --truth are for a folder of renders, not for a table")
+    try:
+        require_regular(place)
+        frame = pd.read_csv(place, dtype=dict.fromkeys(COLUMNS[:2], str), keep_default_na=True)
+    except FileNotFoundError:
+        raise InputError(f"{place}: no such file") from None
+    except (ValueError, UnicodeDecodeError, pd.errors.ParserError) as error:
+        raise InputError(f"{place} is no table of comma-separated values ({error})") from None
+    for name in COLUMNS[:2]:
+        if name in frame:
+            frame[name] = [printable(" ".join(str(value).split())) for value in frame[name]]
+    return frame

@@ -1,0 +1,136 @@
+"""Regions of renders: sums by hand, Smyth's prior and Benjamini-Hochberg against scipy, A/A."""
+
+import numpy as np
+import pytest
+from scipy import special, stats
+
+from gsbench.analysis.regions import (
+    _p_values,
+    compare_regions,
+    discoveries,
+    prior_of,
+    region_errors,
+    region_psnr,
+)
+from tests.helpers import refusal
+
+GRID = {"a": (6, 10), "b": (6, 10), "c": (5, 10)}
+
+
+def trials(rng, seeds, effect=0.0, common=0.0, of_view=0.0, smooth=False):
+    """Errors of ``seeds`` trainings on three views; noise in dB is 0.5, unlike by region."""
+    noise = {
+        view: np.random.default_rng(7).gamma(8, 0.5 / 8, shape) for view, shape in GRID.items()
+    }
+    found = []
+    for _ in range(seeds):
+        shift, errors = rng.normal(0, common), {}
+        for view, shape in GRID.items():
+            drawn = rng.normal(size=shape)
+            if smooth:  # neighbours share half of their noise
+                drawn = (drawn + np.roll(drawn, 1, axis=0) + np.roll(drawn, 1, axis=1)) / 3**0.5
+            decibel = 25 + shift + rng.normal(0, of_view) + noise[view] * drawn
+            if view == "a":
+                decibel[:2] += effect
+            errors[view] = 255**2 * 10 ** (-decibel / 10)
+        found.append(errors)
+    return found
+
+
+@pytest.mark.parametrize(
+    "height, width, rows, columns", [(64, 96, 2, 3), (70, 85, 2, 3), (9, 9, 1, 1)]
+)
+def test_a_region_has_the_mean_squared_error_of_its_pixels(height, width, rows, columns):
+    rng = np.random.default_rng(0)
+    render, truth = rng.integers(0, 256, (2, height, width, 3), dtype=np.uint8)
+    found = region_errors(render, truth)
+    assert found.shape == (rows, columns)
+    for row in range(rows):
+        for column in range(columns):
+            part = (
+                slice(32 * row, None if row == rows - 1 else 32 * (row + 1)),
+                slice(32 * column, None if column == columns - 1 else 32 * (column + 1)),
+            )
+            expected = np.mean((render[part].astype(int) - truth[part]) ** 2)
+            assert found[row, column] == pytest.approx(expected)
+
+
+def test_the_psnr_of_a_perfect_region_is_finite():
+    assert region_psnr(np.array([100.0]))[0] == pytest.approx(28.13, abs=0.01)
+    assert np.isfinite(region_psnr(np.zeros(1)))[0]
+
+
+@pytest.mark.parametrize("degrees, prior_degrees", [(2, 4.0), (3, 8.0)])
+def test_the_prior_is_found_again_from_variances_drawn_from_it(degrees, prior_degrees):
+    """Smyth's model: 1/σ² is scaled χ² of d0, s² is scaled χ² of d."""
+    rng = np.random.default_rng(1)
+    true = 0.3 * prior_degrees / rng.chisquare(prior_degrees, 200_000)
+    found, variance = prior_of(true * rng.chisquare(degrees, len(true)) / degrees, degrees)
+    assert found == pytest.approx(prior_degrees, rel=0.05)
+    assert variance == pytest.approx(0.3, rel=0.02)
+
+
+def test_equal_variances_have_a_prior_that_is_known_exactly():
+    rng = np.random.default_rng(2)
+    drawn = 2.0 * rng.chisquare(4, 50) / 4
+    drawn = np.sort(drawn)[10:-10]  # less spread than chance gives
+    found, variance = prior_of(drawn, 4)
+    assert np.isinf(found)
+    logs = np.log(drawn) - special.digamma(2.0) + np.log(2.0)
+    assert variance == pytest.approx(np.exp(logs.mean()))
+
+
+def test_discoveries_are_those_of_scipys_adjusted_p():
+    rng = np.random.default_rng(3)
+    p = [rng.uniform(size=(4, 5)) ** 3, rng.uniform(size=(2, 7)) ** 2]
+    adjusted = stats.false_discovery_control(np.concatenate([each.ravel() for each in p]))
+    lit = np.concatenate([each.ravel() for each in discoveries(p, 0.1)])
+    assert 0 < lit.sum() < len(lit)
+    np.testing.assert_array_equal(lit, adjusted <= 0.1)
+
+
+def test_without_a_common_shift_p_is_that_of_the_moderated_t():
+    """Smyth's equations 3 to 6 restated, where scene and views differ by nothing."""
+    rng = np.random.default_rng(4)
+    rows = rng.normal(size=(3, 400)) * rng.gamma(3, 1, 400)
+    rows -= rows.mean(axis=1, keepdims=True)  # no common shift
+    found = _p_values([rows])[0]
+    own = rows.var(axis=0, ddof=1)
+    d0, s0 = prior_of(own, 2)
+    moderated = (2 * own + d0 * s0) / (2 + d0)
+    t = rows.mean(axis=0) / np.sqrt(moderated / 3)
+    np.testing.assert_allclose(found, 2 * stats.t.sf(np.abs(t), 2 + d0), rtol=1e-6)
+
+
+def test_regions_with_an_effect_light_up_and_the_others_do_not():
+    rng = np.random.default_rng(5)
+    found = compare_regions(trials(rng, 4, effect=4.0), trials(rng, 4))
+    lit = dict(zip(found.p, discoveries(list(found.p.values())), strict=True))
+    assert lit["a"][:2].mean() > 0.8
+    assert found.change["a"][:2].mean() == pytest.approx(4.0, abs=0.3)
+    others = np.concatenate([lit["a"][2:].ravel(), lit["b"].ravel(), lit["c"].ravel()])
+    assert others.mean() < 0.05
+    assert found.spread["b"].mean() == pytest.approx(0.5, rel=0.3)
+
+
+def test_too_few_seeds_and_other_views_are_refused():
+    rng = np.random.default_rng(6)
+    with refusal("needs 3 pairs of seeds, got 2"):
+        compare_regions(trials(rng, 2), trials(rng, 2))
+    other = [{"a": errors["a"]} for errors in trials(rng, 3)]
+    with refusal("other test views"):
+        compare_regions(trials(rng, 3), other)
+
+
+@pytest.mark.parametrize("seeds", [3, 4])
+@pytest.mark.parametrize(
+    "noise",
+    [{}, {"common": 0.5}, {"of_view": 0.5}, {"smooth": True}, {"common": 0.2, "smooth": True}],
+    ids=str,
+)
+def test_trainings_of_one_arm_light_a_region_in_at_most_one_report_of_twenty(seeds, noise):
+    rng, lit, reports = np.random.default_rng(8), 0, 400
+    for _ in range(reports):
+        found = compare_regions(trials(rng, seeds, **noise), trials(rng, seeds, **noise))
+        lit += any(each.any() for each in discoveries(list(found.p.values())))
+    assert lit / reports <= 0.07  # 5 % and two standard errors of the simulation
