@@ -153,7 +153,7 @@ def write_trial(
         hashes={
             "config": HASH,
             "data": f"data-{scene}",
-            "train": f"t{seed}",
+            "train": f"t{seed} of {scene} {densify} {config_hash}",
             "init": INIT.key({"scene": scene, "init": init}),
         },
         versions={"gsbench": "0.1.0", "torch": "2.13.0", "pycolmap": "4.2.1"},

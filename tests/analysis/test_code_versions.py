@@ -4,15 +4,13 @@ import os
 
 import pytest
 
-from gsbench.analysis.comparison import compare
 from gsbench.analysis.differences import find_superseded
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import read_experiment
 from gsbench.analysis.tables import build_table
 from gsbench.runs import freshness
-from gsbench.runs.user_code import module_digest
 from gsbench.verbs.results import explain_cell
-from tests.analysis.helpers import loaded, page_of, trials_of
+from tests.analysis.helpers import loaded, page_of
 from tests.trials import write_trial
 
 OLD, NEW = "1" * 64, "2" * 64
@@ -71,11 +69,11 @@ def test_choices_by_earlier_code_are_counted(tmp_path):
     assert said in page
 
 
-def test_older_trials_with_other_settings_still_count(tmp_path):
+def test_settings_that_were_last_trained_with_other_code_are_folded(tmp_path):
     write_trial(tmp_path, 0, "aaaaaaaa", MINE | {"densify.views": 5}, psnr=27.0, _code=code(OLD))
     write_trial(tmp_path, 0, "bbbbbbbb", MINE | {"densify.views": 8}, psnr=28.0, _code=code(NEW))
     experiment = loaded(tmp_path)
-    assert (len(experiment.trials), experiment.older, experiment.warnings) == (2, (), ())
+    assert (len(experiment.trials), len(experiment.older), len(experiment.warnings)) == (1, 1, 1)
 
 
 @pytest.mark.parametrize(
@@ -97,35 +95,6 @@ def test_older_trials_of_gsbench_are_left_out(tmp_path, old, new, part):
     assert f"made by earlier versions of {part}: " in experiment.warnings[0]
 
 
-def test_the_code_that_is_here_now_counts_before_what_was_finished_last(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "patient.py").write_text("x = 1\n")
-    here = module_digest("patient", str(tmp_path))
-    made = {"sources": {"patient": here}, "stages": STAGES}
-    finished_at(write_trial(tmp_path, 0, "aaaaaaaa", MINE, psnr=27.0, _code=made), 1000)
-    other = {"sources": {"patient": NEW}, "stages": STAGES}
-    finished_at(write_trial(tmp_path, 0, "bbbbbbbb", MINE, psnr=28.0, _code=other), 2000)
-    assert trials_of(tmp_path)[0].metrics["psnr"] == 27.0
-    (tmp_path / "patient.py").write_text("# a comment\nx  =  1\n")
-    table = table_of(tmp_path)
-    assert table.rows[0].entries[0].text == "27.00"
-    assert not any("edited since" in note for note in table.notes)
-    (tmp_path / "patient.py").write_text("x = 2\n")
-    table = table_of(tmp_path)
-    assert table.rows[0].entries[0].text == "28.00"
-    line = (
-        "patient was edited since: 1 trial of sfm-adc came from the old code. Give the command again "
-        "to run the new one."
-    )
-    assert line in table.notes
-    experiment = loaded(tmp_path)
-    comparison = compare(experiment)
-    # the sweep's end, plan and site have the remarks
-    assert [*map(str, comparison.remarks)] == [line]
-    assert comparison.to_json()["left_out"][0] == line
-    assert line in build_report(experiment)
-
-
 @pytest.mark.parametrize(
     "first, second, best",
     [
@@ -143,9 +112,8 @@ def test_arms_are_compared_unless_they_share_code_in_two_versions(tmp_path, firs
     write_trial(tmp_path, 0, "aaaaaaaa", psnr=27.0, **first)
     write_trial(tmp_path, 0, "bbbbbbbb", psnr=28.0, densify="other", **second)
     table = table_of(tmp_path)
-    assert [entry.bold for row in table.rows for entry in row.entries] == [False, best]
-    said = "garden: not compared, no best marked: the arms differ in code of mine."
-    assert (said in table.notes) == (not best)
+    said = "the arms differ in code of mine, so they are not compared"
+    assert (said in table.verdicts[0]) == (not best)
 
 
 def test_explain_names_the_commit_and_the_edited_packages(tmp_path):

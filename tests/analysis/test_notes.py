@@ -3,7 +3,6 @@
 import html
 import itertools
 from dataclasses import replace
-from shlex import split
 from types import SimpleNamespace
 
 import pytest
@@ -19,8 +18,7 @@ from gsbench.runs.trial_record import (
     FROM_MODEL,
     FROM_RENDERS,
     ExternalTrainer,
-    InitialCloud,
-    TwinViews,
+    Oddity,
 )
 from tests.analysis.helpers import ADC, VOLUMETRIC, loaded, page_of, table_of
 from tests.helpers import read_json, write
@@ -81,97 +79,6 @@ def test_one_sentence_names_all_arms_with_unequal_counts(tmp_path):
     assert note.endswith(
         "give all arms densify.cap=governor densify.max_gaussians=60 and another name."
     )
-
-
-OF_FILE = ["hydra.searchpath=['file:///home/me/conf']"]
-DEMO, MINE = (
-    ["+experiment=demo"],
-    split("densify=adc densify._target_=mine.A allow_targets=[mine]"),
-)
-
-
-GRIDDED = (
-    '\'allow_targets=[mine]\' \'hydra.sweeper.grids=[{densify: "adc"}, {densify: "adc", '
-    'densify._target_: "mine.A"}]\''
-)
-
-
-@pytest.mark.parametrize(
-    "baseline, arm, command",
-    [
-        (
-            [*DEMO, "densify=adc"],
-            [*DEMO, "densify=volumetric"],
-            "`gsbench -m +experiment=demo densify=adc,volumetric seed=0,1 scene=garden ",
-        ),
-        (
-            ["densify=adc"],
-            ["densify=volumetric"],
-            "`gsbench -m densify=adc,volumetric seed=0,1 scene=garden densify.cap=governor",
-        ),
-        (
-            ["densify=adc"],
-            MINE,
-            f"`gsbench -m seed=0,1 scene=garden {GRIDDED} ++densify.cap=governor ",
-        ),
-        (
-            ["densify=adc", "launch.stop_when_decided=True"],
-            ["launch.stop_when_decided=True", *MINE],
-            f"`gsbench -m launch.stop_when_decided=True seed=0,1 scene=garden {GRIDDED} ",
-        ),
-        (
-            ["densify=adc", "launch.stop_when_decided=True"],
-            ["densify=adc", "~densify.cap", "x=1", "launch.stop_when_decided=True"],
-            "`gsbench -m densify=adc seed=0,1 scene=garden densify.cap=governor",
-        ),
-        (
-            [*OF_FILE, "densify=adc", "launch.stop_when_decided=True"],
-            [*OF_FILE, "densify=volumetric", "launch.stop_when_decided=True"],
-            "`gsbench -m --config-dir /home/me/conf densify=adc,volumetric "
-            "launch.stop_when_decided=True seed=0,1 scene=garden ",
-        ),
-        # a stranger's plan: nothing of it reaches the shell
-        (["densify=$(rm x)"], ["densify=y"], "`gsbench -m 'densify=$(rm x),y' seed=0,1"),
-    ],
-)
-def test_the_advice_on_unequal_counts_is_a_whole_command(tmp_path, baseline, arm, command):
-    made = trials_of(tmp_path, scenes=["garden"], seeds=(0, 1))
-    trials = [
-        with_record(trial, num_gaussians=12_345 + 9000 * (trial.densify == "volumetric"))
-        for trial in made
-    ]
-    words = {"adc": baseline, "volumetric": arm}
-    planned = {}
-    for trial in trials:
-        own = [*words[trial.densify], f"seed={trial.seed}", "scene=garden", "name=exp"]
-        place = trial.path.relative_to(tmp_path / "exp").as_posix()
-        planned[place] = {"overrides": [*own, "densify.cap=governor"]}
-    write(tmp_path / "exp/plan.json", {"trials": planned})
-    sentence = str(*counts_notes(trials, [(ADC, VOLUMETRIC)]))
-    assert f"{EQUAL}{command}" in sentence
-    plus = "++" if "_target_" in command else ""  # its choice may lack the settings
-    added = f" {plus}densify.cap=governor {plus}densify.max_gaussians=12300 name=exp_equal`"
-    assert added in sentence
-    lost = "~densify.cap" in arm  # no grid removes a setting
-    assert sentence.endswith("without looks, which need all arms in one command." if lost else "`.")
-
-
-def test_arms_without_a_common_seed_get_advice_for_all_seeds(tmp_path):
-    made = trials_of(tmp_path, scenes=["garden"], seeds=(0, 1))
-    trials = [
-        with_record(trial, num_gaussians=12_345 + 9000 * trial.seed)
-        for trial in made
-        if trial.seed == (trial.densify == "volumetric")
-    ]
-    words = {
-        trial.path.relative_to(tmp_path / "exp").as_posix(): {
-            "overrides": [f"densify={trial.densify}", f"seed={trial.seed}"]
-        }
-        for trial in trials
-    }
-    write(tmp_path / "exp/plan.json", {"trials": words})
-    (note,) = counts_notes(trials, [(ADC, VOLUMETRIC)])
-    assert note["advice"].startswith("`gsbench -m densify=adc,volumetric seed=0,1 ")
 
 
 def test_arms_that_the_governor_did_not_make_equal_need_a_longer_training():
@@ -300,14 +207,14 @@ def test_pictures_of_two_filters_are_noted(tmp_path, folders, downscales, noted)
 
 def test_results_that_are_worth_little_or_may_surprise_are_noted_once(tmp_path):
     made = trials_of(tmp_path, seeds=(0, 1), scenes=("garden",), densifiers=("adc",))
-    cloud = InitialCloud(
-        seen=1.0, color_agreement=None, identical=0.0, far=0, spread=1.0, warnings=["a", "b"]
-    )
+    odd = [
+        Oddity(rule="near-twins", line="1 of 6 test views have a near twin", value=1.0),
+        Oddity(rule="panorama", line="3 photographs are panoramas", value=3.0, refused=True),
+    ]
     changes = {
         "one_color_psnr": made[0].metrics["psnr"],
         "raster_passed_over": ["raster=triton is not used: alpha is off"],
-        "twins": TwinViews(near={"1.png": "2.png"}, left_out={"3.png": "4.png", "5.png": "4.png"}),
-        "initial_cloud": cloud,
+        "oddities": odd,
     }
     psnr = f"{made[0].metrics['psnr']:.2f}"
     second = with_record(made[1], **{**changes, "one_color_psnr": made[1].metrics["psnr"] - 0.1})
@@ -315,10 +222,8 @@ def test_results_that_are_worth_little_or_may_surprise_are_noted_once(tmp_path):
         f"(!) {made[0].label} is not better than one colour: PSNR {psnr} dB, the training views' "
         f"mean colour has {psnr}.",
         "raster=triton is not used: alpha is off.",
-        "garden: training has near twins of 1 of 6 test views, which so measure memory too.",
-        "garden: 2 photographs left out: another one has the same name or content.",
-        "Before training, garden sfm: a.",
-        "Before training, garden sfm: b.",
+        "garden sfm: 1 of 6 test views have a near twin.",
+        "garden sfm, accepted by scene.accept=[panorama]: 3 photographs are panoramas.",
     ]
     assert doubt_notes(made) == []
 

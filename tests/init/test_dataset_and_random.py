@@ -49,7 +49,7 @@ def test_dataset_keeps_the_cloud_of_the_model(courtyard, tmp_path):
     assert_array_equal(cloud.colors[:, 1], 2 * np.arange(20))
     assert report.num_points == 20
     assert report.mean_track_length == 3.0
-    assert any("only 20 points" in warning for warning in report.warnings)
+    assert any("only 20 points" in odd.line for odd in report.oddities)
 
 
 @pytest.mark.parametrize("seen_by", [1, 3])

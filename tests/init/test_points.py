@@ -264,8 +264,12 @@ def test_bad_files_are_refused_in_one_line(courtyard, tmp_path, name, make, mess
 def test_a_missing_file_is_refused_and_photos_without_cameras_need_a_reference(
     bare_photos, tmp_path
 ):
-    with refusal(r"init\.path=nowhere\.ply is not a file"):
+    with refusal(r"init\.path=nowhere\.ply is not a file$"):
         Points(path="nowhere.ply")
+    (tmp_path / "model/point_cloud").mkdir(parents=True)
+    (tmp_path / "model/point_cloud/a.ply").touch()
+    with refusal(r"model is not a file, but a folder: give .*/model/point_cloud/a\.ply$"):
+        Points(path=tmp_path / "model")
     save(tmp_path / "a.xyz", XYZ)
     assert Points(path=tmp_path / "a.xyz").needs_reference(replace(bare_photos))
 

@@ -20,7 +20,7 @@ from gsbench.init.colmap.alignment import (
 from gsbench.init.colmap.mapping import MappingResult
 from gsbench.init.colmap.reconstruct import poses_by_name
 from gsbench.init.reconstruction import Job, Matching, finish
-from gsbench.init.report import find_warnings, make_report
+from gsbench.init.report import make_report
 from gsbench.scene.types import Capture
 from tests.init.models import add_point, camera_at, model_with
 
@@ -83,49 +83,16 @@ def test_a_report_has_the_numbers_of_its_model(capture):
     assert report.versions["pycolmap"] == pycolmap.__version__
 
 
-def errors(**changes):
-    known = PoseErrors(4, True, 0.1, 0.1, 0.1, 0.04, 1.0, 1.0)
-    return {"pose_errors": replace(known, **changes)}
-
-
-@pytest.mark.parametrize(
-    "sound, doubtful, said",
-    [
-        (
-            {"num_registered": 9},
-            {"num_registered": 8},
-            "only 8 of 10 images have a pose (missing: ",
-        ),
-        ({}, {"num_registered": 8}, "(missing: a, b, c, d, e …)"),
-        (
-            {},
-            {"num_registered": 8, "unregistered": tuple("abcde")},
-            "(missing: a, b, c, d, e): the other photos",
-        ),
-        ({"num_points": 100}, {"num_points": 99}, "only 99 points"),
-        ({"mean_reprojection_error": 1.5}, {"mean_reprojection_error": 1.52}, "1.52 px is large"),
-        ({"mean_reprojection_error": None}, {"mean_reprojection_error": 40.0}, "40.00 px is large"),
-        (
-            errors(rotation_mean_deg=2.0, rotation_max_deg=90.0),
-            errors(rotation_mean_deg=2.1),
-            "turned 2.1 degrees against the true ones",
-        ),
-        (
-            errors(center_rmse_relative=0.05),
-            errors(center_rmse_relative=0.051, exact=False),
-            "5.1% of the scene extent away from the reference ones",
-        ),
-        (errors(center_rmse_relative=None), {"num_points": 0}, "only 0 points"),
-    ],
-)
-def test_each_limit_has_its_own_warning(capture, sound, doubtful, said):
-    model = model_of(CENTERS)
-    counts = dict.fromkeys(("num_images", "num_registered"), 10) | {"num_points": 100}
-    report = replace(reported(capture, model), unregistered=tuple("abcdef"), **counts)
-    assert find_warnings(report, model) == ()
-    assert find_warnings(replace(report, **sound), model) == ()
-    (warning,) = find_warnings(replace(report, **doubtful), model)
-    assert said in warning
+def test_doubts_about_a_model_are_measured_and_recorded(capture):
+    """The limits stand in gsbench.scene.rules."""
+    model = model_of(CENTERS, shift_px=2.0)
+    known = PoseErrors(4, False, 0.1, 0.1, 0.1, 0.06, 3.0, 90.0)
+    report = reported(replace(capture, image_names=tuple("abcdefgh")), model, pose_errors=known)
+    found = {odd.rule: odd.value for odd in report.oddities}
+    wanted = {"few-placed": 0.5, "few-points": 2, "reprojection-error": 2.0}
+    wanted |= {"cameras-turned": 3.0, "cameras-moved": 0.06}
+    assert found == pytest.approx(wanted)
+    assert report.to_dict()["oddities"][0]["rule"] == "few-placed"
 
 
 @pytest.mark.parametrize(
@@ -137,7 +104,7 @@ def test_a_field_of_view_outside_5_to_150_degrees_gives_a_warning(capture, focal
     model = model_of(CENTERS)
     model.cameras[1].params = [focal, focal, 50.0, 40.0]
     report = reported(capture, model)
-    assert any("implausible" in warning for warning in report.warnings) == (not 5 < view < 150)
+    assert any("implausible" in odd.line for odd in report.oddities) == (not 5 < view < 150)
 
 
 def test_a_similarity_leaves_no_pose_errors_and_a_tilt_does():

@@ -12,7 +12,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from shlex import split
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import submitit
@@ -58,7 +57,7 @@ class Mirrored:
     """Stands in for a `Mirror`, and keeps what it follows."""
 
     def __init__(self, idle=False):
-        self.idle, self.followed = idle, list[tuple[Path, Any]]()
+        self.idle, self.followed = idle, list[Path]()
 
     def __enter__(self):
         return self
@@ -66,8 +65,11 @@ class Mirrored:
     def __exit__(self, *error):
         pass
 
-    def follow(self, folder, settings):
-        self.followed.append((folder, settings))
+    def follow(self, folder, values):
+        self.followed.append(folder)
+
+    def trial_ended(self):
+        pass
 
 
 def job(folder, name):
@@ -104,7 +106,7 @@ def test_an_error_of_a_trial_becomes_its_outcome_unless_it_concerns_all(tmp_path
     ):
         outcome = run_one(failing, mirror, wait=True)
         assert outcome == Outcome(failing.folder, "failed", message, bad_input)
-    assert mirror.followed == [(failing.folder, {"sink": "of 0"})] * 3
+    assert mirror.followed == [failing.folder] * 3
     for raised in (BusyError("later"), DiskFullError("full"), KeyboardInterrupt()):
         with pytest.raises(type(raised)):
             run_one(failing, mirror, wait=True)
@@ -260,6 +262,16 @@ def test_a_job_gets_the_search_path_and_the_gpus_of_its_sweep(tmp_path, monkeypa
     )
 
 
+def test_a_job_whose_code_changed_since_its_command_fails_and_runs_nothing(
+    tmp_path, machine, monkeypatch
+):
+    monkeypatch.setattr(jobs, "run_one", lambda *arguments, **named: pytest.fail("it ran"))
+    one = trial(tmp_path, launch=SLURM)
+    outcome = TrialJob(one.values, [], {}, None, f"{digest_of(one.values)}-before")()
+    assert (outcome.status, outcome.bad_input) == ("failed", True)
+    assert outcome.message == "code changed since the command; give it again"
+
+
 class Jobs:
     """Stands in for submitit's executor; ``steps`` says after how many questions each job ends."""
 
@@ -312,7 +324,7 @@ def test_local_jobs_run_as_many_at_once_as_asked(tmp_path, monkeypatch, caplog, 
     assert executor.most == 2
     assert pauses == [1.0]  # whenever none has ended
     assert [one.folder for one in outcomes] == [trials[k].folder for k in (2, 0, 1, 3)]
-    assert [settings["sink"] for _, settings in mirror.followed] == ["of 0", "of 2", "of 1", "of 3"]
+    assert [folder.name[-1] for folder in mirror.followed] == ["0", "2", "1", "3"]
     assert executor.parameters == {"timeout_min": limit}
     assert caplog.messages[0] == ("4 trials, 2 at once; to see how far they are: gsbench status x")
     assert caplog.messages[1].startswith(f"{trials[2].files.label}: the process ended without")

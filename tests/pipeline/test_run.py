@@ -61,7 +61,17 @@ def test_a_trial_runs_unless_it_is_done_and_one_process_at_a_time(tmp_path, monk
         (InputError("no photos"), InputError, "no photos", True),
         (TrainingError("nan"), TrainingError, "nan", False),
         (KeyError("x"), KeyError, "KeyError: 'x'", False),
-        (torch.OutOfMemoryError("x"), TrainingError, "the memory of device=cuda is full: ", False),
+        (
+            torch.OutOfMemoryError("out of memory"),
+            TrainingError,
+            "device=cuda has no memory ",
+            False,
+        ),
+        (MemoryError("x"), TrainingError, "device=cuda has no memory left: lower ", False),
+        (
+            RuntimeError("[alloc_cpu.cpp] DefaultCPUAllocator: can't allocate memory: 9 bytes"),
+            *(TrainingError, "device=cuda has no memory left: ", False),
+        ),
         (RuntimeError("No space left"), DiskFullError, "the disk of ", False),
     ],
 )

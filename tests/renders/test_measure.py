@@ -144,7 +144,7 @@ def test_photographs_are_found_by_trial_folder_and_address(trial, runs, tmp_path
     assert "scene.width=7: the settings of the test views" in refused(*address, "scene.width=7")
     (tmp_path / "empty").mkdir()
     for place, words in (
-        (tmp_path / "empty", "holds no pictures"),
+        (tmp_path / "empty", "holds no pictures that gsbench reads: write PNG"),
         ("gardn", "is no folder, no trial EXPERIMENT:SCENE:ARM and no scene; did you mean"),
     ):
         assert words in refused("evaluate", renders, "--truth", place)

@@ -149,6 +149,23 @@ def test_archives_without_a_usable_name_are_refused(name, tmp_path, refused):
     assert "leads out of the archive" in refused("evaluate", as_tar(files, tmp_path / "names"))
 
 
+@pytest.mark.parametrize(
+    "name, content, said",
+    [
+        ("a.ply", b"ply\nformat ascii 1.0\n", "is a model: gsbench scene=SCENE init=ply"),
+        ("a.png", png(np.zeros((4, 4, 3), np.uint8)), "is one picture: give its folder"),
+        ("a.zip", b"version https://git-lfs.github.com/spec/v1\n", "is a pointer of Git LFS"),
+        ("renders/a.npy", b"NUMPY", "holds no pictures that gsbench reads, only a.npy: write PNG"),
+        ("renders/.a.png", b"", "holds no pictures that gsbench reads, only .a.png"),
+    ],
+)
+def test_renders_of_other_kinds_are_named_with_the_remedy(name, content, said, tmp_path, refused):
+    place = write(tmp_path / name, content)
+    photographs = as_folder({"a.png": png(np.zeros((4, 4, 3), np.uint8))}, tmp_path / "truth")
+    renders = place.parent if "/" in name else place
+    assert said in refused("evaluate", renders, "--truth", photographs)
+
+
 @pytest.mark.parametrize("said", [9, 11])
 def test_a_member_must_have_the_size_that_its_archive_says(said, tmp_path):
     with pytest.raises(ValueError, match=r"a\.png has another size"):

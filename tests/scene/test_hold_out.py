@@ -151,11 +151,9 @@ def test_settings_that_contradict_each_other_are_refused(settings, message):
         SceneConfig(**({"name": "a", "kind": "colmap", "path": "/a"} | settings))
 
 
-def test_too_many_sectors_and_photographs_without_cameras_are_refused():
+def test_too_many_sectors_are_refused():
     with refusal(r"scene\.sectors=8 are more than the 5 images"):
         hold_out(NAMES[:5], SplitRule(split="sector"), cameras=cameras)
-    with refusal("needs the cameras"):
-        hold_out(NAMES, SplitRule(split="sector"))
     with refusal("the last is 7"):
         hold_out(NAMES, SplitRule(sector=8))
 

@@ -121,7 +121,7 @@ def test_images_are_listed_by_real_folders_and_outside_ones_by_their_link(photos
 @pytest.mark.parametrize(
     "names, said",
     [
-        (["d.HEIC"], "1 HEIC file is not read: save as JPEG"),
+        (["d.HEIC"], "1 HEIC file is not read: save as PNG or JPEG"),
         (["d.DNG", "e.nef", "f.avif"], "2 raw files and 1 AVIF file are not read"),
         (["d.MOV"], "1 video file is not read"),
         (["._a.png", "Thumbs.db", "a.txt"], ""),

@@ -56,7 +56,7 @@ def test_files_with_another_extension_are_used_and_missing_ones_left_out(make_sc
     with caplog.at_level(logging.WARNING):
         capture = read_colmap("toy", root, images="images_2")
     assert capture.image_names == tuple(f"cam/{k}.png" for k in range(5))
-    assert "1 of 6 images of the model have no file: cam/5.JPG" in caplog.text
+    assert "1 image with a camera but without a file: cam/5.JPG" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -251,7 +251,6 @@ def test_a_split_without_views_is_refused():
     for options, said in (
         ({"test_every": 1}, "no training view"),
         ({"test": []}, "no test view"),
-        *(({"test_every": every}, "test_every must be positive") for every in (0, -1)),
     ):
         with refusal(said):
             split_names(names, **options)
@@ -327,7 +326,7 @@ def test_what_is_not_read_of_a_folder_is_named(make_scene, caplog):
     capture = read_colmap("toy", root)
     assert (capture.image_names, capture.test_names) == (plain.image_names, plain.test_names)
     assert "sparse/0: the binary model is read, and not the text beside it" in caplog.text
-    assert "1 of 7 photographs have no pose in the model: new.png" in caplog.text
+    assert "1 photograph without a pose in the model: new.png" in caplog.text
 
 
 def test_a_scene_is_named_after_its_folder_and_a_missing_model_is_reported(make_scene, tmp_path):

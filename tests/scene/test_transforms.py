@@ -351,8 +351,8 @@ def test_a_missing_file_and_a_name_that_fits_two_images_are_refused(tmp_path):
 def test_images_without_a_file_are_left_out(tmp_path, caplog):
     folder = write(tmp_path / "in")
     (folder / "images" / "4.png").unlink()
-    assert len(read_transforms(folder).names) == 5
-    assert "1 of 6 images have no file: ./images/4.png" in caplog.text
+    assert len(capture_of(folder, tmp_path / "made").image_names) == 5
+    assert "1 image with a camera but without a file: ./images/4.png" in caplog.text
 
 
 def reduced(folder, name="images_2"):
@@ -434,12 +434,14 @@ def test_a_frame_with_a_field_of_view_of_its_own_uses_no_focal_length_of_the_fil
 
 
 def test_a_focal_length_that_contradicts_the_field_of_view_is_used_with_one_line(tmp_path, caplog):
-    read_transforms(write(tmp_path, camera_angle_x=2 * math.atan(20 / 50 * 1.02)))
-    own = SIZE | {"fl_x": 25, "fl_y": 25, "cx": 10, "cy": 7}
-    found = cameras(tmp_path, in_frame(2, **own, **{"camera_angle_x": 2 * math.atan(10 / 25)}))
-    assert found["images/2.png"].params == (25, 25, 10, 7)
+    def read(edit=None, **changes):
+        return capture_of(write(tmp_path / "in", edit, **changes), tmp_path / "made")
+
+    read(camera_angle_x=2 * math.atan(20 / 50 * 1.02))
+    own = SIZE | {"fl_x": 25, "fl_y": 25, "cx": 10, "cy": 7.5}
+    read(in_frame(2, **own, **{"camera_angle_x": 2 * math.atan(10 / 25)}))
     assert not caplog.text
-    assert cameras(tmp_path, camera_angle_x=0.3)["images/3.png"].params[0] == 50
+    read(camera_angle_x=0.3)
     assert caplog.text.count("its focal length is 50 px, but its field of view means 132.") == 1
 
 

@@ -10,8 +10,8 @@ from pathlib import Path
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import hold
 from gsbench.tracking import Mirror
-from gsbench.tracking.tracker_run import mirror_ended
-from tests.helpers import write, write_lines
+from gsbench.tracking.sync import mirror
+from tests.helpers import read_json, write, write_lines
 from tests.trials import STEPS, results_of, trial_values
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -38,14 +38,14 @@ def begin_trial(values, uri=None, patience=30.0, **more):
 @contextmanager
 def following(settings, folder):
     """Mirror the trial in ``folder``, which runs while the block does."""
-    with Mirror() as mirror, hold(folder / ".lock", "a trial"):
-        mirror.follow(folder, settings)
+    with Mirror() as beside, hold(folder / ".lock", "a trial"):
+        beside.follow(folder, read_json(folder / "config.yaml") | {"tracking": settings})
         yield
 
 
 def mirror_trial(settings, folder, values, allowed=()):
     """Mirror an ended trial; False if nothing was missing. Raises any error of the tracker."""
-    return mirror_ended(TrialFolder(folder), settings, values, allowed)
+    return mirror(TrialFolder(folder), settings, values, allowed)
 
 
 def write_trial(folder, values, records=STEPS, psnr=20.0, **changes):

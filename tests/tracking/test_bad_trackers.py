@@ -138,11 +138,7 @@ def mirrors_of(program):
     def look():
         with suppress(psutil.NoSuchProcess):
             children = psutil.Process(program.pid).children(recursive=True)
-            found[:] = [
-                child
-                for child in children
-                if any("gsbench.tracking.mirror" in word for word in child.cmdline())
-            ]
+            found[:] = [child for child in children if "sync" in child.cmdline()]
         return bool(found)
 
     wait_until(look)

@@ -13,7 +13,7 @@ from PIL import Image
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import BusyError
 from gsbench.tracking import connect
-from gsbench.tracking.tracker_run import TrackerRun, make_sink
+from gsbench.tracking.sync import TrackerRun, make_sink
 from tests.conftest import ROOT
 from tests.helpers import read_json, refusal, write
 from tests.tracking.helpers import (

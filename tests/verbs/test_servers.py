@@ -99,8 +99,7 @@ def served(runs, monkeypatch):
             served.extend([(server, page, self.daemon)] * bool(page))
 
     write(runs / "mlflow.db", b"")
-    monkeypatch.setattr(servers, "publish", lambda home, uri: f"{len(home.name)}")
-    monkeypatch.setattr(servers, "version", lambda package: "3.17.0")
+    monkeypatch.setattr(servers, "show_ideas", lambda home, uri: f"{len(home.name)}")
     monkeypatch.setattr(servers, "serve", lambda uri, port: served.append((uri, port)) or 0)
     monkeypatch.setattr(servers.threading, "Thread", Thread)
     monkeypatch.setattr(servers, "_has_screen", lambda: True)
@@ -124,9 +123,9 @@ def test_the_dashboard_opens_at_the_only_experiment(runs, served, said):
     assert words == ["dashboard", "http://127.0.0.1:81"]  # one of two was not chosen
     served.clear()
     pages = said("ui cde --no-browser").split()
-    assert pages[0] == "arms"
-    assert pages[1].startswith(f"{LOCAL}/#/experiments/3/")
-    assert pages[2] == "table"
+    assert pages[0] == "ideas"
+    assert pages[1] == f"{LOCAL}/#/experiments/3/runs"
+    assert pages[2] == "bars"
     assert served == [(uri, 5000)]
 
 
@@ -156,7 +155,7 @@ def test_what_the_dashboard_cannot_show_is_refused(
         raise OSError("full")
 
     make_home(runs / "ab")
-    monkeypatch.setattr(servers, "publish", full)
+    monkeypatch.setattr(servers, "show_ideas", full)
     assert message in refused("ui", *words)
     assert served == []
 

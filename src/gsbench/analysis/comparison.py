@@ -17,14 +17,13 @@ from gsbench.analysis.old_declarations import all_questions
 from gsbench.analysis.pairs import are_equal
 from gsbench.analysis.quantities import choose_quantities
 from gsbench.analysis.questions import Asked, Row, choose_pairs, rows_of
-from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by
+from gsbench.analysis.results import Arm, Experiment, TrialResult
 from gsbench.analysis.sentences import asked_words, badge, headline, risk, sentence
 from gsbench.analysis.statistics import REFUTED, SUPPORTED
 from gsbench.analysis.verdicts import (
     ANSWERED,
     NOT_ASKED,
     NOT_TESTED,
-    SceneEstimate,
     Verdict,
     interval_of,
     judge,
@@ -112,7 +111,7 @@ class Comparison:
                 labels = [trial.label for trial in unused]
                 notes.append(Note.of("unused", trials=labels, arm=answer.arm))
             notes += [note for note in answer.verdict.notes if note.kind == "valueless"]
-        return [*notes, *edited_notes(self.trials), *same_bits_notes(self.trials)]
+        return [*notes, *same_bits_notes(self.trials)]
 
     def to_json(self) -> dict[str, Any]:
         """The verdicts and what is left out, for other programs."""
@@ -302,29 +301,6 @@ def winners(comparison: Comparison) -> dict[tuple[str, frozenset[str]], set[Arm]
         else:
             worse.update(sides)
     return {place: better - worse for place, (better, worse) in found.items()}
-
-
-def scenes_of(answer: Answer) -> tuple[SceneEstimate, ...]:
-    """The estimates of the single scenes of an answer."""
-    return answer.verdict.scenes
-
-
-def edited_notes(trials: Sequence[TrialResult]) -> list[Note]:
-    """A note for each of the user's modules that was edited after it made some of the trials."""
-    of_module: dict[str, list[TrialResult]] = {}
-    # Trials of one version of the code have the same edits, and finding them reads the modules.
-    for own in group_by(trials, lambda trial: frozenset(trial.code.items())).values():
-        for edit in own[0].edits:
-            of_module.setdefault(edit.name, []).extend(own)
-    return [
-        Note.of(
-            "edited",
-            module=module,
-            trials=len(own),
-            arms=sorted({f"{trial.init}-{trial.densify}" for trial in own}),
-        )
-        for module, own in of_module.items()
-    ]
 
 
 def same_bits_notes(trials: Sequence[TrialResult]) -> list[Note]:

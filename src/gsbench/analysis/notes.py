@@ -128,13 +128,9 @@ SENTENCES: dict[str, str] = {
         "Pictures of scene.images and of scene.downscale were made by different filters: results "
         "on them differ by about 0.3 to 0.45 dB."
     ),
-    "near twins": (
-        "{scene}: training has near twins of {near} of {tested:n test view}, which so measure "
-        "memory too."
-    ),
-    "copies": "{scene}: {copies:n photograph} left out: another one has the same name or content.",
     "few rounds": FEW_ROUNDS,
-    "cloud": "Before training, {scene} {init}: {doubt}.",
+    "odd": "{scene} {init}: {doubt}.",
+    "accepted": "{scene} {init}, accepted by scene.accept=[{rule}]: {doubt}.",
     "program's model": (
         "Trained here by another program, its model rendered by gsbench (its time is that of the "
         "whole program, and it sets its own budget): {arms:list}."
@@ -150,10 +146,6 @@ SENTENCES: dict[str, str] = {
     "foreign renders": (
         "Renders of another program, measured as they are (its conditions are not known): "
         "{arms:list}."
-    ),
-    "edited": (
-        "{module} was edited since: {trials:n trial} of {arms:few} came from the old code. Give "
-        "the command again to run the new one."
     ),
     "machines": (
         "The trials ran on {kinds} kinds of machine: {trials:parts}. There equal settings give "

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from gsbench.analysis.trial_result import TrialResult as TrialResult
-from gsbench.analysis.trial_settings import Configurations
+from gsbench.analysis.trial_settings import Configurations, settings_text
 from gsbench.errors import InputError
 from gsbench.files import require_no_links
 from gsbench.parsing import DamagedError, one_line
@@ -233,23 +233,38 @@ def newest_code(experiment: Experiment) -> Experiment:
     older: list[TrialResult] = []
     # {(part, version that counts): {earlier version: its trials}}
     replaced: dict[tuple[str, str], dict[str, list[TrialResult]]] = {}
+
+    def fold(made: Sequence[TrialResult], now: Sequence[TrialResult], name: str) -> None:
+        older.extend(made)
+        change = _change_of_code(made[0], now[0]) if now else Change("code", name, now="newer")
+        earlier = replaced.setdefault((change.name, change.now), {})
+        earlier.setdefault(change.made, []).extend(made)
+
     for name, own in group_by(experiment.trials, lambda t: f"{t.init}-{t.densify}").items():
         versions = group_by(own, lambda trial: code_in(trial.digest))
-        last = max(versions, key=lambda version: max(t.finished for t in versions[version]))
-        newest = code.get(name, last)
+        newest = code.get(name, max(versions, key=lambda version: _last(versions[version])))
         for version, made in versions.items():
             if version != newest:
-                older += made
-                now = versions.get(newest)
-                change = _change_of_code(made[0], now[0]) if now else Change("code", name, version)
-                earlier = replaced.setdefault((change.name, change.now or "newer"), {})
-                earlier.setdefault(change.made, []).extend(made)
+                fold(made, versions.get(newest, []), name)
+        # an update of gsbench: the trials of a scene and settings that it repeated
+        same = group_by(versions.get(newest, []), lambda t: (t.scene, settings_text(t.config)))
+        for repeated in same.values():
+            stages = group_by(repeated, lambda trial: frozenset(trial.code.items()))
+            last = max(stages.values(), key=_last)
+            for made in stages.values():
+                if made is not last:
+                    fold(made, last, name)
     if not older:
         return experiment
     left_out = {trial.path for trial in older}
     kept = tuple(trial for trial in experiment.trials if trial.path not in left_out)
     lines = tuple(_versions_line(*part, earlier) for part, earlier in replaced.items())
     return replace(experiment, trials=kept, older=(*experiment.older, *older), versions=lines)
+
+
+def _last(trials: Sequence[TrialResult]) -> float:
+    """When the last of the trials was finished."""
+    return max(trial.finished for trial in trials)
 
 
 def _change_of_code(made: TrialResult, newest: TrialResult) -> Change:

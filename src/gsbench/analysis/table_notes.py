@@ -12,7 +12,7 @@ from gsbench.analysis.results import TrialResult, group_by, seeds_text
 from gsbench.events import FEWEST_ROUNDS
 from gsbench.runs.layout import EVENTS
 from gsbench.runs.nested import SHOWN
-from gsbench.runs.trial_record import FROM_MODEL, FROM_RENDERS, TwinViews
+from gsbench.runs.trial_record import FROM_MODEL, FROM_RENDERS
 from gsbench.words import counted
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ def doubt_notes(trials: Sequence[TrialResult]) -> list[Note]:
     """Notes on results that are worth little or may surprise.
 
     They are about renders not better than one colour, executors that failed their proof, pictures
-    made by different filters, twins, and doubts about initial points.
+    made by different filters, and what rules found odd (`gsbench.scene.rules`).
     """
     notes = []
     for trial in trials:
@@ -94,19 +94,13 @@ def doubt_notes(trials: Sequence[TrialResult]) -> list[Note]:
     downscales = {config.get("scene.downscale") for config in known}
     if len(folders) > 1 and len(downscales) > 1:
         notes.append(Note.of("filters"))
-    for trial in trials:
-        twins, tested = trial.record.twins or TwinViews(), trial.record.test_views
-        if near := len(twins.near):
-            notes.append(Note.of("near twins", scene=trial.scene, near=near, tested=tested))
-        if copies := len(twins.left_out):
-            notes.append(Note.of("copies", scene=trial.scene, copies=copies))
     by_arm = group_by(trials, lambda trial: trial.key.partition("/")[2])  # of one schedule each
     notes += [note for own in by_arm.values() if (note := _rounds_note(own[0]))]
     for trial in trials:
-        cloud = trial.record.initial_cloud
-        doubts = [] if cloud is None else cloud.warnings
         place = {"scene": trial.scene, "init": trial.init}
-        notes += [Note.of("cloud", **place, doubt=line) for line in doubts]
+        for odd in trial.record.oddities:
+            kind = "accepted" if odd.refused else "odd"
+            notes.append(Note.of(kind, **place, rule=odd.rule, doubt=odd.line))
     return list(dict.fromkeys(notes))  # trials of one cloud have the same notes
 
 

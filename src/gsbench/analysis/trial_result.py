@@ -1,17 +1,16 @@
 """A complete trial as tables and verdicts see it: its record, settings, code and conditions."""
 
-import os
 import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from gsbench.analysis.trial_settings import Configurations, canonical, config_if_readable
 from gsbench.runs.commands import Digest, make_digest
 from gsbench.runs.experiments import QUESTIONS, Arm, trial_key, unix_time
-from gsbench.runs.freshness import Change, Part, code_changes, code_of, present_version
+from gsbench.runs.freshness import Part, code_of
 from gsbench.runs.layout import RESULTS
 from gsbench.runs.nested import SHOWN
 from gsbench.runs.trial_folder import TrialFolder
@@ -126,12 +125,6 @@ class TrialResult:
         """``code of mine 3fa9c1d2`` for each of the user's modules and of gsbench's stages."""
         shown = [part for part in self.code if part.kind != "package"]
         return [f"{part} {self.code[part]:.{SHOWN}}" for part in shown]
-
-    @cached_property
-    def edits(self) -> list[Change]:
-        """The user's modules that were edited since, as far as they are found from here."""
-        modules = {part: made for part, made in self.code.items() if part.kind == "module"}
-        return list(code_changes(modules, partial(present_version, folder=os.getcwd())))
 
     @cached_property
     def finished(self) -> float:

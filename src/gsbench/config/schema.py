@@ -79,7 +79,7 @@ class TrackingConfig:
     _target_: TargetName = "gsbench.tracking.MLflow"
     # null: $MLFLOW_TRACKING_URI, else sqlite in the runs folder; W&B: $WANDB_BASE_URL
     uri: Address | None = None
-    flush_seconds: PositiveFloat = 10.0
+    flush_seconds: PositiveFloat = 60.0  # between two sendings while trials run
     # waiting for a slow tracker at the end; `gsbench sync` sends the rest
     patience_seconds: NonNegativeFloat = 30.0
     images: NonNegativeInt = 4  # test renders mirrored per trial

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from gsbench.errors import InputError
 from gsbench.logs import Progress, no_progress
+from gsbench.runs.trial_record import Oddity
 from gsbench.scene.types import Capture
 
 # below the output folder: where COLMAP users and 3DGS trainers look for a model
@@ -160,6 +161,7 @@ class InitReport:
     # None without a reference, or if the poses are those of the reference
     pose_errors: PoseErrors | None = None
     warnings: tuple[str, ...] = ()
+    oddities: tuple[Oddity, ...] = ()
     # features, pairs, verified pairs, inlier matches
     counts: Mapping[str, int] = field(default_factory=dict)
     # the mapping strategy that placed the cameras (init.mapper); None if they were given

@@ -27,7 +27,7 @@ from gsbench.init.colmap.pairs import ALL_PAIRS_UP_TO
 from gsbench.init.options import ColmapOptions
 from gsbench.logs import Progress
 from gsbench.scene.exif import lens_of
-from gsbench.scene.options import MIN_IMAGES
+from gsbench.scene.rules import MIN_IMAGES
 from gsbench.scene.types import Capture
 from gsbench.system.isolate import run_with_progress
 from gsbench.words import counted, some_of

@@ -23,7 +23,7 @@ from gsbench.runs.store import Store
 from gsbench.runs.user_code import PERMISSIONS
 from gsbench.system.stopping import stop_on_signals
 from gsbench.tracking import Mirror
-from gsbench.tracking.tracker_run import make_sink
+from gsbench.tracking.sync import make_sink
 
 log = logging.getLogger(__name__)
 

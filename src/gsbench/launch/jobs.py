@@ -95,7 +95,7 @@ def run_one(trial: Trial, mirror: Mirror, wait: bool) -> Outcome:
 
     Errors become its outcome, except BusyError, DiskFullError, and exceptions that end the program.
     """
-    mirror.follow(trial.folder, trial.values["tracking"])
+    mirror.follow(trial.folder, trial.values)
     try:
         # imported here, because a finished sweep needs no torch
         from gsbench.pipeline.trial import run_trial
@@ -105,6 +105,8 @@ def run_one(trial: Trial, mirror: Mirror, wait: bool) -> Outcome:
         raise
     except Exception as error:  # noqa: BLE001 - a failed trial does not stop the others
         return outcome_of_error(trial.folder, error)
+    finally:
+        mirror.trial_ended()
 
 
 # ---- processes of this machine
@@ -265,10 +267,11 @@ def _run(
                 # passes it on below.
                 with interrupts_ignored():
                     running[trial.folder] = executor.submit(job_of(trial))
-                mirror.follow(trial.folder, trial.values["tracking"])
+                mirror.follow(trial.folder, trial.values)
             ended = [folder for folder, job in running.items() if job.done()]
             for folder in ended:
                 outcomes.append(collect(running.pop(folder), folder, trials))
+                mirror.trial_ended()
                 repeats.note(by_folder[folder], outcomes[-1])
                 say_last(outcomes, labels)
             show(len(outcomes), [by_folder[folder] for folder in running])

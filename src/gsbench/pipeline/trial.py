@@ -61,6 +61,7 @@ from gsbench.runs.trial_record import (
     Budget,
     Code,
     Evaluation,
+    Oddity,
     Training,
     TrialRecord,
     TwinViews,
@@ -68,9 +69,11 @@ from gsbench.runs.trial_record import (
 )
 from gsbench.runs.user_code import user_modules
 from gsbench.scene.colmap_files import model_files
+from gsbench.scene.rules import settle
 from gsbench.scene.types import Capture, Scene
 from gsbench.system.install import version_of
 from gsbench.system.locks import hold
+from gsbench.system.resources import lacks_memory
 from gsbench.system.stopping import reinstall_handlers
 from gsbench.train.kernels import compiled_beside
 from gsbench.train.proof import Proven
@@ -180,10 +183,13 @@ def _recorded_failures(values: dict[str, Any], folder: TrialFolder) -> Iterator[
                     "returning"
                 )
                 raise TrainingError(text) from ended
-            except torch.OutOfMemoryError as error:
+            except (RuntimeError, MemoryError) as error:
+                if not lacks_memory(error):
+                    raise
                 raise TrainingError(
-                    f"the memory of device={values['device']} is full: lower scene.max_size or the "
-                    "number of trials at once (launch.parallel), or end other programs there"
+                    f"device={values['device']} has no memory left: lower scene.max_size, "
+                    "densify.max_gaussians or the number of trials at once (launch.parallel), or "
+                    "end other programs there"
                 ) from error
     except Exception as error:
         log.debug("the trial failed", exc_info=True)
@@ -346,11 +352,17 @@ def results_of(
     entries by stage. ``code`` maps the parts of gsbench's source that the steps used to their
     states. ``asked`` are the ids of the questions that covered the trial before its training.
     """
-    stages = keys.TRAIN, keys.EVALUATE
+    stages = keys.INIT, keys.TRAIN, keys.EVALUATE
     init, trained, evaluated = (entries[stage.name] for stage in stages)
     training = read_typed(trained.path / layout.TRAINING, Training)
     evaluation = read_typed(evaluated.path / layout.METRICS, Evaluation)
     manifest = read_manifest(evaluated.path)
+    init_report = read_json(init.path / REPORT_FILE)
+    of_model = [Oddity(**odd) for odd in init_report.get("oddities", ())]
+    oddities = [*capture.oddities, *scene.oddities, *of_model, *training.oddities]
+    # A stage of the store may have been made with a rule accepted that is not accepted here.
+    refused = [odd for odd in oddities if odd.refused]
+    settle(refused, f"scene {capture.name}", capture.accept)
     is_ready_made = training.trained_by is None and not training.iterations
     seconds = {"init": init.seconds, "train": training.seconds, "evaluate": evaluated.seconds}
     if is_ready_made:
@@ -375,6 +387,7 @@ def results_of(
         questions=asked,
         metric_facts=evaluation.facts,
         metrics_at=evaluation.at,
+        oddities=oddities,
         twins=TwinViews(
             left_out={**capture.left_out, **scene.twins.left_out}, near=dict(scene.twins.near)
         ),
@@ -391,7 +404,7 @@ def results_of(
         held_out=capture.held_out,
         resolution=max((view.camera.width, view.camera.height) for view in views),
         events=sum_events(read_rows(trained.path / layout.EVENTS)),
-        init_report=read_json(init.path / REPORT_FILE),
+        init_report=init_report,
         hashes={
             "config": config_hash(values),
             "arm": arm_hash(values),

@@ -26,11 +26,11 @@ from gsbench.renders.predictions import opened_renders
 from gsbench.renders.truth import (
     ReferenceImages,
     find_reference_images,
+    picture_names,
     pictures_in,
     reference_images_of,
 )
 from gsbench.runs.user_code import PERMISSIONS
-from gsbench.scene.images import list_images
 from gsbench.system.device import select_device
 from gsbench.system.own_modules import allow_modules
 from gsbench.system.resources import available_threads
@@ -60,7 +60,7 @@ def measure_folders(
         for done, folder in enumerate(folders, 1):
             method, scene, seed = folder.relative_to(root).parts
             images = pictures_in(truth / scene, settings)
-            matching = match_pictures(list(images.photographs), list_images(folder))
+            matching = match_pictures(list(images.photographs), picture_names(folder))
             pairs = [
                 PicturePair(view, path, folder / matching.pairs[view])
                 for view, path in images.photographs.items()
@@ -91,7 +91,7 @@ def _measure(
         destination = find_destination(options.place, options.scene, options.seed, truth, runs)
         check_destination(destination, truth, runs)
     match = match_by_order if options.by_order else match_pictures
-    matching = match(list(truth.photographs), list_images(renders))
+    matching = match(list(truth.photographs), picture_names(renders))
     pairs = [
         PicturePair(view, path, renders / matching.pairs[view], truth.masks.get(view))
         for view, path in truth.photographs.items()

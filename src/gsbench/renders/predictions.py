@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import IO
 
 from gsbench.errors import InputError
-from gsbench.files import DAMAGE, is_safe_member, require_regular
+from gsbench.files import DAMAGE, GIT_LFS, LFS_REMEDY, is_safe_member, require_regular
 from gsbench.words import readable_bytes
 
 RENDERED, PHOTOGRAPHS = "color", "gt-color"
@@ -40,6 +40,8 @@ def opened_renders(place: Path) -> Iterator[tuple[Path, Path | None]]:
     if not place.exists():
         raise InputError(f"{place} is not a folder of renders")
     require_regular(place)
+    if kind := _kind_of(place):
+        raise InputError(f"{place} is {kind}")
     with tempfile.TemporaryDirectory(prefix="gsbench-") as scratch:
         try:
             _unpack(place, Path(scratch))
@@ -50,6 +52,18 @@ def opened_renders(place: Path) -> Iterator[tuple[Path, Path | None]]:
                 f"{place} cannot be unpacked ({error}): give a folder, a .zip or a .tar.gz"
             ) from None
         yield Path(scratch) / RENDERED, Path(scratch) / PHOTOGRAPHS
+
+
+MODEL = "a model: gsbench scene=SCENE init=ply init.path=FILE train=none densify=none measures it"
+PICTURE = "one picture: give its folder"
+# By the first bytes of a file that is no archive: what it is, and what to do.
+OTHERS = {GIT_LFS: LFS_REMEDY, b"ply": MODEL, b"\x89PNG": PICTURE, b"\xff\xd8": PICTURE}
+
+
+def _kind_of(place: Path) -> str:
+    with place.open("rb") as file:
+        start = file.read(len(GIT_LFS))
+    return next((kind for first, kind in OTHERS.items() if start.startswith(first)), "")
 
 
 def _unpack(archive: Path, scratch: Path) -> None:

@@ -18,7 +18,7 @@ from gsbench.runs.trial_folder import TrialFolder
 from gsbench.scene.images import image_size, list_images, png_name
 from gsbench.scene.pipe import fingerprint
 from gsbench.view.trials import find_trial
-from gsbench.words import did_you_mean
+from gsbench.words import did_you_mean, some_of
 
 CAMERAS_ONLY = ("init=random", "init.count=100")  # the fastest initialiser; its points are not used
 
@@ -120,10 +120,17 @@ def _masks(folder: Path, views: Iterable[str]) -> dict[str, Path]:
     return {view: file for view, file in files.items() if file.is_file()}
 
 
+def picture_names(folder: Path) -> list[str]:
+    """The names of the pictures in a folder; raises `InputError` if none can be read."""
+    if names := list_images(folder):
+        return names
+    others = sorted(path.name for path in folder.iterdir() if path.is_file())
+    found = f", only {some_of(others)}" if others else ""
+    raise InputError(f"{folder} holds no pictures that gsbench reads{found}: write PNG of 8 bits")
+
+
 def pictures_in(folder: Path, settings: Sequence[str]) -> ReferenceImages:
-    names = list_images(folder)
-    if not names:
-        raise InputError(f"--truth {folder} holds no pictures")
+    names = picture_names(folder)
     photographs = {name: folder / name for name in names}
     resolution = max(image_size(path) for path in photographs.values())
     config = compose_one(list(settings)).values

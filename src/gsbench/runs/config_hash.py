@@ -9,9 +9,10 @@ from gsbench.runs.user_code import PERMISSIONS, user_modules
 # Options that cannot change a result. This holds for gsbench's own classes; a user's class may use
 # the names otherwise.
 WITHOUT_EFFECT = ("threads", "weights", "download", "time_limit_minutes")
-# Settings that only declare how results are read or what an ablation may turn off.
+# Settings that only declare what is accepted, how results are read or what may be turned off.
 # train.steps_scaler has been applied to the steps.
 DECLARED = {
+    "scene": ("accept",),
     "eval": ("primary", "baseline", "controls"),
     "densify": ("switches",),
     "train": ("steps_scaler",),

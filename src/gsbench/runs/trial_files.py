@@ -5,6 +5,7 @@ from typing import Any
 
 from gsbench.parsing import Amount, Count, Raw, Record, fault_of, one_line
 from gsbench.settings import FolderName
+from gsbench.words import as_line
 
 Stamp = tuple[int, ...]  # size in bytes, times of change in ns
 
@@ -40,7 +41,7 @@ class Failure(Record):
     """``failed.json``: the error's type, its text, its traceback, and the Unix time."""
 
     error: str = ""
-    message: str = ""
+    message: Raw = ""  # of several lines; `reason` is the first
     traceback: Raw = field(default="", repr=False)
     time: Amount = 0.0
     seed: Count = 0
@@ -50,7 +51,7 @@ class Failure(Record):
     def reason(self) -> str:
         """The first line of the message."""
         lines = (self.message or self.error).strip().splitlines()
-        return one_line(lines[0]) if lines else "no reason was given"
+        return one_line(as_line(lines[0])) if lines else "no reason was given"
 
 
 class Building(Record):

@@ -96,6 +96,18 @@ class ExternalTrainer(Record):
     command: list[str] = field(default_factory=list)
 
 
+class Oddity(Record):
+    """What one rule of gsbench.scene.rules found odd about a capture, its model or its points.
+
+    ``refused`` says that the value is not usable, and that the rule was accepted.
+    """
+
+    rule: Text
+    line: Text
+    value: Number
+    refused: bool = False
+
+
 class InitialCloud(Record):
     """Facts of the initial points, measured before the first iteration (`gsbench.train.start`)."""
 
@@ -107,7 +119,7 @@ class InitialCloud(Record):
     far: Count
     # the median distance of points from their median place, over that of the training cameras
     spread: Amount
-    warnings: list[str]  # about points and training cameras, as logged
+    warnings: list[str] = field(default_factory=list)  # of earlier versions
 
 
 class TwinViews(Record):
@@ -183,6 +195,7 @@ class TrialRecord(Record):
     causes: dict[str, Count] = field(default_factory=dict)
     scene_extent: Amount | None = None  # units of the given coordinates
     initial_cloud: InitialCloud | None = None
+    oddities: list[Oddity] = field(default_factory=list)
     twins: TwinViews | None = None  # None: not looked for
     # from the given coordinates to those of the training; None: the same
     normalization: Normalization | None = None
@@ -276,6 +289,7 @@ class Training(Record):
     # gsbench's commit, and whether files were edited
     checkout: dict[str, Any] = field(default_factory=dict)
     initial_cloud: InitialCloud | None = None
+    oddities: list[Oddity] = field(default_factory=list)  # of the initial points
     # compiling kernels for it, in no other time; None if another program trained
     compile_seconds: Amount | None = None
     evaluated_from: Literal["model", "renders"] | None = None

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsbench.errors import InputError
-from gsbench.scene.options import MIN_IMAGES, TEST_EVERY, SplitRule
+from gsbench.scene.options import TEST_EVERY, SplitRule
 from gsbench.scene.types import Array, Camera, CameraModel
 from gsbench.words import counted, some_of
 
@@ -140,7 +140,7 @@ def _azimuths(cameras: Sequence[Camera], centers: Array) -> tuple[Array | None, 
     return np.round(degrees, AZIMUTH_DECIMALS).astype(np.float64) % 360.0, ""
 
 
-def select_images(names: Sequence[str], max_images: int, least: int = MIN_IMAGES) -> list[str]:
+def select_images(names: Sequence[str], max_images: int) -> list[str]:
     """Select at most ``max_images`` of n names: the k-th of m selected has index ``k * n // m``.
 
     The first name is always kept, and views on a closed ring stay evenly spaced. Images are
@@ -150,8 +150,6 @@ def select_images(names: Sequence[str], max_images: int, least: int = MIN_IMAGES
         >>> select_images(["a", "b", "c", "d", "e"], 3)
         ['a', 'b', 'd']
     """
-    if max_images < least:
-        raise InputError(f"scene.max_images must be at least {least}, got {max_images}")
     if len(names) <= max_images:
         return list(names)
     return [names[k * len(names) // max_images] for k in range(max_images)]
@@ -171,8 +169,6 @@ def split_names(
 
     Raises `InputError` if there is no training view or no test view.
     """
-    if test_every < 1:
-        raise InputError(f"scene.test_every must be positive, got {test_every}")
     if train is None and test is None:
         held_out = set(names[::test_every])
     elif test is None:
@@ -250,7 +246,7 @@ def _divide(
             chosen, description = _sector(names, rule, matched, cameras)
         else:
             assert matched is not None
-            chosen = select_images(names, matched, least=1)
+            chosen = select_images(names, matched)
             spread = f"{matched} evenly spread over the sorted names"
             description = f"{spread}, as many as in a sector of {rule.sectors}"
         train, test = split_names(names, test=chosen)
@@ -260,11 +256,7 @@ def _divide(
 def _sector(
     names: Sequence[str], rule: SplitRule, exactly: int | None, cameras: CamerasByName | None
 ) -> tuple[list[str], str]:
-    if cameras is None:
-        raise InputError(
-            "scene.split=sector needs the cameras, and these photographs came without: give a "
-            "COLMAP model (scene=colmap; gsbench export writes that of a trial)"
-        )
+    assert cameras is not None  # `SceneConfig` refuses sectors of photographs alone
     if len(names) < rule.sectors:
         raise InputError(
             f"scene.sectors={rule.sectors} are more than the {len(names)} images: give fewer"

@@ -74,7 +74,9 @@ def list_images(folder: Path) -> list[str]:
     if unread:
         files = " and ".join(counted(count, f"{kind} file") for kind, count in unread.items())
         is_one = unread.total() == 1
-        log.warning("%s: %s %s not read: save as JPEG", folder, files, "is" if is_one else "are")
+        log.warning(
+            "%s: %s %s not read: save as PNG or JPEG", folder, files, "is" if is_one else "are"
+        )
     if strange := sorted(name for name in names if not is_one_line(name)):
         advice = "rename them"
         if sys.getfilesystemencoding() != "utf-8":
@@ -176,8 +178,6 @@ def resize_image(
     ``bicubic`` is Pillow's with a = -0.5, widened too. ``area`` is the mean over each new pixel's
     area.
     """
-    if resample not in _FILTERS:
-        raise InputError(f"scene.resample must be one of {', '.join(_FILTERS)}, got {resample!r}")
     if image.shape[:2] == (height, width):
         return image
     return np.array(Image.fromarray(image).resize((width, height), _FILTERS[resample]))

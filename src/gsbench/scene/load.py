@@ -18,11 +18,11 @@ import logging
 import os
 import secrets
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import MappingProxyType
+from types import MappingProxyType, SimpleNamespace
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -33,6 +33,7 @@ from gsbench.files import write_json
 from gsbench.logs import Progress, no_progress
 from gsbench.parsing import MAX_NUMBER, Count, Number, Record, read_typed
 from gsbench.runs.store import Output, is_sound, record_files
+from gsbench.runs.trial_record import Oddity
 from gsbench.scene.colmap_files import model_files
 from gsbench.scene.images import (
     Resample,
@@ -43,12 +44,12 @@ from gsbench.scene.images import (
     write_png,
 )
 from gsbench.scene.masks import WHITE, Mask, read_mask, resize_mask, write_mask
-from gsbench.scene.options import MIN_IMAGES, downscaled_size
+from gsbench.scene.options import downscaled_size
+from gsbench.scene.rules import MIN_IMAGES, inspect, settle
 from gsbench.scene.types import Camera, CameraModel, Capture, Scene, View, to_pinhole
-from gsbench.scene.undistortion import check_lenses, undistort
+from gsbench.scene.undistortion import lens_findings, undistort
 from gsbench.system.isolate import CrashError, run_isolated
 from gsbench.system.resources import in_threads
-from gsbench.words import some_of
 
 log = logging.getLogger(__name__)
 
@@ -101,6 +102,7 @@ class PreparedViews(Record):
     """The content of `CAMERAS_FILE`."""
 
     views: dict[str, PreparedView]
+    oddities: list[Oddity] = field(default_factory=list)  # of lenses
 
 
 class PreparedFiles(Record):
@@ -131,19 +133,21 @@ def load_scene(
     Raises `InputError` if fewer than three views or no training view have a pose, or an image does
     not fit its camera.
     """
-    if principal_point not in ("used", "centred"):
-        raise InputError(f"scene.principal_point must be used or centred, got {principal_point!r}")
     downscaling = Downscaling(downscale, max_size, resample)
     folder = Path(cache_dir) / _cache_key(capture, Path(model_dir), downscaling, made_by)
     try:
-        entries = _read_prepared(folder)
+        prepared = _read_prepared(folder)
     except (InputError, OSError) as error:
         if folder.exists():
             log.warning("store: %s; the views are prepared again", error)
             shutil.rmtree(folder)
         _prepare_views(folder, capture, Path(model_dir), downscaling, progress)
-        entries = _read_prepared(folder)
-    _report_unregistered(capture, set(entries))
+        prepared = _read_prepared(folder)
+    entries, oddities = (
+        prepared.views,
+        settle(prepared.oddities, f"scene {capture.name}", capture.accept),
+    )
+    oddities += _inspect_views(capture, entries)
 
     def mask_of(name: str) -> Mask | None:
         if name not in capture.masks:
@@ -171,6 +175,7 @@ def load_scene(
         name=capture.name,
         train=tuple(view for view in views if view.name not in held_out),
         test=tuple(view for view in views if view.name in held_out),
+        oddities=oddities,
     )
 
 
@@ -196,11 +201,13 @@ def _prepare_views(
             else:
                 entries[name] |= _intrinsics(to_pinhole(model))
         lenses = {name: image.camera for name, image in changes.items() if image.camera.distorted}
-        check_lenses(lenses)
+        odd = inspect("lens", lens_findings(lenses), f"scene {capture.name}", capture.accept)
         prepared = prepare_all(list(changes.values()), progress)
         for name, camera in zip(changes, prepared, strict=True):
             entries[name] |= _intrinsics(camera)
         document = {"version": CACHE_VERSION, "scene": capture.name, "views": entries}
+        if odd:
+            document["oddities"] = [one.to_json() for one in odd]
         (work / CAMERAS_FILE).write_text(json.dumps(document, indent=1), encoding="utf-8")
         write_json(work / SUMS_FILE, {"files": record_files(work)})
         _publish(work, folder)
@@ -219,8 +226,8 @@ def _publish(work: Path, folder: Path) -> None:
         os.rename(work, folder)
 
 
-def _read_prepared(folder: Path) -> dict[str, PreparedView]:
-    """The prepared views by name.
+def _read_prepared(folder: Path) -> PreparedViews:
+    """The prepared views by name, and what was odd about their lenses.
 
     Raises InputError, or FileNotFoundError, unless all files are as they were written.
     """
@@ -228,11 +235,11 @@ def _read_prepared(folder: Path) -> dict[str, PreparedView]:
     for name, recorded in sums.items():
         if not is_sound(folder, name, recorded, thorough=True):
             raise InputError(f"{folder / name} is not as it was prepared")
-    views = read_typed(folder / CAMERAS_FILE, PreparedViews).views
-    files = {CAMERAS_FILE, *(view.file for view in views.values() if view.file)}
+    prepared = read_typed(folder / CAMERAS_FILE, PreparedViews)
+    files = {CAMERAS_FILE, *(view.file for view in prepared.views.values() if view.file)}
     if missing := sorted(files - sums.keys()):
         raise InputError(f"{folder / SUMS_FILE} lacks {missing[0]}")
-    return views
+    return prepared
 
 
 def _model_cameras(
@@ -259,20 +266,18 @@ def _model_cameras(
             f"{model_dir}, but at least {MIN_IMAGES} are needed: take more overlapping photos, or "
             "another init"
         )
-    if not set(cameras) & set(capture.train_names):
-        raise InputError(
-            f"scene {capture.name}: no training view has a pose in {model_dir}: change the split "
-            "or the init"
-        )
+    _inspect_views(capture, cameras)  # before hours of work
     return dict(sorted(cameras.items()))
 
 
-def _report_unregistered(capture: Capture, registered: set[str]) -> None:
-    for kind, names in (("training", capture.train_names), ("test", capture.test_names)):
-        if missing := [name for name in names if name not in registered]:
-            share = f"{len(missing)} of {len(names)} {kind} views"
-            what = "have no pose and are left out"
-            log.warning("scene %s: %s %s: %s", capture.name, share, what, some_of(missing))
+def _inspect_views(capture: Capture, placed: Collection[str]) -> tuple[Oddity, ...]:
+    """Judge which views of the capture have a pose."""
+    views = SimpleNamespace(
+        train=[name for name in capture.train_names if name in placed],
+        test=[name for name in capture.test_names if name in placed],
+        unplaced=[name for name in capture.image_names if name not in placed],
+    )
+    return inspect("views", views, f"scene {capture.name}", capture.accept)
 
 
 def _intrinsics(camera: Camera) -> dict[str, float]:

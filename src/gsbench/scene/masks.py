@@ -20,14 +20,13 @@ from gsbench.scene.images import image_size, list_images, open_image, read_image
 from gsbench.scene.names import match
 from gsbench.scene.options import Backdrop
 from gsbench.scene.record import Photograph
+from gsbench.scene.rules import given
 from gsbench.words import some_of
 
 Mask = NDArray[np.bool_]  # [H, W], True where a pixel counts
 SUFFIX = ".png"
 WHITE = np.uint8(255)
 IMAGES, MASKS = "images", "masks"  # in the folder of `prepare_photograph`
-# largest share of pixels between black and the brightest value; a photograph has far more
-MAX_GREY_SHARE = 0.05
 NEARLY_ONE = 1 - 1e-6  # a mean of ones in float32 may round to less than 1
 
 
@@ -50,11 +49,10 @@ def find_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
 def check_masks(rows: Sequence[Photograph]) -> None:
     """Raise InputError for a mask that is no image, or not of its photograph's size."""
     for row in rows:
-        if row.mask is not None and (size := image_size(row.mask)) != row.size:
-            raise InputError(
-                f"{row.mask}: the mask is {size[0]}x{size[1]} px and its image {row.name} "
-                f"{row.size[0]}x{row.size[1]}: give masks of the images' size"
-            )
+        if row.mask is not None:
+            size = image_size(row.mask)
+            texts = {"size": "{}x{}".format(*size), "full": "{}x{}".format(*row.size)}
+            given("mask-of-other-size", size != row.size, str(row.mask), name=row.name, **texts)
 
 
 def read_mask(path: Path) -> Mask:
@@ -86,17 +84,8 @@ def read_mask(path: Path) -> Mask:
             )
         pixels = pixels.max(axis=2)
     mask: Mask = pixels != 0
-    if not mask.any():
-        raise InputError(
-            f"{path}: the mask is black all over, so no pixel counts: correct it, or leave the "
-            "image out"
-        )
-    grey_share = float((mask & (pixels != pixels.max())).mean())
-    if grey_share > MAX_GREY_SHARE:
-        raise InputError(
-            f"{path}: {grey_share:.0%} of its pixels are grey, so it is not a mask: make it black "
-            "where pixels are ignored, else white"
-        )
+    given("black-mask", float(mask.mean()), str(path))
+    given("grey-mask", float((mask & (pixels != pixels.max())).mean()), str(path))
     return mask
 
 

@@ -1,7 +1,7 @@
 """The settings of a scene: where photographs lie, how many, how large, which are held out."""
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -9,6 +9,7 @@ from annotated_types import Ge, Interval
 from pydantic import NonNegativeInt, PositiveInt
 
 from gsbench.errors import InputError
+from gsbench.scene.rules import MIN_IMAGES, MIN_SIZE, check_accept, given
 from gsbench.settings import (
     MISSING,
     FolderName,
@@ -17,11 +18,8 @@ from gsbench.settings import (
     check_settings,
     is_folder_name,
 )
-from gsbench.words import counted
 
 MAX_IMAGES = 200  # the paper's limit per scene
-MIN_IMAGES = 3  # with two views, no third one can reveal a wrong geometry
-MIN_SIZE = 16  # px: the smallest side of an image that is trained on
 
 
 def downscaled_size(
@@ -37,10 +35,6 @@ def downscaled_size(
         >>> downscaled_size(4946, 3286, max_size=1600)
         (1600, 1063)
     """
-    if downscale < 1:
-        raise InputError(f"scene.downscale must be at least 1, got {downscale}")
-    if max_size is not None and max_size < 1:
-        raise InputError(f"scene.max_size must be at least 1 px, got {max_size}")
     longest = max(width, height)
     numerator, denominator = 1, downscale
     if max_size and max_size * downscale < longest:
@@ -58,21 +52,15 @@ def check_final_size(
 ) -> None:
     """Raise InputError if ``what``, of ``size`` (width, height), would have a side below 16 px."""
     width, height = downscaled_size(*size, downscale, max_size)
-    if min(width, height) < MIN_SIZE:
-        limit = "" if max_size is None else f" with scene.max_size={max_size}"
-        raise InputError(
-            f"scene.downscale={downscale}{limit} leaves {width}x{height} px of {what} "
-            f"({size[0]}x{size[1]} px): at least {MIN_SIZE} px are needed"
-        )
+    limit = "" if max_size is None else f" with scene.max_size={max_size}"
+    sizes = {"size": f"{width}x{height}", "full": f"{size[0]}x{size[1]}"}
+    given("view-size", min(width, height), what, downscale=downscale, limit=limit, **sizes)
 
 
 def require_enough(count: int, folder: Path, which: str, remedy: str = "") -> None:
     """Raise InputError for fewer than three photographs."""
-    if count < MIN_IMAGES:
-        raise InputError(
-            f"{folder}: {counted(count, 'image')} {which}, but at least {MIN_IMAGES} are needed"
-            + (f": {remedy}" if remedy else "")
-        )
+    mend = remedy or "give more photographs"
+    given("too-few-images", count, str(folder), which=which, mend=mend)
 
 
 SplitName = Literal["every_nth", "sector", "matched", "list"]
@@ -184,6 +172,8 @@ class SceneConfig:
     sectors: Annotated[int, Ge(2)] = SECTORS  # contiguous parts of the cameras
     match_views: bool = False  # every_nth and sector hold out equally many views
     validation: bool = False  # drop the test views, and measure on views held out of the rest
+    # ids of rules (docs/captures.md) whose refusal becomes a line in log, results and tables
+    accept: list[str] = field(default_factory=list)
     # centred: moved to the image centre, as 3DGS assumes
     principal_point: Literal["used", "centred"] = "used"
     # courtyard only, as are the next three: in steps of 7.5 degrees; 48 close the ring
@@ -214,10 +204,11 @@ class SceneConfig:
             )
         self._check_that_all_is_read()
         self.split_rule.check()
+        check_accept(self.accept)
         if self.split == "sector" and self.kind == "photos":
             raise InputError(
                 "scene.split=sector needs the cameras, and these photographs came without: give a "
-                "COLMAP model (scene=colmap)"
+                "COLMAP model (scene=colmap; gsbench export writes that of a trial)"
             )
         if self.kind == "courtyard":
             check_final_size(

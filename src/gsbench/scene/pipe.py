@@ -28,7 +28,8 @@ from gsbench.scene.options import (
 )
 from gsbench.scene.readers import existing_folder, read_raw
 from gsbench.scene.record import RawCapture, Role
-from gsbench.scene.twins import copies_by_name, copies_of_test_views, report_left_out
+from gsbench.scene.rules import inspect
+from gsbench.scene.twins import copies_by_name, copies_of_test_views
 from gsbench.scene.types import Capture
 from gsbench.words import some_of
 
@@ -49,7 +50,7 @@ class Wish:
 def drop_copies(raw: RawCapture, wish: Wish) -> RawCapture:
     """Drop photographs of one name that differ in the extension; listed ones are kept."""
     wanted = set(chain.from_iterable(filter(None, wish.lists)))
-    return _without(raw, copies_by_name(raw.names, wanted), "of the same name")
+    return _without(raw, copies_by_name(raw.names, wanted))
 
 
 def hold_out_views(raw: RawCapture, wish: Wish) -> RawCapture:
@@ -74,7 +75,7 @@ def hold_out_views(raw: RawCapture, wish: Wish) -> RawCapture:
 def drop_copies_of_test_views(raw: RawCapture, wish: Wish) -> RawCapture:
     """Drop training photographs with the content of a test view, which would measure memory."""
     copies = copies_of_test_views(raw.folder, raw.named("train"), raw.named("test"))
-    raw = _without(raw, copies, "with the content of a test view")
+    raw = _without(raw, copies)
     which = "in the split lists" if wish.options.split_rule.by_lists else "left by the split"
     require_enough(len(raw.photographs), raw.folder, which)
     return raw
@@ -133,8 +134,11 @@ def prepare(raw: RawCapture, options: SceneConfig, root: Path, model: Path | Non
     centers = raw.centers
     if centers is None and raw.has_cameras:
         centers = np.array([row.center for row in raw.photographs])
+    accept = tuple(options.accept)
+    oddities = inspect("read", raw.noted, str(raw.folder), accept)
     for step in PIPE:
         raw = step(raw, Wish(options, root, lists))
+    oddities += inspect("capture", raw, str(raw.folder), accept)
     # Only the courtyard has exact poses, and its units fit the paper's threshold.
     exact = options.kind == "courtyard"
     rows = raw.photographs
@@ -155,6 +159,8 @@ def prepare(raw: RawCapture, options: SceneConfig, root: Path, model: Path | Non
         more={row.name: row.more for row in rows if row.more},
         read_from=raw.files,
         left_out=raw.left_out,
+        oddities=oddities,
+        accept=accept,
         advised_normalization=(
             IDENTITY if exact or centers is None else find_normalization(centers)
         ),
@@ -183,9 +189,8 @@ def fingerprint(
     return digest.hexdigest()
 
 
-def _without(raw: RawCapture, copies: Mapping[str, str], why: str) -> RawCapture:
+def _without(raw: RawCapture, copies: Mapping[str, str]) -> RawCapture:
     """The capture without ``copies``, each mapped to the photograph that is used instead."""
-    report_left_out(raw.folder, copies, why)
     kept = tuple(row for row in raw.photographs if row.name not in copies)
     return replace(raw, photographs=kept, left_out={**raw.left_out, **copies})
 

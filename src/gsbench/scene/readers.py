@@ -1,7 +1,7 @@
 """Readers of captures: from a folder on disk to one record of each photograph."""
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 from gsbench.datasets.catalog import how_to_get
@@ -12,6 +12,7 @@ from gsbench.scene.images import list_images
 from gsbench.scene.names import IMAGE_SUFFIXES, match, match_anywhere, same_folder, stem_of
 from gsbench.scene.options import SceneConfig, require_enough
 from gsbench.scene.record import Photograph, RawCapture, SceneReader, read_own
+from gsbench.scene.rules import Finding
 from gsbench.scene.transforms import read_transforms
 from gsbench.words import counted, some_of
 
@@ -41,44 +42,36 @@ def read_colmap(root: Path, options: SceneConfig) -> RawCapture:
     model = read_model(model_folder)
     files = _images_outside_masks(root, folder, options.masks)
     posed = posed_by_name(model)
-    matches = _files_of_model(folder, files, sorted(posed), model_folder)
-    _report_unused(folder, files, matches)
-    photographs = sorted(
-        (Photograph(file, folder / file, *posed[image]) for image, file in matches.items()),
-        key=lambda photograph: photograph.name,
-    )
-    return RawCapture(folder, tuple(photographs), model=model_folder, centers=camera_centers(model))
-
-
-def _files_of_model(
-    folder: Path, files: Sequence[str], wanted: Sequence[str], model: Path
-) -> dict[str, str]:
-    """The file of each image ``wanted`` by the ``model``; images without one are reported."""
     # In other folders there may be thumbnails with the names of photographs.
-    matches = match(wanted, files) or match_anywhere(wanted, photographs_among(folder, files))
-    if missing := [image for image in wanted if image not in matches]:
-        share = f"{len(missing)} of {len(wanted)} images of the model"
-        log.warning("%s: %s have no file: %s", folder, share, some_of(missing))
+    matches = match(posed, files) or match_anywhere(posed, photographs_among(folder, files))
     require_enough(
         len(matches),
         folder,
-        f"that the model {model} has a pose for (it names {some_of(wanted)})",
+        f"that the model {model_folder} has a pose for (it names {some_of(sorted(posed))})",
         "set scene.images to the folder of the model's photographs",
     )
-    if moved := [image for image, file in matches.items() if not same_folder(image, file)]:
-        pairs = some_of([f"{image} ({matches[image]})" for image in moved])
-        log.warning("%s: files found by the last part of their path: %s", folder, pairs)
-    return matches
+    moved = [f"{name} ({file})" for name, file in matches.items() if not same_folder(name, file)]
+    noted = {
+        "no-file": sorted(posed.keys() - matches.keys()),
+        "found-by-last-part": moved,
+        "no-pose": _without_pose(folder, files, matches.values()),
+    }
+    images = {file: image for image, file in matches.items()}
+    return RawCapture(
+        folder,
+        tuple(Photograph(file, folder / file, *posed[images[file]]) for file in sorted(images)),
+        model=model_folder,
+        centers=camera_centers(model),
+        noted={rule: [Finding(len(names), names)] for rule, names in noted.items()},
+    )
 
 
-def _report_unused(folder: Path, files: Sequence[str], matches: Mapping[str, str]) -> None:
-    """Log one line on photographs without a pose in the model."""
-    used = {stem_of(file) for file in matches.values()}
-    if any(stem_of(name) not in used for name in files):
-        photographs = photographs_among(folder, files, report=False)
-        if others := [name for name in photographs if stem_of(name) not in used]:
-            share = f"{len(others)} of {len(others) + len(used)} photographs"
-            log.warning("%s: %s have no pose in the model: %s", folder, share, some_of(others))
+def _without_pose(folder: Path, files: Sequence[str], matched: Iterable[str]) -> list[str]:
+    """The photographs among ``files`` that no image of the model matched."""
+    used = {stem_of(file) for file in matched}
+    others = [name for name in files if stem_of(name) not in used]
+    kept = set(photographs_among(folder, files, report=False)) if others else set()
+    return [name for name in others if name in kept]
 
 
 def read_photos(root: Path, options: SceneConfig) -> RawCapture:

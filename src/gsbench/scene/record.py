@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path, PurePath
@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Literal, Protocol
 import numpy as np
 
 from gsbench.errors import InputError
-from gsbench.scene.images import image_size
+from gsbench.scene.images import open_image
+from gsbench.scene.rules import Finding
 from gsbench.scene.types import Array, CameraModel, nearest_rotation
 
 if TYPE_CHECKING:
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from gsbench.scene.transforms_cameras import AppliedTransform
 
 Role = Literal["", "train", "test", "unused"]
+EQUIRECTANGULAR = b"equirectangular"  # GPano:ProjectionType in the XMP of a panorama
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,9 +45,20 @@ class Photograph:
     more: Mapping[str, Path] = field(default_factory=dict)
 
     @cached_property
+    def _header(self) -> tuple[tuple[int, int], bool]:
+        with open_image(self.file) as image:
+            xmp = image.info.get("xmp", b"")
+            return image.size, isinstance(xmp, bytes) and EQUIRECTANGULAR in xmp
+
+    @property
     def size(self) -> tuple[int, int]:
         """(width, height) of the file in px; raises InputError if it is no image."""
-        return image_size(self.file)
+        return self._header[0]
+
+    @property
+    def is_panorama(self) -> bool:
+        """Return whether the file says that it is a full panorama, and has its shape."""
+        return self._header[1] and self.size[0] == 2 * self.size[1]
 
     @property
     def posed(self) -> tuple[CameraModel, Array, Array]:
@@ -88,6 +101,7 @@ class RawCapture:
     files: tuple[Path, ...] = ()
     model: Path | None = None
     centers: Array | None = None
+    noted: Mapping[str, Sequence[Finding]] = field(default_factory=dict)
     left_out: Mapping[str, str] = field(default_factory=dict)
     held_out: str = ""
 

@@ -21,6 +21,7 @@ from typing import Any
 from pydantic_core import from_json
 
 from gsbench.errors import InputError
+from gsbench.files import GIT_LFS, LFS_REMEDY
 from gsbench.parsing import (
     DamagedError,
     parse_typed,
@@ -32,14 +33,15 @@ from gsbench.scene.images import list_images
 from gsbench.scene.names import IMAGE_SUFFIXES, match, stem_of
 from gsbench.scene.options import Backdrop, require_enough
 from gsbench.scene.record import Photograph, PointsFile, RawCapture, Role
+from gsbench.scene.rules import Finding
 from gsbench.scene.transforms_cameras import (
     AppliedTransform,
     FrameRecord,
     TransformsRecord,
     applied_transform_of,
     camera_of,
+    focal_ratios,
     pose_of,
-    report_contradictions,
 )
 from gsbench.scene.transforms_keys import check_keys
 from gsbench.words import some_of
@@ -94,6 +96,7 @@ def read_transforms(
     rows: dict[str, Photograph] = {}
     points: PointsFile | None = None
     all_missing: list[str] = []
+    ratios: list[Finding] = []
     for split, record in records.items():
         path, missing = files[split], []
         applied = applied_transform_of(path, record)
@@ -106,7 +109,7 @@ def read_transforms(
                 raise InputError(f"{path}: {name} is there twice: name each image once")
             camera = camera_of(folder / name, path, record, frame)
             if not any(row.role == SPLIT_ROLES[split] for row in rows.values()):
-                report_contradictions(path, record, camera)
+                ratios += focal_ratios(record, camera)
             rows[name] = Photograph(
                 name,
                 folder / name,
@@ -116,10 +119,7 @@ def read_transforms(
                 depth=_beside(path, frame.depth_file_path),
                 role=SPLIT_ROLES[split],
             )
-        if missing:
-            share = f"{len(missing)} of {len(record.frames)}"
-            log.warning("%s: %s images have no file: %s", path, share, some_of(missing))
-            all_missing += missing
+        all_missing += missing
         points = _points(path, record, applied, points)
     lacking = f", while {some_of(all_missing)} have no file" if all_missing else ""
     first = next(iter(files.values()))
@@ -135,7 +135,12 @@ def read_transforms(
     elif len(files) == 1:
         rows = {name: replace(row, role="") for name, row in rows.items()}
     read_from = (*files.values(), *(() if points is None else (points.path,)))
-    return RawCapture(folder, tuple(rows[name] for name in sorted(rows)), points, read_from)
+    ordered = tuple(rows[name] for name in sorted(rows))
+    noted = {
+        "no-file": [Finding(len(all_missing), all_missing)],
+        "focal-length-and-field": ratios,
+    }
+    return RawCapture(folder, ordered, points, read_from, noted=noted)
 
 
 def _beside(path: Path, written: str | None) -> Path | None:
@@ -173,6 +178,8 @@ def _relative_path(path: Path, written: str) -> PurePosixPath:
 
 def _read_record(path: Path, backdrop: Backdrop) -> TransformsRecord:
     content = read_bytes(resolved(path))
+    if content.startswith(GIT_LFS):
+        raise DamagedError(path, f"is {LFS_REMEDY}")
     try:
         content = text_of(content).encode()
     except InputError as error:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Collection
 from dataclasses import dataclass, field
@@ -15,9 +14,9 @@ from annotated_types import Len
 from gsbench.errors import InputError
 from gsbench.parsing import Number, Record, Text
 from gsbench.scene.images import image_size
+from gsbench.scene.rules import Finding, given
 from gsbench.scene.types import ROTATION_TOLERANCE, Array, CameraModel, nearest_rotation
 
-log = logging.getLogger(__name__)
 Row = Annotated[list[Number], Len(4, 4)]
 Optional = Number | None
 Matrix = Annotated[list[Row], Len(3, 4)]  # a fourth row must be `LAST_ROW`
@@ -26,12 +25,9 @@ OPENGL = np.diag([1.0, -1.0, -1.0])  # from OpenCV's camera axes to OpenGL's, an
 PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 FISHEYE = "OPENCV_FISHEYE"
 FOCAL_KEYS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov")
-# A focal length and a field of view of one camera may differ by rounding and by a shift of the
-# principal point; 5 % is far more than that.
-SAME_FOCAL = 1.05
-# A principal point is taken for the centre of a copy of another size if it is off by this factor
-# along both sides, equally up to a tenth. Copies are halved; other points are off by few percent.
-OTHER_SCALE, SAME_SCALE = 1.5, 0.1
+# A principal point may be the centre of a copy of another size if it is off by one factor along
+# both sides, up to a tenth.
+SAME_SCALE = 0.1
 RATIONAL = "FULL_OPENCV"  # OpenCV's: a polynomial of k1, k2, k3 divided by one of k4, k5, k6
 
 
@@ -197,11 +193,8 @@ def _check_center(
     ratios = [2 * cx / size[0], 2 * cy / size[1]]  # 1 at the centre
     if min(ratios) <= 0 or abs(math.log(ratios[0] / ratios[1])) > math.log(1 + SAME_SCALE):
         return
-    if not 1 / OTHER_SCALE < ratios[0] < OTHER_SCALE:
-        raise InputError(
-            f"{where}: its principal point ({cx:g}, {cy:g}) is the centre of a photograph "
-            f"of another size than {size[0]}x{size[1]} px: add w and h"
-        )
+    facts = {"cx": cx, "cy": cy, "width": size[0], "height": size[1]}
+    given("principal-point-of-other-size", ratios[0], where, **facts)
 
 
 def _distortion(
@@ -254,23 +247,19 @@ def _focal_length(
     return side / (2 * math.tan(angle / 2)) if 0 < angle < math.pi else 0.0
 
 
-def report_contradictions(path: Path, record: TransformsRecord, camera: CameraModel) -> None:
-    """Log one line if a record's focal length and its field of view differ; the first is used."""
+def focal_ratios(record: TransformsRecord, camera: CameraModel) -> list[Finding]:
+    """Focal lengths over those that fields of view mean, where a record gives both."""
+    found = []
     for source in (record, *record.frames):
         width = camera.width if source.w is None else source.w
         height = camera.height if source.h is None else source.h
         given = (source.fl_x, source.fl_y)
-        seen = (
+        meant = (
             _focal_length(width, None, source.camera_angle_x, source.x_fov),
             _focal_length(height, None, source.camera_angle_y, source.y_fov),
         )
-        for length, other in zip(given, seen, strict=True):
-            if length and other and not 1 / SAME_FOCAL < length / other < SAME_FOCAL:
-                log.warning(
-                    "%s: its focal length is %g px, but its field of view means %g px: the focal "
-                    "length is used",
-                    path,
-                    length,
-                    other,
-                )
-                return
+        for length, other in zip(given, meant, strict=True):
+            if length and other:
+                name = [source.file_path] if isinstance(source, FrameRecord) else ["the file"]
+                found.append(Finding(length / other, name, {"given": length, "meant": other}))
+    return found

@@ -4,9 +4,8 @@ If a copy of a test view is trained on, that test view measures memory. So copie
 left out of training. Near twins, such as the next shot of a burst, are used and reported.
 """
 
-import logging
 from collections import Counter, defaultdict
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
@@ -14,14 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from gsbench.errors import InputError
 from gsbench.files import file_sha256
 from gsbench.scene.masks import resize_mask
 from gsbench.scene.names import stem_of
+from gsbench.scene.rules import given
 from gsbench.scene.types import Scene, Twins, View
-from gsbench.words import counted, some_of
-
-log = logging.getLogger(__name__)
 
 # Formats in the order of preference between equally frequent ones: a JPEG usually has a focal
 # length in its EXIF data.
@@ -85,19 +81,6 @@ def copies_of_test_views(folder: Path, train: Sequence[str], test: Sequence[str]
     return copies
 
 
-def report_left_out(folder: Path, left_out: Mapping[str, str], why: str) -> None:
-    """Write one line on photographs that are left out, each mapped to the one that it copies."""
-    if left_out:
-        pairs = [f"{name} ({other} is used)" for name, other in left_out.items()]
-        log.warning(
-            "%s: %s left out, %s: %s",
-            folder,
-            counted(len(left_out), "photograph"),
-            why,
-            some_of(pairs),
-        )
-
-
 def without_copies(scene: Scene) -> Scene:
     """Leave out training views that have the pixels of a test view, and record near twins.
 
@@ -121,21 +104,8 @@ def without_copies(scene: Scene) -> Scene:
     for name, found in candidates.items():
         if trained_on := [twin for twin in found if twin[1] not in equal]:
             near[name] = max(trained_on)[1]
-    report_left_out(Path(scene.name), equal, "with the pixels of a test view")
-    if near:
-        pairs = some_of([f"{name} ({twin})" for name, twin in near.items()])
-        log.warning(
-            "%s: %d of %d test views have a near twin in training: %s",
-            scene.name,
-            len(near),
-            len(scene.test),
-            pairs,
-        )
     train = tuple(view for view in scene.train if view.name not in equal)
-    if not train:
-        raise InputError(
-            f"scene {scene.name}: all training views are copies of test views: change the split"
-        )
+    given("no-training-view", len(train), f"scene {scene.name}")
     return replace(scene, train=train, twins=Twins(left_out=equal, near=near))
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from gsbench.errors import InputError
 from gsbench.normalization import IDENTITY, Normalization
+from gsbench.runs.trial_record import Oddity
 
 Array = NDArray[np.float64]
 
@@ -138,7 +139,8 @@ class Capture:
     the given coordinates to those in which the scene should be trained
     (`gsbench.scene.colmap.normalize_capture`). ``normalization`` is the map that was applied to
     ``model`` already. ``left_out`` maps each photograph that is left out to the one with the same
-    name or content.
+    name or content. ``oddities`` is what rules found, ``accept`` are the ids of accepted rules
+    (`gsbench.scene.rules`).
     """
 
     name: str
@@ -156,6 +158,8 @@ class Capture:
     advised_normalization: Normalization = IDENTITY
     normalization: Normalization = IDENTITY
     left_out: Mapping[str, str] = field(default_factory=dict)
+    oddities: tuple[Oddity, ...] = ()
+    accept: tuple[str, ...] = ()
 
     @property
     def train_names(self) -> tuple[str, ...]:
@@ -190,6 +194,7 @@ class Scene:
     train: tuple[View, ...]
     test: tuple[View, ...]
     twins: Twins = field(default_factory=Twins)
+    oddities: tuple[Oddity, ...] = ()
 
     @cached_property
     def extent(self) -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -10,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbench.errors import InputError
+from gsbench.scene.rules import Finding
 from gsbench.scene.types import Camera, CameraModel, to_pinhole
 from gsbench.system.isolate import CrashError, run_isolated
 from gsbench.words import some_of
@@ -17,50 +17,34 @@ from gsbench.words import some_of
 if TYPE_CHECKING:
     import pycolmap
 
-log = logging.getLogger(__name__)
-
-# A larger share of folded pixels is refused, a smaller one is reported: fitted lenses of correct
-# models may turn back in the outermost corners, which hardly change a result.
-MAX_FOLDED = 0.01
-MIN_LEFT = 0.25  # of the pixels of a photograph; if fewer are left by undistorting, a line says so
+Flattened = tuple[float, int, int]
 
 
-def check_lenses(cameras: Mapping[str, CameraModel]) -> None:
-    """Check that the lens of each distorted image maps one to one (`folded_share`).
-
-    Raises `InputError` for a lens with a larger share of folded pixels than `MAX_FOLDED`; reports
-    a smaller one, and photographs of which less than `MIN_LEFT` is left.
-    """
+def lens_findings(cameras: Mapping[str, CameraModel]) -> dict[str, list[Finding]]:
+    """Findings for the rules of lenses, of the distorted images' cameras."""
     names: dict[CameraModel, list[str]] = {}
     for name, camera in cameras.items():
         names.setdefault(camera, []).append(name)
     if not names:
-        return
+        return {}
     try:
-        flattened = run_isolated(flatten, list(names), what="undistortion")
+        flattened: list[Flattened] = run_isolated(flatten, list(names), what="undistortion")
     except CrashError as error:
         raise InputError(f"{error}: check the cameras of {some_of(list(cameras))}") from error
+    found: dict[str, list[Finding]] = {"lens-turns-back": [], "little-left": []}
     for (camera, users), (share, width, height) in zip(names.items(), flattened, strict=True):
-        parameters = ", ".join(f"{value:g}" for value in camera.params)
-        what = f"the camera of {some_of(users)} ({camera.name}: {parameters})"
-        if width * height < MIN_LEFT * camera.width * camera.height:
-            size, full = f"{width}x{height}", f"{camera.width}x{camera.height}"
-            log.warning("%s leaves %s of %s px undistorted: check its lens", what, size, full)
-        if share == 0:
-            continue
-        message = (
-            f"{what} turns back inside the picture: {max(share, 0.001):.1%} of the undistorted "
-            "photograph would be a mirrored ghost"
-        )
-        if share > MAX_FOLDED:
-            raise InputError(
-                f"{message}: correct its distortion, estimate another model "
-                "(scene=photos init.camera_model=RADIAL), or give undistorted photographs"
-            )
-        log.warning("%s", message)
+        facts = {
+            "camera": f"{camera.name}: {', '.join(f'{value:g}' for value in camera.params)}",
+            "size": f"{width}x{height}",
+            "full": f"{camera.width}x{camera.height}",
+        }
+        found["lens-turns-back"].append(Finding(share, users, facts))
+        left = width * height / (camera.width * camera.height)
+        found["little-left"].append(Finding(left, users, facts))
+    return found
 
 
-def flatten(cameras: Sequence[CameraModel]) -> list[tuple[float, int, int]]:
+def flatten(cameras: Sequence[CameraModel]) -> list[Flattened]:
     """`folded_share` and the size in px of each camera's undistorted photograph.
 
     COLMAP's native code can abort, so run it isolated.

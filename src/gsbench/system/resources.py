@@ -37,6 +37,10 @@ R = TypeVar("R")
 MIB = 2**20
 STATUS = Path("/proc/self/status")
 CLEAR_REFS = Path("/proc/self/clear_refs")
+# Texts of torch, numpy and C++ for memory that cannot be allocated; most come as RuntimeError.
+NO_MEMORY = re.compile(
+    r"out of memory|allocat\w+ memory|not enough memory|bad_alloc|unable to allocate", re.I
+)
 RESET_PEAK = "5"  # makes Linux reset VmHWM, see proc(5)
 SECONDS_BETWEEN_TRIES = 0.5
 CORES_OF_TRIAL = 4  # with more cores, more trials at once gain more than more threads per trial
@@ -84,6 +88,13 @@ def trials_at_once(max_gaussians: int | None, device: str) -> int:
     needed = MEMORY_OF_TRIAL + MEMORY_OF_GAUSSIAN * (max_gaussians or USUAL_GAUSSIANS)
     in_memory = psutil.virtual_memory().total // needed
     return max(1, min(max(min(2, cores), cores // CORES_OF_TRIAL), in_memory))
+
+
+def lacks_memory(error: Exception) -> bool:
+    """Return whether an error says that no memory is left, on a GPU or on this machine."""
+    return isinstance(error, MemoryError) or (
+        isinstance(error, RuntimeError) and NO_MEMORY.search(str(error)) is not None
+    )
 
 
 @contextmanager

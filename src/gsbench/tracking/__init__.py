@@ -1,12 +1,12 @@
 """Tracking: the files of a trial mirrored to MLflow, TensorBoard or Weights & Biases.
 
-Trials write only files. A process beside them follows the files and writes to the tracker in
-batches, so a tracker that is slow, down or read-only never harms a trial. ``gsbench sync`` sends
-later what the tracker missed.
+Trials write only files. ``gsbench sync`` sends to the tracker what it lacks; beside a sweep a
+process does so every minute and whenever a trial ends. So a tracker that is slow, down or
+read-only never harms a trial.
 """
 
-from gsbench.tracking.comparison import publish
-from gsbench.tracking.mirror import Mirror
+from gsbench.tracking.beside import Mirror
+from gsbench.tracking.ideas import show_ideas
 from gsbench.tracking.mlflow_sink import (
     MLflow,
     connect,
@@ -30,6 +30,6 @@ __all__ = [
     "connect",
     "default_uri",
     "ensure_experiment",
-    "publish",
+    "show_ideas",
     "tracker_uri",
 ]

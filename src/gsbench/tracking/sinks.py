@@ -29,6 +29,7 @@ class Run(Record):
     described: bool = False  # its settings and tags were sent
     logged: dict[str, Count] = field(default_factory=dict)  # newest iteration sent, by file
     complete: str | None = None  # hash of the results that were sent
+    ended: str | None = None  # how a trial without results had ended when that was sent
 
 
 class Sink(Protocol):

@@ -142,6 +142,12 @@ class TrackedTrial:
         results = self.folder.sound_record()
         return None if results is None else sha256_of(results.to_json())
 
+    def ending(self) -> str:
+        """How a trial without results has ended: when it failed, or where it was stopped."""
+        if self.folder.has_failed():
+            return f"failed at {self.folder.failure().time}"
+        return "stopped in {} at {}".format(*self.folder.stage_and_step())
+
     def curves(
         self, logged: Mapping[str, int], live: bool
     ) -> Iterator[tuple[str, int, list[Scalar]]]:

@@ -14,7 +14,7 @@ from typing import Any, Literal, NamedTuple
 from gsbench.errors import InputError
 from gsbench.raster.executors import AUTO, EXECUTORS, names, resolve
 from gsbench.runs.trial_record import RasterProof
-from gsbench.scene.options import MIN_SIZE
+from gsbench.scene.rules import MIN_SIZE
 from gsbench.system.install import install_command, version_of
 from gsbench.system.own_modules import allow_modules
 from gsbench.system.resources import available_threads, installed_gpus

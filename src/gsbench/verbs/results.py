@@ -360,8 +360,6 @@ def _origin(trial: TrialResult) -> dict[str, str]:
         origin["machine"] = machine
     if code := trial.code_texts:
         origin["code"] = ", ".join(code)
-    if edits := trial.edits:
-        origin["since"] = "; ".join(map(str, edits))
     if record.code.commit:
         origin["commit"] = f"{record.code.commit}{', edited' if record.code.edited else ''}"
     packages = record.code.packages

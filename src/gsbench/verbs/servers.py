@@ -9,7 +9,6 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
-from importlib.metadata import version
 from pathlib import Path
 
 import requests
@@ -23,7 +22,7 @@ from gsbench.system.install import install_command
 from gsbench.system.isolate import end_descendants
 from gsbench.system.programs import NEUTRAL, own_folder, safe_environment
 from gsbench.system.stopping import stop_on_signals
-from gsbench.tracking.comparison import addresses, publish
+from gsbench.tracking.ideas import addresses, show_ideas
 from gsbench.tracking.mlflow_sink import (
     SETTINGS,
     absolute_address,
@@ -106,7 +105,7 @@ def ui(argv: Sequence[str], runs: Path) -> int:
     pages = {"dashboard": server}
     if home is not None:
         try:
-            pages = addresses(server, publish(home, uri), version("mlflow"))
+            pages = addresses(server, show_ideas(home, uri))
         except Exception as error:  # any error of the tracker's client
             raise InputError(
                 f"{home.name} could not be sent to {uri} ({type(error).__name__}: {error})"

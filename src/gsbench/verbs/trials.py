@@ -15,8 +15,6 @@ from rich.live import Live
 from rich.markup import escape
 from rich.table import Table
 
-from gsbench.analysis.differences import find_superseded
-from gsbench.analysis.results import read_experiment
 from gsbench.config.command_words import makes_other_trials, typed_permissions
 from gsbench.config.compose import Trial, compose_one
 from gsbench.config.overrides import key_of
@@ -24,15 +22,22 @@ from gsbench.errors import GsbenchError, InputError
 from gsbench.launch.dry_run import describe_plan
 from gsbench.launch.progress import Progress, progress_of
 from gsbench.launch.record import remove
-from gsbench.launch.states import TrialState, label_of, names_of, states_of_experiment
+from gsbench.launch.states import (
+    TrialState,
+    label_of,
+    names_of,
+    states_now,
+    states_of_experiment,
+)
 from gsbench.runs.commands import PlannedTrial, drop
 from gsbench.runs.experiments import experiment_home, list_experiments, trial_folders
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS
 from gsbench.runs.user_code import PERMISSIONS
 from gsbench.system.own_modules import allow_modules
-from gsbench.tracking.tracker_run import MirrorError
-from gsbench.tracking.tracker_run import sync as send_missing
+from gsbench.tracking.beside import end_with
+from gsbench.tracking.sync import MirrorError
+from gsbench.tracking.sync import sync as send_missing
 from gsbench.verbs.arguments import ArgumentParser
 from gsbench.words import counted, readable_time
 
@@ -71,7 +76,7 @@ def status(argv: Sequence[str], runs: Path) -> int:
     home = experiment_home(runs, options.experiment)
     if options.watch:
         _watch(home)
-    trials = progress_with_superseded(home)
+    trials = states_now(home)
     if options.verify:
         trials = [_verified(trial) for trial in trials]
     if options.forget_superseded:
@@ -142,19 +147,6 @@ def _cell(counts: dict[str, int]) -> str:
     return ", ".join([f"{counts['done']}/{sum(counts.values())}", *others])
 
 
-def progress_with_superseded(home: Path) -> list[TrialState]:
-    """The state of every trial in ``home``; those that older code made are ``superseded``."""
-    states = states_of_experiment(home)
-    folders = {state.folder: state.planned.cwd for state in states if state.planned is not None}
-    # The user's modules are read in the folder where the trial's command was given: another may
-    # have a namesake.
-    reasons = find_superseded(read_experiment(home).trials, folders)
-    for place, trial in enumerate(states):
-        if trial.state == "done" and trial.folder in reasons:
-            states[place] = replace(trial, state="superseded", note=str(reasons[trial.folder]))
-    return states
-
-
 def lines_of(trials: list[TrialState], with_done: bool) -> list[str]:
     """A line for each trial not done or in doubt (``with_done``: for each), and a summary."""
     lines, names = [], names_of(trials)
@@ -178,7 +170,7 @@ def _overview(runs: Path) -> int:
     if not names:
         print(f"no experiment in {runs} yet")
     for name in names:
-        print(f"{name:<20} {summary_of(progress_with_superseded(runs / name))}")
+        print(f"{name:<20} {summary_of(states_now(runs / name))}")
     return 0
 
 
@@ -295,18 +287,31 @@ def sync(argv: Sequence[str], runs: Path) -> int:
         "--uri",
         help="such as http://127.0.0.1:5000; default: $MLFLOW_TRACKING_URI, or the runs folder's",
     )
+    parser.add_argument(
+        "--trial",
+        action="append",
+        metavar="SCENE/ARM/FOLDER",
+        help="only this trial of the experiment (repeatable)",
+    )
+    parser.add_argument(
+        "--beside", type=int, metavar="PID", help="end soon after this process has ended"
+    )
     options = parser.parse_args(argv)
     words = [options.experiment or "", *options.permissions]
     experiment = "" if "=" in words[0] else words.pop(0)
     if unread := [word for word in words if key_of(word) != PERMISSIONS]:
         raise InputError(f"sync reads only {PERMISSIONS}, not {unread[0]}")
     allow_modules(allowed := typed_permissions(words))
+    if options.beside:
+        end_with(options.beside)
     names = [experiment] if experiment else list_experiments(runs)
     homes = [experiment_home(runs, name) for name in names]
     try:
         folders: list[TrialFolder] = []
         for home in homes:
-            folders += [TrialFolder(Path(place)) for place in sorted(trial_folders(home))]
+            places = [TrialFolder(Path(place)) for place in sorted(trial_folders(home))]
+            wanted = {str(home / trial) for trial in options.trial or ()}
+            folders += [one for one in places if not wanted or str(one.path) in wanted]
         for line in send_missing(folders, options.uri, allowed):
             print(line, flush=True)
     except (MirrorError, OSError) as error:

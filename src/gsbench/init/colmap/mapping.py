@@ -25,7 +25,7 @@ from gsbench.init.colmap import database as colmap_database
 from gsbench.init.colmap import geometry
 from gsbench.init.options import ColmapOptions
 from gsbench.logs import Progress
-from gsbench.scene.options import MIN_IMAGES
+from gsbench.scene.rules import MIN_IMAGES
 from gsbench.scene.types import Array
 
 SMALL_ANGLE_DEG = 2.0  # triangulation angle of the initial pair; COLMAP's default is 16

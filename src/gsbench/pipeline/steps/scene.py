@@ -34,6 +34,7 @@ from gsbench.scene.options import Backdrop, SceneConfig
 from gsbench.scene.pipe import fingerprint, prepare
 from gsbench.scene.readers import existing_folder, read_raw
 from gsbench.scene.record import PointsFile, RawCapture, SceneReader
+from gsbench.scene.rules import inspect
 from gsbench.scene.twins import without_copies
 from gsbench.scene.types import Capture, Scene, View
 from gsbench.system.install import version_of
@@ -218,7 +219,9 @@ class Views:
                 made_by=view_versions(),
                 **self.preparation,
             )
-        return without_copies(scene)
+        scene = without_copies(scene)
+        odd = inspect("scene", scene, f"scene {scene.name}", self.capture.accept)
+        return replace(scene, oddities=scene.oddities + odd)
 
 
 @cache

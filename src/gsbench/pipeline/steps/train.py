@@ -24,7 +24,7 @@ from gsbench.logs import progress
 from gsbench.pipeline.steps.scene import Views
 from gsbench.runs.keys import TRAIN, Step, options_of, rasterizer_inputs, step_of
 from gsbench.runs.layout import LINEAGE, POINT_CLOUD, TRAINING
-from gsbench.runs.trial_record import InitialCloud
+from gsbench.runs.trial_record import InitialCloud, Oddity
 from gsbench.scene.types import Capture
 from gsbench.system.compile_clock import CLOCK
 from gsbench.system.install import own_checkout
@@ -106,11 +106,14 @@ def train_step(views: Views, parts: Parts) -> Step:
 
 def check_points(
     points: NDArray[np.float64], colors: NDArray[np.uint8], views: Views, parts: Parts
-) -> InitialCloud:
+) -> tuple[InitialCloud, tuple[Oddity, ...]]:
     """Check the points that training starts from against the training views (`check_start`)."""
     # A user's initialiser may lack the attribute.
     is_random = getattr(parts.initializer, "random_points", False)
-    return check_start(points, colors, views.scene, is_random, views.capture.normalization)
+    capture = views.capture
+    return check_start(
+        points, colors, views.scene, is_random, capture.normalization, capture.accept
+    )
 
 
 def _log_normalization(capture: Capture, densifier: Densifier) -> None:
@@ -140,7 +143,7 @@ def write_training(
     lineage: Lineage | None,
     views: Views,
     device: torch.device,
-    start: InitialCloud,
+    start: tuple[InitialCloud, tuple[Oddity, ...]],
 ) -> None:
     """Write a trained model's lineage, and the ``summary`` of the training with more facts."""
     if lineage is not None:
@@ -149,7 +152,8 @@ def write_training(
     facts = {
         "causes": {} if lineage is None else lineage.causes_of_living(),
         "scene_extent": views.scene.extent / views.capture.normalization.scale,
-        "initial_cloud": start.to_json(),
+        "initial_cloud": start[0].to_json(),
+        "oddities": [odd.to_json() for odd in start[1]],
         "machine": describe_machine(device),
         "checkout": own_checkout(),
     }

@@ -16,7 +16,7 @@ from gsbench.errors import InputError
 from gsbench.logs import Progress, no_progress
 from gsbench.scene.courtyard.kernels import render
 from gsbench.scene.courtyard.layout import Layout, build_layout
-from gsbench.scene.options import MIN_IMAGES, MIN_SIZE
+from gsbench.scene.rules import MIN_IMAGES, MIN_SIZE
 from gsbench.scene.types import Camera
 from gsbench.system.resources import in_threads
 

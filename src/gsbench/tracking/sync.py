@@ -1,4 +1,4 @@
-"""A trial in its tracker: making the tracker, and sending what it lacks (`gsbench sync`)."""
+"""Sending to trackers what they lack of trials (`gsbench sync`), while they run and later."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from gsbench.runs.nested import GSBENCH
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import BusyError, hold
 from gsbench.system.programs import own_folder
-from gsbench.tracking.comparison import publish
+from gsbench.tracking.ideas import show_ideas
 from gsbench.tracking.mlflow_sink import VARIABLE, absolute_address
 from gsbench.tracking.sinks import Run, Sink
 from gsbench.tracking.trial import TrackedTrial
@@ -102,9 +102,7 @@ class TrackerRun:
     ) -> None:
         folder.require_no_links()
         self._options, self._trial = options, TrackedTrial(folder, values)
-        name = tracker_name(options)
-        own = class_of(options).startswith(OWN)
-        self._file = folder.path / f"{name.lower() if own else f'tracker-{name}'}.json"
+        self._file = _state_file(folder, options)
         with ExitStack() as held:
             held.enter_context(hold(folder.path / LOCK, "mirroring", wait=False))
             self._sink = make_sink(options, allowed)
@@ -117,9 +115,11 @@ class TrackerRun:
 
     @property
     def is_complete(self) -> bool:
-        """Return whether the run shows the trial's present results."""
+        """Return whether the run shows how the trial ended, and its present results."""
         results = self._trial.results_hash()
-        return results is not None and self._run.complete == results
+        if results is None:
+            return self._run.ended == self._trial.ending()
+        return self._run.complete == results
 
     def add_curves(self, live: bool = True) -> None:
         """Log the records that were written since the last call.
@@ -144,8 +144,10 @@ class TrackerRun:
         if folder.has_failed():
             sink.artifacts(self._trial.files((CONFIG, FAILED, LOG)), ())
             sink.close("FAILED", folder.failure().reason)
+            self._keep(replace(self._run, ended=self._trial.ending()))
         elif (results := folder.sound_record()) is None:
             sink.close("KILLED", None)
+            self._keep(replace(self._run, ended=self._trial.ending()))
         else:
             images, with_model = int(self._options["images"]), bool(self._options.get("model"))
             summary = self._trial.summary(results, images, with_model)
@@ -179,11 +181,10 @@ class TrackerRun:
 def sync(
     folders: Iterable[TrialFolder], uri: str | None, allowed: Sequence[str] = ()
 ) -> Iterator[str]:
-    """Mirror ended trials that the tracker lacks; yields a line for each, and a summary.
+    """Send what trackers lack of these trials; yields a line for each ended one, and a summary.
 
-    ``allowed`` are the modules whose code may run, and the addresses that may get results.
-
-    Raises MirrorError if the tracker refuses a trial.
+    Of a trial that runs, the curves are sent. ``allowed`` are the modules whose code may run, and
+    the addresses that may get results. Raises MirrorError if the tracker refuses a trial.
     """
     new = already_there = 0
     pages: Pages = {}
@@ -191,7 +192,7 @@ def sync(
         state = folder.state()
         if state == "damaged":
             yield f"left out: {folder.label}: damaged, see gsbench status"
-        if state not in ("done", "failed"):
+        if state in ("damaged", "missing"):
             continue
         try:
             values = folder.configuration()
@@ -208,6 +209,8 @@ def sync(
             )
             continue
         options = with_absolute_address(options)
+        if state == "partial" and not _state_file(folder, options).exists():
+            continue  # it never began to be sent
         try:  # a class of a user's is run only with permission
             make_sink(options, allowed)
         except InputError as error:
@@ -215,35 +218,57 @@ def sync(
             continue
         try:
             with place_for(options) as place, chdir(place):
-                is_new = mirror_ended(folder, options, values, allowed)
-            pages[folder.home, options["uri"]] = folder, options
+                is_new = mirror(folder, options, values, allowed, live=state == "running")
         except BusyError:
             yield f"{folder.label} is being mirrored by another process"
             continue
         except ERRORS as error:
             raise refusal(folder, options, error) from error
+        if state == "running":
+            continue
+        if class_of(options) == MLFLOW:
+            pages[folder.home, options["uri"]] = folder, options
         new, already_there = new + is_new, already_there + (not is_new)
         if is_new:
             yield f"mirrored {folder.label}"
-    renew_pages(pages)
+    for folder, options in pages.values():
+        try:
+            show_ideas(folder.home, options["uri"])
+        except Exception as error:  # any error of the tracker's client
+            raise refusal(folder, options, error) from error
     yield f"{counted(new, 'trial')} mirrored now, {already_there} before"
 
 
-def mirror_ended(
+# for each experiment and tracker, a trial and its settings ``tracking``
+Pages = dict[tuple[Path, str | None], tuple[TrialFolder, dict[str, Any]]]
+
+
+def mirror(
     folder: TrialFolder,
     options: Mapping[str, Any],
     values: dict[str, Any],
     allowed: Sequence[str] = (),
+    live: bool = False,
 ) -> bool:
-    """Mirror an ended trial; returns False if the tracker lacks nothing.
+    """Send a trial that has ended or (``live``) runs; returns False if the tracker lacks nothing.
 
     Raises the errors of `TrackerRun`.
     """
     with closing(TrackerRun(folder, options, values, allowed)) as run:
-        if run.is_complete:
+        if live:
+            run.add_curves()
+        elif run.is_complete:
             return False
-        run.end()
+        else:
+            run.end()
         return True
+
+
+def _state_file(folder: TrialFolder, options: Mapping[str, Any]) -> Path:
+    """The file in a trial's folder that says what its tracker has got."""
+    name = tracker_name(options)
+    own = class_of(options).startswith(OWN)
+    return folder.path / f"{name.lower() if own else f'tracker-{name}'}.json"
 
 
 def refusal(folder: TrialFolder, options: Mapping[str, Any], error: BaseException) -> MirrorError:
@@ -251,18 +276,3 @@ def refusal(folder: TrialFolder, options: Mapping[str, Any], error: BaseExceptio
     lines = str(error).strip().splitlines()
     reason = f"{type(error).__name__}: {lines[0][:200] if lines else ''}"
     return MirrorError(f"{folder.label} could not be sent to {tracker_name(options)} ({reason})")
-
-
-# for each experiment and tracker, a trial and its settings ``tracking``
-Pages = dict[tuple[Path, str | None], tuple[TrialFolder, dict[str, Any]]]
-
-
-def renew_pages(pages: Pages) -> None:
-    """Show the present table and verdict of experiments on their pages. Raises MirrorError."""
-    for folder, options in pages.values():
-        if class_of(options) == MLFLOW:
-            try:
-                publish(folder.home, options["uri"])
-            except Exception as error:  # any error of the tracker's client
-                raise refusal(folder, options, error) from error
-    pages.clear()

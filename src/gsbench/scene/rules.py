@@ -1,0 +1,611 @@
+"""The table of rules: what is odd about a capture, its cameras, its model and its points.
+
+A rule measures something, and has two ranges of values: outside ``fine`` a line says so, outside
+``usable`` the capture is refused, unless ``scene.accept`` has the rule's id. A new trouble is a row
+and its measure. docs/captures.md has the table (scripts/captures.py).
+"""
+
+import logging
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from gsbench.errors import InputError
+from gsbench.parsing import MAX_NUMBER
+from gsbench.runs.trial_record import Oddity
+from gsbench.scene.types import Array, Camera, Scene
+from gsbench.words import FORM, did_you_mean, listed
+
+log = logging.getLogger(__name__)
+
+MIN_IMAGES = 3  # with two views, no third one can reveal a wrong geometry
+MIN_SIZE = 16  # px: the smallest side of an image that is trained on
+
+Range = tuple[float, float]  # the ends belong to it
+ANY: Range = (-math.inf, math.inf)
+
+
+def at_most(limit: float) -> Range:
+    return -math.inf, limit
+
+
+def at_least(limit: float) -> Range:
+    return limit, math.inf
+
+
+ABOVE_ZERO = at_least(math.nextafter(0, 1))
+
+
+class Finding(NamedTuple):
+    """A measured value, the images that have it, and facts for the sentence."""
+
+    value: float
+    names: Sequence[str] = ()
+    facts: Mapping[str, Any] = {}
+
+
+# file: one file, by `given` · read: a folder with photographs · capture: as it is used
+# lens: cameras with distortion · views: that have a pose · scene: views as they are trained on
+# model: of the initialisation · cloud: before training
+Stage = Literal["file", "read", "capture", "lens", "views", "scene", "model", "cloud"]
+
+
+@dataclass(frozen=True)
+class Rule:
+    """One row. ``say`` and ``mend`` are formatted with the finding (`gsbench.words.FORM`).
+
+    A ``fixed`` rule is one of arithmetic or safety, and cannot be accepted.
+    """
+
+    id: str
+    stage: Stage
+    measure: Callable[[Any], Iterable[Finding]]
+    fine: Range
+    usable: Range
+    say: str
+    mend: str
+    fixed: bool = False
+
+    def judge(self, subject: Any) -> Oddity | None:
+        """The oddity of a subject, told by its worst finding; None if all is fine."""
+        return self.tell(self.measure(subject))
+
+    def tell(self, measured: Iterable[Finding]) -> Oddity | None:
+        """The oddity among findings."""
+        odd = [found for found in measured if not _within(found.value, self.fine)]
+        if not odd:
+            return None
+        worst = max(odd, key=lambda found: _beyond(found.value, self.fine))
+        names = list(dict.fromkeys(name for found in odd for name in found.names))
+        facts = {"count": len(names), **worst.facts, "value": worst.value, "names": names}
+        value = min(max(worst.value, -MAX_NUMBER), MAX_NUMBER) if worst.value == worst.value else -1
+        return Oddity(
+            rule=self.id,
+            line=FORM.format(f"{self.say}: {self.mend}", **facts),
+            value=value,
+            refused=not all(_within(found.value, self.usable) for found in odd),
+        )
+
+
+def _within(value: float, limits: Range) -> bool:
+    return limits[0] <= value <= limits[1]  # NaN is within nothing
+
+
+def _beyond(value: float, limits: Range) -> float:
+    return max(limits[0] - value, value - limits[1]) if value == value else math.inf
+
+
+def inspect(
+    stage: Stage, subject: Any, where: str, accept: Sequence[str] = ()
+) -> tuple[Oddity, ...]:
+    """Judge a subject by all rules of a stage; returns what is odd, and logs each line.
+
+    Raises InputError for what is not usable, unless its rule is in ``accept``.
+    """
+    judged = (rule.judge(subject) for rule in RULES if rule.stage == stage)
+    return settle([found for found in judged if found is not None], where, accept)
+
+
+def settle(found: Sequence[Oddity], where: str, accept: Sequence[str] = ()) -> tuple[Oddity, ...]:
+    """Log oddities, here or earlier found, and refuse those that are not usable nor accepted."""
+    # Lines come first, because they may explain an error.
+    for odd in sorted(found, key=lambda odd: odd.refused):
+        if not odd.refused:
+            log.warning("%s: %s", where, odd.line)
+        elif odd.rule in accept:
+            log.warning("%s: %s (accepted: %s)", where, odd.line, odd.rule)
+        else:
+            way = "" if BY_ID[odd.rule].fixed else f" (or scene.accept=[{odd.rule}])"
+            raise InputError(f"{where}: {odd.line}{way}")
+    return tuple(found)
+
+
+def check_accept(accept: Sequence[str]) -> None:
+    """Raise InputError for an id that is no rule's, or whose rule cannot be accepted."""
+    for name in accept:
+        if name not in BY_ID:
+            known = [rule.id for rule in RULES if not rule.fixed and rule.usable != ANY]
+            raise InputError(
+                f"scene.accept={name} is no rule: {listed(known)} can be accepted"
+                f"{did_you_mean(name, known)}"
+            )
+        if BY_ID[name].fixed:
+            raise InputError(f"scene.accept={name}: this rule cannot be accepted: leave it out")
+
+
+# ---- measures
+
+
+def camera_distances(cameras: Sequence[Camera]) -> tuple[Array, Array]:
+    """The median position [3] of cameras, and the distance of each from it [V]."""
+    centers = np.stack([camera.center for camera in cameras])  # [V, 3]
+    middle = np.median(centers, axis=0)
+    return middle, np.linalg.norm(centers - middle, axis=1)
+
+
+def _far_cameras(scene: Scene) -> Iterable[Finding]:
+    _, distances = camera_distances([view.camera for view in scene.train])
+    typical = float(np.median(distances))
+    for view, distance in zip(scene.train, distances, strict=True):
+        if typical > 0:
+            yield Finding(float(distance) / typical, [view.name], {"extent": scene.extent})
+
+
+def _each_camera(value: Callable[[Camera], float]) -> Callable[[Scene], Iterable[Finding]]:
+    """A measure of each training camera."""
+
+    def measure(scene: Scene) -> Iterable[Finding]:
+        for view in scene.train:
+            yield Finding(value(view.camera), [view.name], {"camera": view.camera})
+
+    return measure
+
+
+def _field_of_view(camera: Camera) -> float:
+    return math.degrees(2 * math.atan(camera.width / (2 * camera.fx)))
+
+
+def _off_center(camera: Camera) -> float:
+    """The distance of the principal point from the middle, in shares of a side."""
+    return max(abs(camera.cx / camera.width - 0.5), abs(camera.cy / camera.height - 0.5))
+
+
+def _brightest(scene: Scene) -> Iterable[Finding]:
+    yield Finding(max(int(view.image.max()) for view in scene.train))
+
+
+def _near_twins(scene: Scene) -> Iterable[Finding]:
+    names = [f"{name} ({twin})" for name, twin in scene.twins.near.items()]
+    yield Finding(len(names), names, {"tested": len(scene.test)})
+
+
+def _kept(part: str) -> Callable[[Any], Iterable[Finding]]:
+    """A measure that counts the views of a part that is left."""
+    return lambda subject: [Finding(len(getattr(subject, part)))]
+
+
+def _left_out(subject: Any) -> Iterable[Finding]:
+    """The photographs left out of a capture or a scene as copies of others."""
+    twins = getattr(subject, "twins", subject).left_out
+    yield Finding(len(twins), [f"{name} ({other} is used)" for name, other in twins.items()])
+
+
+def _fact(name: str, *more: str) -> Callable[[Any], Iterable[Finding]]:
+    """A measure that is an attribute of the subject, if known; ``more`` are for the sentence."""
+
+    def measure(subject: Any) -> Iterable[Finding]:
+        value = getattr(subject, name)
+        if value is not None:
+            yield Finding(value, (), {key: getattr(subject, key) for key in more})
+
+    return measure
+
+
+def _findings(name: str) -> Callable[[Any], Iterable[Finding]]:
+    """A measure whose findings the subject has already, by the name of what was measured."""
+    return lambda subject: subject.get(name, ())
+
+
+def _names(name: str) -> Callable[[Any], Iterable[Finding]]:
+    """A measure that counts names of images that the subject lists."""
+    return lambda subject: [Finding(len(getattr(subject, name)), getattr(subject, name))]
+
+
+def given(rule: str, value: float, where: str, **facts: Any) -> None:
+    """Judge a value that the caller measured by one rule that cannot be accepted."""
+    found = BY_ID[rule].tell([Finding(value, (), facts)])
+    settle([] if found is None else [found], where)
+
+
+def _panoramas(raw: Any) -> Iterable[Finding]:
+    names = [row.name for row in raw.photographs if row.camera is None and row.is_panorama]
+    yield Finding(len(names), names)
+
+
+ELSEWHERE = "the cloud may lie in other coordinates, or have another scale, than the cameras"
+RULES = (
+    # ---- files
+    Rule(
+        "too-few-images",
+        "file",
+        _fact("value"),
+        at_least(MIN_IMAGES),
+        at_least(MIN_IMAGES),
+        "{value:n image} {which}, but at least 3 are needed",
+        "{mend}",
+        fixed=True,
+    ),
+    Rule(
+        "view-size",
+        "file",
+        _fact("value"),
+        at_least(MIN_SIZE),
+        at_least(MIN_SIZE),
+        "scene.downscale={downscale}{limit} leaves {size} px of {full}",
+        "at least 16 px are needed",
+        fixed=True,
+    ),
+    Rule(
+        "principal-point-of-other-size",
+        "file",
+        _fact("value"),
+        (1 / 1.5, 1.5),  # copies are halved; other points are off by few percent
+        (1 / 1.5, 1.5),
+        "its principal point ({cx:g}, {cy:g}) is the centre of a photograph of another size than "
+        "{width}x{height} px",
+        "add w and h",
+        fixed=True,
+    ),
+    Rule(
+        "mask-of-other-size",
+        "file",
+        _fact("value"),
+        at_most(0),
+        at_most(0),
+        "the mask is {size} px and its image {name} {full}",
+        "give masks of the images' size",
+        fixed=True,
+    ),
+    Rule(
+        "black-mask",
+        "file",
+        _fact("value"),
+        ABOVE_ZERO,
+        ABOVE_ZERO,
+        "the mask is black all over, so no pixel counts",
+        "correct it, or leave the image out",
+        fixed=True,
+    ),
+    Rule(
+        "grey-mask",
+        "file",
+        _fact("value"),
+        at_most(0.05),  # a photograph has far more
+        at_most(0.05),
+        "{value:.0%} of its pixels are grey, so it is not a mask",
+        "make it black where pixels are ignored, else white",
+        fixed=True,
+    ),
+    # ---- a folder with photographs
+    Rule(
+        "no-pose",
+        "read",
+        _findings("no-pose"),
+        at_most(0),
+        ANY,
+        "{count:n photograph} without a pose in the model: {names:few}",
+        "they are not used",
+    ),
+    Rule(
+        "no-file",
+        "read",
+        _findings("no-file"),
+        at_most(0),
+        ANY,
+        "{count:n image} with a camera but without a file: {names:few}",
+        "they are not used",
+    ),
+    Rule(
+        "found-by-last-part",
+        "read",
+        _findings("found-by-last-part"),
+        at_most(0),
+        ANY,
+        "files found by the last part of their path: {names:few}",
+        "name the photographs as the model does",
+    ),
+    Rule(
+        "focal-length-and-field",
+        "read",
+        _findings("focal-length-and-field"),
+        (1 / 1.05, 1.05),  # rounding, and a shift of the principal point, are far less
+        ANY,
+        "its focal length is {given:g} px, but its field of view means {meant:g} px: {names:few}",
+        "the focal length is used",
+    ),
+    # ---- a capture as it is used
+    Rule(
+        "panorama",
+        "capture",
+        _panoramas,
+        at_most(0),
+        at_most(0),
+        "{count:n photograph} declared as panoramas by XMP (equirectangular): {names:few}",
+        "split them into pinhole views first, for example with COLMAP's panorama_sfm",
+    ),
+    Rule(
+        "copies",
+        "capture",
+        _left_out,
+        at_most(0),
+        ANY,
+        "{count:n photograph} left out, with the name or content of another: {names:few}",
+        "keep one of each",
+    ),
+    # ---- lenses
+    Rule(
+        "lens-turns-back",
+        "lens",
+        _findings("lens-turns-back"),
+        at_most(0.0),
+        at_most(0.01),  # fitted lenses of correct models may do so in the outermost corners
+        "the camera of {names:few} ({camera}) turns back inside the picture: {value:.1%} of the "
+        "undistorted photograph would be a mirrored ghost",
+        "correct its distortion, estimate another model (scene=photos init.camera_model=RADIAL), "
+        "or give undistorted photographs",
+    ),
+    Rule(
+        "little-left",
+        "lens",
+        _findings("little-left"),
+        at_least(0.25),
+        ANY,
+        "the camera of {names:few} ({camera}) leaves {size} of {full} px undistorted",
+        "check its lens",
+    ),
+    # ---- views
+    Rule(
+        "no-training-view",
+        "views",
+        _kept("train"),
+        at_least(1),
+        at_least(1),
+        "no training view has a pose, or all of them are copies of test views",
+        "change the split or the init",
+        fixed=True,
+    ),
+    Rule(
+        "no-test-view",
+        "views",
+        _kept("test"),
+        at_least(1),
+        at_least(1),
+        "no test view has a pose, so nothing could be measured",
+        "change the split or the init, or leave out photographs of another camera",
+        fixed=True,
+    ),
+    Rule(
+        "views-without-pose",
+        "views",
+        _names("unplaced"),
+        at_most(0),
+        ANY,
+        "{count:n view} without a pose left out: {names:few}",
+        "take photographs with more overlap, or another init",
+    ),
+    Rule(
+        "copies-in-pixels",
+        "scene",
+        _left_out,
+        at_most(0),
+        ANY,
+        "{count:n training view} left out, with the pixels of a test view: {names:few}",
+        "keep one of each",
+    ),
+    Rule(
+        "near-twins",
+        "scene",
+        _near_twins,
+        at_most(0),
+        ANY,
+        "{count} of {tested:n test view} with a near twin in training: {names:few}",
+        "such views measure memory; scene.split=sector holds out whole parts",
+    ),
+    Rule(
+        "far-camera",
+        "scene",
+        _far_cameras,
+        at_most(20.0),
+        ANY,
+        "the camera of {names:few} is {value:,.0f} times as far from the others as they usually "
+        "are, and sets the scene extent to {extent:.4g}",
+        "check its pose, or leave the image out",
+    ),
+    Rule(
+        "field-of-view",
+        "scene",
+        _each_camera(_field_of_view),
+        (0.2, 150.0),  # satellites have 1 degree, the widest pinhole lenses 130
+        ANY,
+        "the camera of {names:few} has a focal length of {camera.fx:.4g} px for a width of "
+        "{camera.width} px",
+        "check its unit",
+    ),
+    Rule(
+        "pixel-shape",
+        "scene",
+        _each_camera(lambda camera: camera.fy / camera.fx),
+        (1 / 1.25, 1.25),  # unequal scaling of photographs gives 1.01
+        ANY,
+        "the camera of {names:few} has focal lengths of {camera.fx:.4g} and {camera.fy:.4g} px, "
+        "but pixels are square",
+        "check both",
+    ),
+    Rule(
+        "principal-point",
+        "scene",
+        _each_camera(_off_center),
+        at_most(0.4),
+        ANY,
+        "the camera of {names:few} has its principal point at ({camera.cx:.4g}, {camera.cy:.4g}) "
+        "of {camera.width}x{camera.height} px, far from the middle",
+        "check its unit, unless the photographs were cropped",
+    ),
+    Rule(
+        "dark",
+        "scene",
+        _brightest,
+        at_least(49),  # the usual cause are values of 10 or 12 bits in files of 16
+        ANY,
+        "no photograph has a value above {value} of 255",
+        "scale them to their full range",
+    ),
+    # ---- the model of the initialisation
+    Rule(
+        "few-placed",
+        "model",
+        _fact("placed_share", "num_registered", "num_images", "unregistered"),
+        at_least(0.9),
+        ANY,
+        "only {num_registered} of {num_images} images have a pose (missing: {unregistered:few})",
+        "the other photos are not used; more overlap or texture would help",
+    ),
+    Rule(
+        "few-points",
+        "model",
+        _fact("num_points"),
+        at_least(100),
+        ANY,
+        "only {value} points",
+        "training starts from next to nothing",
+    ),
+    Rule(
+        "reprojection-error",
+        "model",
+        _fact("mean_reprojection_error"),
+        at_most(1.5),  # px; correct models stay below 0.7 with SIFT, 1.2 with learned features
+        ANY,
+        "mean reprojection error {value:.2f} px is large",
+        "the cameras or the matches are probably wrong",
+    ),
+    Rule(
+        "cameras-turned",
+        "model",
+        _fact("rotation_error", "truth"),
+        at_most(2.0),  # degrees; correct models stay below 0.5, wrong ones reach 20 and more
+        ANY,
+        "the cameras are turned {value:.1f} degrees against the {truth} ones on average",
+        "the model is wrong although its images are placed (views at most 7.5 degrees apart are "
+        "safe)",
+    ),
+    Rule(
+        "cameras-moved",
+        "model",
+        _fact("center_error", "truth"),
+        at_most(0.05),
+        ANY,
+        "the cameras are {value:.1%} of the scene extent away from the {truth} ones",
+        "the model is probably wrong",
+    ),
+    Rule(
+        "estimated-field-of-view",
+        "model",
+        lambda model: model.fields_of_view,
+        (5.0, 150.0),
+        ANY,
+        "estimated focal length {focal:.0f} px (field of view {value:.0f} degrees) is implausible",
+        "give init.focal_length in px",
+    ),
+    # ---- the points that training starts from
+    Rule(
+        "cameras-at-one-place",
+        "cloud",
+        _fact("extent"),
+        ABOVE_ZERO,
+        ABOVE_ZERO,
+        "all training cameras stand at one place, so no depth can be learnt",
+        "take photographs from several places",
+        fixed=True,
+    ),
+    Rule(
+        "point-beyond-range",
+        "cloud",
+        _fact("farthest", "number", "total", "place"),
+        at_most(1e7),  # squares of larger lengths leave the range in which float32 can train
+        at_most(1e7),
+        "initial point {number} of {total:,} is {value:.3g} times as far from the cameras as they "
+        "are from each other, at {place}",
+        "remove it from the cloud",
+        fixed=True,
+    ),
+    Rule(
+        "points-out-of-view",
+        "cloud",
+        _fact("seen_by_one"),
+        ABOVE_ZERO,
+        ABOVE_ZERO,
+        "no training view has one of the initial points in view",
+        "the cloud lies in other coordinates than the cameras; bring it into theirs",
+        fixed=True,
+    ),
+    Rule(
+        "points-share-places",
+        "cloud",
+        _fact("identical", "first_place"),
+        at_most(0.5),
+        at_most(math.nextafter(1, 0)),
+        "{value:.0%} of the initial points share their place with another, such as {first_place}",
+        "thin or rebuild the cloud",
+        fixed=True,
+    ),
+    Rule(
+        "points-far-off",
+        "cloud",
+        _fact("far"),
+        at_most(0),
+        ANY,
+        "{value:n initial point} more than 10,000 times as far off as the cameras",
+        "clean the cloud",
+    ),
+    Rule(
+        "points-seen-once",
+        "cloud",
+        _fact("seen"),
+        at_least(0.1),  # clouds by structure from motion have 0.97 and more
+        ANY,
+        "only {value:.1%} of the initial points are in view of two training views",
+        ELSEWHERE,
+    ),
+    Rule(
+        "points-in-a-heap",
+        "cloud",
+        _fact("spread"),
+        at_least(0.02),
+        ANY,
+        "half of the initial points lie within {value:.2g} of the cameras' distances",
+        ELSEWHERE,
+    ),
+    Rule(
+        "colours-disagree",
+        "cloud",
+        _fact("color_agreement"),
+        at_least(0.25),  # sound clouds have 0.6 to 0.9, other scales or axes -0.1 to 0.2
+        ANY,
+        "the colours of the initial points hardly agree with the photographs (agreement "
+        "{value:.2f}; 0 is chance, 1 is equal)",
+        ELSEWHERE,
+    ),
+    Rule(
+        "cloud-of-one-colour",
+        "cloud",
+        _fact("color_spread", "first_color"),
+        at_least(1.0),
+        ANY,
+        "all initial points have the colour {first_color}",
+        "export the cloud with its colours",
+    ),
+)
+BY_ID = {rule.id: rule for rule in RULES}

@@ -1,0 +1,204 @@
+"""All answers of an experiment: badges, other questions, folded code, and what nobody asked."""
+
+import itertools
+
+import pytest
+
+from gsbench.analysis.comparison import compare
+from gsbench.analysis.results import load_experiment
+from gsbench.runs.commands import read_history
+from tests.helpers import change_json, write_lines
+from tests.trials import ask_about, write_arms, write_runs, write_trial
+
+CLEAR = {"effect": {"psnr": 3.0, "ssim": 0.5}}
+
+
+def answers(runs, **how):
+    return compare(load_experiment(runs, "exp"), **how).answers
+
+
+def badges(runs):
+    return {str(one.arm): one.badge for one in answers(runs)}
+
+
+def write_mine(runs, version, psnr, settings=None, seeds=(0, 1, 2), scene="courtyard"):
+    """Trials of a user's densifier whose module has this version."""
+    sources = {"sources": {"mine": version * 64}}
+    key = f"{hash((version, str(settings))) % 2**32:08x}"
+    for seed in seeds:
+        write_trial(
+            runs,
+            seed,
+            key,
+            settings,
+            scene=scene,
+            densify="mine",
+            _code=sources,
+            psnr=psnr + 0.01 * seed,
+        )
+
+
+def write_adc(runs, seeds=(0, 1, 2), scene="courtyard"):
+    for seed in seeds:
+        write_trial(runs, seed, scene=scene, psnr=20 + 0.02 * seed)
+
+
+def of(version):
+    """Trials of the baseline, and of this version of the user's module."""
+    return lambda trial: trial.record.code.sources.get("mine", version * 64) == version * 64
+
+
+def test_the_badge_is_that_of_the_question_and_other_metrics_are_not_tested(tmp_path):
+    write_runs(tmp_path, **CLEAR)
+    ask_about(tmp_path)
+    (answer,) = answers(tmp_path)
+    assert answer.badge == "BETTER"
+    assert answer.sentence.startswith("sfm-volumetric against sfm-adc: better in PSNR (dB) on")
+    assert {one.quantity.key for one in answer.metrics} == {"ssim", "lpips_vgg_raw", "flip"}
+    assert {one.state for one in answer.metrics} == {"not tested"}
+    assert compare(load_experiment(tmp_path, "exp")).risk.startswith("1 question, 1 statement;")
+
+
+def test_what_nobody_asked_has_an_interval_and_no_verdict(tmp_path):
+    write_runs(tmp_path, **CLEAR)
+    (answer,) = answers(tmp_path)
+    assert (answer.badge, answer.verdict.outcome) == ("NOT ASKED", "undecided")
+    assert answer.verdict.interval.low > 2
+    assert compare(load_experiment(tmp_path, "exp")).risk == ""
+
+
+def test_another_baseline_that_is_chosen_later_is_not_tested(tmp_path):
+    write_runs(tmp_path, **CLEAR)
+    ask_about(tmp_path)
+    (answer,) = answers(tmp_path, baseline="volumetric")
+    assert (str(answer.arm), answer.badge) == ("sfm-adc", "NOT TESTED")
+
+
+def test_a_look_after_each_seed_ends_at_ever_smaller_levels(tmp_path):
+    """Declare eight seeds, look after each: there is no verdict before all are done."""
+    write_runs(tmp_path, scenes=("garden",), seeds=range(8), **CLEAR)
+    ask_about(tmp_path)
+    for path in itertools.chain(*(tmp_path.glob(f"exp/*/*/*-seed{k}") for k in range(3, 8))):
+        (path / "results.json").unlink()
+    assert badges(tmp_path) == {"sfm-volumetric": "STOPPED 6/16"}
+
+
+def test_seeds_that_are_added_until_it_pleases_cost_level(tmp_path):
+    write_runs(tmp_path, scenes=("garden",), seeds=range(6))
+    levels = [
+        ask_about(tmp_path, lambda trial, n=n: trial.seed < n)[0].level for n in (2, 3, 4, 5, 6)
+    ]
+    assert levels == pytest.approx([0.05 * 2 / (n * (n + 1)) for n in range(1, 6)])
+    (answer,) = answers(tmp_path)
+    assert answer.verdict.question.n == 5
+    assert [one.question.n for one in answer.others] == [4, 3, 2, 1]
+
+
+def test_a_scene_of_the_next_day_folds_nothing_away(tmp_path):
+    write_runs(tmp_path, scenes=("garden", "room"), **CLEAR)
+    for scene in ("garden", "room"):
+        ask_about(tmp_path, lambda trial, scene=scene: trial.scene == scene)
+    experiment = load_experiment(tmp_path, "exp")
+    assert len(experiment.trials) == 12
+    (answer,) = answers(tmp_path)
+    assert [*answer.verdict.question.seeds] == ["room"]
+    assert [[*one.question.seeds] for one in answer.others] == [["garden"]]
+
+
+def test_the_code_of_an_idea_is_that_of_its_newest_question_from_any_folder(tmp_path, monkeypatch):
+    write_adc(tmp_path)
+    ask_about(tmp_path)
+    for version, psnr in (("1", 25.0), ("2", 15.0)):
+        write_mine(tmp_path, version, psnr)
+        ask_about(tmp_path, of(version))
+    shown = []
+    for folder, text in (("a", "x = 1"), ("b", "x = 2")):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "mine.py").write_text(text)
+        monkeypatch.chdir(tmp_path / folder)
+        shown.append(compare(load_experiment(tmp_path, "exp")).to_json())
+    assert shown[0] == shown[1]
+    (answer,) = answers(tmp_path)
+    assert (answer.badge, answer.verdict.question.n) == ("WORSE", 2)
+    assert {trial.metrics["psnr"] < 21 for trial in load_experiment(tmp_path, "exp").trials} == {
+        True
+    }
+
+
+def test_after_an_edit_rows_that_were_not_trained_again_are_folded_as_earlier_code(tmp_path):
+    """Edit `candidates()` and run one of three settings again: one version in the table."""
+    write_adc(tmp_path)
+    settings = [{"densify.decay": k} for k in (1, 2, 3)]
+    for own in settings:
+        write_mine(tmp_path, "1", 25.0, own)
+    ask_about(tmp_path)
+    write_mine(tmp_path, "2", 15.0, settings[1])
+    ask_about(tmp_path, of("2"))
+    experiment = load_experiment(tmp_path, "exp")
+    assert len(experiment.older) == 9
+    (line,) = experiment.versions
+    assert "9 trials of sfm-mine made by earlier versions of mine" in line
+    shown = [trial for trial in experiment.trials if trial.densify == "mine"]
+    assert {trial.record.code.sources["mine"][0] for trial in shown} == {"2"}
+    newest = [one for one in answers(tmp_path) if one.verdict.question.n == 2]
+    assert [one.badge for one in newest] == ["WORSE"]
+
+
+def test_a_trial_of_no_question_is_named(tmp_path):
+    write_runs(tmp_path, scenes=("garden",), seeds=range(4), **CLEAR)
+    ask_about(tmp_path, lambda trial: trial.seed < 3)
+    remarks = [*map(str, compare(load_experiment(tmp_path, "exp")).remarks)]
+    assert any("whose question did not name them" in line and "seed3" in line for line in remarks)
+
+
+def test_arms_of_one_command_keep_their_names_among_later_settings(tmp_path):
+    write_arms(tmp_path, {"adc": {}, "mine": {"decay": 1}})
+    ask_about(tmp_path)
+    write_arms(tmp_path / "more", {"mine": {"decay": 2}})
+    for path in (tmp_path / "more").glob("exp/*/*/*"):
+        path.rename(tmp_path / path.relative_to(tmp_path / "more"))
+    names = {str(one.arm) for one in answers(tmp_path)}
+    assert names == {"sfm-mine[decay=1]", "sfm-mine[decay=2]"}
+
+
+def test_a_broken_link_among_the_commands_is_a_warning(tmp_path):
+    write_runs(tmp_path, **CLEAR)
+    ask_about(tmp_path)
+    file = tmp_path / "exp/commands.jsonl"
+    file.write_text(file.read_text() * 2)
+    experiment = load_experiment(tmp_path, "exp")
+    assert any("does not follow the one before it" in line for line in experiment.warnings)
+    assert badges(tmp_path) == {"sfm-volumetric": "BETTER"}
+
+
+# ---- experiments of gsbench 0.1
+
+
+def declare(runs, time="2020-01-01T00:00:00Z", **more):
+    asked = {"metric": "psnr", "sign": 0}
+    trials = {}
+    for trial in load_experiment(runs, "exp").trials:
+        trials.setdefault(trial.key, []).append(trial.seed)
+    write_lines(
+        runs / "exp/declared.jsonl",
+        [{"time": time, "questions": [asked], "trials": trials} | more],
+    )
+
+
+def test_an_old_declaration_is_read_as_five_percent_by_arms(tmp_path):
+    write_runs(tmp_path, densifiers=("adc", "volumetric", "mcmc"), **CLEAR)
+    for path in tmp_path.glob("exp/*/*/*/results.json"):
+        change_json(path, measured="2021-01-01T00:00:00Z")
+    declare(tmp_path)
+    found = {str(one.arm): one for one in answers(tmp_path)}
+    assert found["sfm-volumetric"].badge == "BETTER"
+    assert {one.verdict.level for one in found.values()} == {0.025}
+    assert not read_history(tmp_path / "exp").questions
+
+
+def test_an_old_declaration_after_results_is_not_tested(tmp_path):
+    write_runs(tmp_path, **CLEAR)
+    for path in tmp_path.glob("exp/*/*/*/results.json"):
+        change_json(path, measured="2019-01-01T00:00:00Z")
+    declare(tmp_path)
+    assert badges(tmp_path) == {"sfm-volumetric": "NOT TESTED"}

@@ -1,0 +1,278 @@
+"""The table of rules: the limits of each, and what is logged, refused, accepted and recorded."""
+
+from dataclasses import replace
+from types import SimpleNamespace as Facts
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from gsbench.config.compose import compose_one
+from gsbench.runs.config_hash import arm_hash, config_hash
+from gsbench.scene import rules
+from gsbench.scene.load import load_scene
+from gsbench.scene.options import SceneConfig
+from gsbench.scene.rules import BY_ID, RULES, Finding, Rule, check_accept, inspect
+from gsbench.scene.types import Camera, Scene, Twins, View
+from tests.helpers import refusal
+from tests.scene.captures import read_colmap, read_photos
+
+
+def camera(place=0.0, **changes):
+    values = {"width": 40, "height": 32, "fx": 40.0, "fy": 40.0, "cx": 20.0, "cy": 16.0} | changes
+    return Camera(**values, rotation=np.eye(3), translation=np.array([-place, 0.0, 0.0]))
+
+
+def views(places=(-1.0, 0.0, 1.0, 2.0), level=200, **changes):
+    image = np.full((32, 40, 3), level, np.uint8)
+    return tuple(View(f"{n}.png", camera(x, **changes), image) for n, x in enumerate(places))
+
+
+def scene(twins=None, **changes):
+    return Scene("toy", views(**changes), views((0.5,)), twins=twins or Twins())
+
+
+def value(number, **facts):
+    """A finding of a rule whose values the caller has."""
+    return [Finding(number, ("a.png",), facts)]
+
+
+def found(rule, number, **facts):
+    return {rule: value(number, **facts)}
+
+
+def panorama(is_panorama):
+    return Facts(photographs=[Facts(name="a.jpg", camera=None, is_panorama=is_panorama)])
+
+
+SIZE = {"size": "8x6", "full": "40x30"}
+LENS = {"camera": "RADIAL: 1, 2", "size": "8x6", "full": "40x30"}
+MODEL = {"num_registered": 8, "num_images": 10, "unregistered": list("abcdefgh"), "truth": "true"}
+CENTER = {"cx": 40, "cy": 30, "width": 40, "height": 30}
+# id: a subject that is just fine, one that is not, what is said of it
+ROWS = {
+    "too-few-images": (
+        value(3),
+        value(2, which="left by the split", mend="give more"),
+        "2 images left by the split, but at least 3 are needed: give more",
+    ),
+    "view-size": (
+        value(16),
+        value(15, downscale=2, limit="", **SIZE),
+        r"scene.downscale=2 leaves 8x6 px of 40x30: at least 16 px",
+    ),
+    "principal-point-of-other-size": (value(1.5), value(1.51, **CENTER), r"\(40, 30\) is the cent"),
+    "mask-of-other-size": (value(0), value(1, name="a.png", **SIZE), "8x6 px and its image a.png"),
+    "black-mask": (value(0.01), value(0.0), "black all over"),
+    "grey-mask": (value(0.05), value(0.051), "5% of its pixels are grey"),
+    "no-pose": (found("no-pose", 0), found("no-pose", 1), "1 photograph without a pose .*: a.png"),
+    "no-file": (
+        found("no-file", 0),
+        found("no-file", 1),
+        "1 image with a camera but without a file: a.png",
+    ),
+    "found-by-last-part": (
+        found("found-by-last-part", 0),
+        found("found-by-last-part", 1),
+        "files found by the last part of their path: a.png",
+    ),
+    "focal-length-and-field": (
+        found("focal-length-and-field", 1.05),
+        found("focal-length-and-field", 1.06, given=50, meant=53),
+        "its focal length is 50 px, but its field of view means 53 px",
+    ),
+    "panorama": (panorama(False), panorama(True), "1 photograph declared as panoramas"),
+    "copies": (Facts(left_out={}), Facts(left_out={"a": "b"}), r"left out, .*: a \(b is used\)"),
+    "lens-turns-back": (
+        found("lens-turns-back", 0.0),
+        found("lens-turns-back", 0.02, **LENS),
+        r"camera of a.png \(RADIAL: 1, 2\) turns back .*: 2.0% of",
+    ),
+    "little-left": (
+        found("little-left", 0.25),
+        found("little-left", 0.24, **LENS),
+        "leaves 8x6 of 40x30 px undistorted: check its lens",
+    ),
+    "no-training-view": (Facts(train="a"), Facts(train=""), "no training view has a pose"),
+    "no-test-view": (Facts(test="a"), Facts(test=""), "no test view has a pose"),
+    "views-without-pose": (
+        Facts(unplaced=[]),
+        Facts(unplaced=["a"]),
+        "1 view without a pose left out: a",
+    ),
+    "copies-in-pixels": (
+        scene(),
+        scene(Twins(left_out={"a": "b"})),
+        r"1 training view left out, .*: a \(b is used\)",
+    ),
+    "near-twins": (
+        scene(),
+        scene(Twins(near={"a": "b"})),
+        r"1 of 1 test view with a near twin in training: a \(b\)",
+    ),
+    "far-camera": (
+        scene(places=(-1.0, 0.0, 1.0, 20.0)),
+        scene(places=(-1.0, 0.0, 1.0, 41.0)),
+        "the camera of 3.png is .* times as far from the others .* scene extent to 33.83",
+    ),
+    "field-of-view": (
+        scene(fx=5.4, fy=5.4),  # 20 px / tan(75 deg) = 5.36 px
+        scene(fx=5.3, fy=5.3),
+        r"0.png, 1.png, 2.png and 1 more has a focal length of 5.3 px for a width of 40 px",
+    ),
+    "pixel-shape": (scene(fy=32.4), scene(fy=31.6), "focal lengths of 40 and 31.6 px"),
+    "principal-point": (scene(cx=35.9), scene(cx=36.1), r"at \(36.1, 16\) of 40x32 px"),
+    "dark": (scene(level=49), scene(level=48), "no photograph has a value above 48 of 255"),
+    "few-placed": (
+        Facts(placed_share=0.9, **MODEL),
+        Facts(placed_share=0.8, **MODEL),
+        r"only 8 of 10 images have a pose \(missing: a, b, c and 5 more\)",
+    ),
+    "few-points": (Facts(num_points=100), Facts(num_points=99), "only 99 points"),
+    "reprojection-error": (
+        Facts(mean_reprojection_error=1.5),
+        Facts(mean_reprojection_error=1.52),
+        "1.52 px is large",
+    ),
+    "cameras-turned": (
+        Facts(rotation_error=2.0, **MODEL),
+        Facts(rotation_error=2.1, **MODEL),
+        "turned 2.1 degrees against the true ones",
+    ),
+    "cameras-moved": (
+        Facts(center_error=0.05, **MODEL),
+        Facts(center_error=0.051, **MODEL),
+        "5.1% of the scene extent away from the true ones",
+    ),
+    "estimated-field-of-view": (
+        Facts(fields_of_view=value(150.0)),
+        Facts(fields_of_view=value(151.0, focal=13.0)),
+        r"focal length 13 px \(field of view 151 degrees\) is implausible",
+    ),
+    "cameras-at-one-place": (Facts(extent=1e-9), Facts(extent=0.0), "stand at one place"),
+    "point-beyond-range": (
+        Facts(farthest=1e7, number=3, total=4, place="(1, 2, 3)"),
+        Facts(farthest=np.nan, number=3, total=4, place="(1, 2, 3)"),
+        r"initial point 3 of 4 is nan times as far .* at \(1, 2, 3\)",
+    ),
+    "points-out-of-view": (Facts(seen_by_one=1.0), Facts(seen_by_one=0.0), "other coordinates"),
+    "points-share-places": (
+        Facts(identical=0.5, first_place="(0, 0, 4)"),
+        Facts(identical=1.0, first_place="(0, 0, 4)"),
+        r"100% of the initial points share .*\(0, 0, 4\)",
+    ),
+    "points-far-off": (Facts(far=0), Facts(far=2), "2 initial points more than 10,000 times"),
+    "points-seen-once": (Facts(seen=0.1), Facts(seen=0.09), "only 9.0% of the initial points"),
+    "points-in-a-heap": (Facts(spread=0.02), Facts(spread=0.01), "lie within 0.01"),
+    "colours-disagree": (
+        Facts(color_agreement=0.25),
+        Facts(color_agreement=0.24),
+        r"hardly agree .*agreement 0.24",
+    ),
+    "cloud-of-one-colour": (
+        Facts(color_spread=1.0, first_color=(9, 9, 9)),
+        Facts(color_spread=0.9, first_color=(9, 9, 9)),
+        r"the colour \(9, 9, 9\)",
+    ),
+}
+
+
+def test_each_rule_has_its_row_here_and_an_id_of_its_own():
+    assert [rule.id for rule in RULES] == [*ROWS]
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_a_rule_is_silent_up_to_its_limit_and_names_what_is_beyond(name):
+    fine, odd, said = ROWS[name]
+    rule = BY_ID[name]
+    judge = rule.tell if rule.stage == "file" else rule.judge
+    assert judge(fine) is None
+    judged = judge(odd)
+    with refusal(said):
+        raise rules.InputError(judged.line)
+    assert judged.refused is (rule.usable != rules.ANY)
+
+
+RULE = Rule(
+    "odd", "read", lambda raw: raw, (0, 1), (0, 2), "{value:g} of {names:few}", "take {low}"
+)
+
+
+@pytest.fixture
+def table(monkeypatch):
+    monkeypatch.setattr(rules, "RULES", (RULE, replace(RULE, id="hard", stage="file", fixed=True)))
+    monkeypatch.setattr(rules, "BY_ID", {rule.id: rule for rule in rules.RULES})
+
+
+def odd(*values):
+    return [Finding(number, [f"{number:g}.png"], {"low": "less"}) for number in values]
+
+
+def test_what_is_odd_is_one_line_with_the_worst_value_and_all_names(table, caplog):
+    assert inspect("read", odd(0, 1), "here") == ()
+    assert not caplog.records
+    (found,) = inspect("read", odd(1, 1.5, 2), "here")
+    assert found.to_json() == {
+        "rule": "odd",
+        "line": "2 of 1.5.png, 2.png: take less",
+        "value": 2.0,
+    }
+    assert caplog.messages == ["here: 2 of 1.5.png, 2.png: take less"]
+
+
+@pytest.mark.parametrize("number", [3.0, -1.0, float("nan"), float("inf")])
+def test_what_is_not_usable_is_refused_unless_its_rule_is_accepted(table, caplog, number):
+    with refusal(rf"^here: .* of {number:g}.png: take less \(or scene.accept=\[odd\]\)$"):
+        inspect("read", odd(number), "here")
+    (found,) = inspect("read", odd(number), "here", accept=("odd",))
+    assert found.refused
+    assert found.to_json()["refused"]
+    assert caplog.messages[-1].endswith("(accepted: odd)")
+    with refusal("take less$"):  # what was accepted when it was stored is judged again
+        rules.settle([replace(found, rule="hard")], "here", accept=("odd",))
+
+
+XMP = b'<rdf:Description GPano:ProjectionType="equirectangular"/>'
+
+
+@pytest.mark.parametrize("size, refused", [((40, 20), True), ((40, 30), False)])
+def test_panoramas_are_refused_unless_they_are_accepted(tmp_path, size, refused):
+    for number in range(4):
+        picture = Image.new("RGB", size, (60 * number, 0, 0))
+        picture.save(tmp_path / f"{number}.jpg", xmp=XMP)
+    with refusal(r"4 photographs declared as panoramas .*accept=\[panorama\]" if refused else None):
+        read_photos("toy", tmp_path)
+    capture = read_photos("toy", tmp_path, accept=["panorama"])
+    assert [(odd.rule, odd.refused) for odd in capture.oddities] == [("panorama", True)] * refused
+    with refusal("scene.accept=panoramas is no rule: .*did you mean panorama"):
+        SceneConfig("toy", "photos", path="/x", accept=["panoramas"])
+
+
+def test_prepared_views_of_an_accepted_lens_are_judged_again(make_scene, tmp_path):
+    root = make_scene(model="SIMPLE_RADIAL", params=[30, 20, 15, -0.5])
+    plain, accepting = (
+        read_colmap("toy", root, accept=accept) for accept in ([], ["lens-turns-back"])
+    )
+    scene = load_scene(accepting, accepting.model, tmp_path / "cache")
+    again = load_scene(accepting, accepting.model, tmp_path / "cache")
+    assert [odd.refused for odd in again.oddities if odd.rule == "lens-turns-back"] == [True]
+    assert again.oddities == scene.oddities
+    with refusal("turns back inside the picture"):
+        load_scene(plain, plain.model, tmp_path / "cache")
+
+
+def test_what_is_accepted_changes_no_hash_of_a_trial():
+    plain, accepting = (
+        compose_one(["scene=courtyard", *words]).values
+        for words in ([], ["scene.accept=[lens-turns-back]"])
+    )
+    assert config_hash(plain) == config_hash(accepting)
+    assert arm_hash(plain) == arm_hash(accepting)
+
+
+def test_only_known_rules_that_may_be_broken_can_be_accepted():
+    check_accept(["lens-turns-back", "panorama"])
+    with refusal(r"scene.accept=lens is no rule: panorama and lens-turns-back can be accepted"):
+        check_accept(["lens"])
+    with refusal("scene.accept=too-few-images: this rule cannot be accepted"):
+        check_accept(["too-few-images"])
