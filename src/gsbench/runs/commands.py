@@ -275,10 +275,6 @@ class History:
         """The questions about a trial."""
         return [one for one in self.questions if one.has(digest, scene, seed)]
 
-    def gave_result(self, digest: Digest, places: Iterable[Place]) -> bool:
-        """Return whether a trial with this digest at one of these places gave a result."""
-        return any((digest, place) in self.results for place in places)
-
 
 def read_history(home: Path) -> History:
     """What was asked in the experiment in ``home``; nothing without a file."""
