@@ -22,7 +22,7 @@ from gsbench.config.schema import CLASS_DEFAULTS
 from gsbench.settings import MISSING, option_fields
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
-GROUPS = ("densify",)
+GROUPS = ("densify", "init")
 
 
 def main() -> None:

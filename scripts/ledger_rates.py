@@ -22,7 +22,7 @@ import numpy as np
 import simulations
 from numpy.typing import NDArray
 
-from gsbench.analysis.looks import look_levels, plan_looks
+from gsbench.analysis.questions import look_shares, plan_looks
 from gsbench.analysis.thresholds import Region, evenness
 from gsbench.claims.ledger import GIVE_UP, SCREEN
 
@@ -101,7 +101,7 @@ def in_looks(differences: Array, levels: Array, least: float) -> tuple[Mask, NDA
         half = np.zeros(count)
         for level in np.unique(levels):
             own = levels == level
-            at_look = look_levels(scenes, LOOKS, float(level))[number]
+            at_look = float(level) * look_shares(len(LOOKS))[number]
             half[own] = Region(scenes, look, even[own]).limits(at_look) * error[own]
         within = np.maximum(half - mean, half + mean) < least
         hopeless = mean + Region(scenes, look, even).limits(2 * GIVE_UP) * error < least

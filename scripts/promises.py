@@ -1,11 +1,12 @@
 """Simulate every error rate and power that the documents promise (findings/simulations.md).
 
     python scripts/promises.py                write all rows of the page (15 minutes)
-    python scripts/promises.py --only gate    write the rows whose names have this word
+    python scripts/promises.py --only habit   write the rows whose names have this word
     python scripts/promises.py --share 0.05   print them from a twentieth of the draws
 
-Trials' results with known truth go in where results of trials go in: `judge`, looks, gate
-and ledger decide as in the verbs; only the training and the files are left out.
+Trials' results with known truth go in where results of trials go in: `judge` and the gate decide as
+in the verbs; only the training and the files are left out. What people do with commands, one after
+another, is simulated by `habits`; nights of ideas by `ledger_rates`.
 """
 
 from __future__ import annotations
@@ -15,11 +16,12 @@ import math
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Any
 
+import habits
 import ledger_rates
 import numpy as np
 import regions
@@ -27,25 +29,19 @@ import simulations
 from numpy.typing import NDArray
 from scipy import special
 
-from gsbench.analysis.designs import estimate_components
-from gsbench.analysis.judgement import Verdict, judge
-from gsbench.analysis.looks import look_levels, plan_looks, simulate_looks
+from gsbench.analysis.designs import Components, estimate_components
 from gsbench.analysis.planning import Purpose, deviation_range
-from gsbench.analysis.results import Arm, TrialResult
+from gsbench.analysis.questions import plan_looks
+from gsbench.analysis.results import Arm, TrialResult, Unfinished
 from gsbench.analysis.statistics import REFUTED, SUPPORTED
 from gsbench.analysis.thresholds import Region
-from gsbench.analysis.unfinished import Unfinished
+from gsbench.analysis.verdicts import judge
 from gsbench.claims import gate as gates
-from gsbench.claims import ledger as rules
-from gsbench.claims.stopping import KeyAndSeed, SequentialTest
-from gsbench.runs import ledger as records
-from gsbench.runs.experiments import Declaration, Question, trial_key
+from gsbench.runs.commands import Question
 from gsbench.runs.trial_record import TrialRecord
-from gsbench.verbs.plan import purpose_of
 
 # If no bad training is seen, nothing tells such an arm from a better one (docs/verdict.md).
 ONE_ARM_LIMIT = 0.22
-TIME, MEASURED = "2020-01-01T00:00:00Z", "2021-01-01T00:00:00Z"
 METRIC, LEAST = "psnr", 0.1
 NIGHTS = 8000  # at once
 NO_RESULTS: dict[str, Any] = {
@@ -101,34 +97,35 @@ def repeated(draw: Draw, draws: int, seed: int) -> tuple[float, float]:
 # ---- trials with known truth
 
 
-def trials(
-    arm: str, values: Array, version: str = "aaaa", first_seed: int = 0
-) -> list[TrialResult]:
-    """Trials of an arm on scenes and seeds with these ``values`` [S, K]."""
+def trials(arm: str, values: Array) -> list[TrialResult]:
+    """Trials of an arm on scenes and seeds with these ``values`` [S, K]; its name is its digest."""
     found = []
     for place, row in enumerate(values):
-        for seed, value in enumerate(row, first_seed):
+        for seed, value in enumerate(row):
             scene = f"scene{place}"
             about: dict[str, Any] = {"scene": scene, "init": "sfm", "densify": arm, "seed": seed}
-            filled = NO_RESULTS | {"metrics": {METRIC: float(value)}, "measured": MEASURED}
+            filled = NO_RESULTS | {"metrics": {METRIC: float(value)}}
             record = TrialRecord(status="complete", experiment="simulated", **about, **filled)
-            folder = Path("runs", "simulated", scene, f"sfm-{arm}", f"{version}-seed{seed}")
-            found.append(TrialResult(folder, version, record))
+            folder = Path("runs", "simulated", scene, f"sfm-{arm}", f"aaaa-seed{seed}")
+            found.append(TrialResult(folder, "aaaa", record, alias=arm))
     return found
 
 
-def question(arm: str, scenes: int, seeds: int, least: float = LEAST, **more: Any) -> Question:
-    """Ask if ``arm`` is better than the baseline."""
-    keys = {
-        f"scene{k}": (
-            trial_key(f"scene{k}", "sfm-adc", "aaaa"),
-            trial_key(f"scene{k}", f"sfm-{arm}", "aaaa"),
-        )
-        for k in range(scenes)
-    }
-    both = {"baseline": Arm("sfm", "adc"), "arm": Arm("sfm", arm)}
+def question(
+    arm: str, scenes: int, seeds: int, level: float = 0.05, looks: tuple[int, ...] = ()
+) -> Question:
+    """Ask if ``arm`` is better than the baseline, by all trials or in looks."""
+    names = [f"scene{k}" for k in range(scenes)]
     return Question(
-        metric=METRIC, least=least, scenes=keys, seeds=tuple(range(seeds)), **both, **more
+        idea=Arm("sfm", arm),
+        baseline=Arm("sfm", "adc"),
+        metric=METRIC,
+        least=1e-9,
+        digests=dict.fromkeys(names, ("adc", arm)),
+        seeds=dict.fromkeys(names, tuple(range(seeds))),
+        looks=looks,
+        level=level,
+        rule="simulated",
     )
 
 
@@ -138,39 +135,58 @@ def noise_of(scenes: int, ratio: float) -> Array:
 
 
 def arms(
-    rng: Rng, noise: Array, seeds: int, effects: Sequence[float], correlation: float = 0.0
+    rng: Rng,
+    noise: Array,
+    seeds: int,
+    effects: Sequence[float],
+    correlation: float = 0.0,
+    degrees: float = math.inf,
 ) -> list[TrialResult]:
-    """Trials of the baseline and of arms with these effects."""
+    """Trials of the baseline and of arms with these effects.
+
+    Their noise is normal, or (``degrees``) Student's of unit variance, with heavy tails.
+    """
     shape = (len(noise), seeds)
-    baseline = rng.standard_normal(shape)
+
+    def drawn() -> Array:
+        if math.isinf(degrees):
+            return rng.standard_normal(shape)
+        return rng.standard_t(degrees, shape) * math.sqrt((degrees - 2) / degrees)
+
+    baseline = drawn()
     found = trials("adc", 25 + noise * math.sqrt(0.5) * baseline)
     for number, effect in enumerate(effects):
         own = correlation * baseline
-        own += math.sqrt(1 - correlation**2) * rng.standard_normal(shape)
+        own += math.sqrt(1 - correlation**2) * drawn()
         found += trials(f"arm{number}", 25 + effect + noise * math.sqrt(0.5) * own)
     return found
 
 
-# ---- sweeps and checks
+# ---- single questions
 
 
 def sweep(
-    scenes: int, seeds: int, ratio: float, effect: float, count: int = 1, **more: float
+    scenes: int,
+    seeds: int,
+    ratio: float,
+    effect: float,
+    count: int = 1,
+    looks: bool = False,
+    **more: float,
 ) -> Draw:
-    """Judge a sweep; 1 if any sign is false, or with an effect if it is found."""
+    """Judge ``count`` questions of a command, which share 5 %.
+
+    1 if any sign is false, or with an effect, in standard errors, if it is found.
+    """
 
     def draw(rng: Rng) -> float:
         noise = noise_of(scenes, ratio)
         error = float(np.sqrt((noise**2).sum() / seeds)) / scenes
         made = arms(rng, noise, seeds, [effect * error] * count, **more)
-        asked = tuple(question(f"arm{k}", scenes, seeds, 1e-9) for k in range(count))
-        verdicts = judge(made, Declaration(time=TIME, questions=asked))
-        return float(
-            any(
-                one.outcome in ((SUPPORTED,) if effect else (SUPPORTED, REFUTED))
-                for one in verdicts
-            )
-        )
+        at = plan_looks(seeds) if looks else ()
+        asked = [question(f"arm{k}", scenes, seeds, 0.05 / count, at) for k in range(count)]
+        outcomes = {judge(made, one).outcome for one in asked}
+        return float(bool(outcomes & {SUPPORTED, *(() if effect else (REFUTED,))}))
 
     return draw
 
@@ -181,7 +197,7 @@ def failing(finish: bool) -> Draw:
     Otherwise the arm is better by one, so the real mean difference is 0. Such trainings ``finish``
     with their results, or fail. 1 if the arm is called better.
     """
-    asked = Question(metric=METRIC, least=1e-9, baseline=Arm("sfm", "adc"), arm=Arm("sfm", "arm0"))
+    asked = question("arm0", 3, 3)
 
     def draw(rng: Rng) -> float:
         values = rng.normal([[[25.0]], [[25.1]]], 0.1 * math.sqrt(0.5), (2, 3, 3))
@@ -189,9 +205,30 @@ def failing(finish: bool) -> Draw:
         baseline, arm = trials("adc", values[0]), trials("arm0", values[1] - bad)
         lost = [one for one, failed in zip(arm, bad.flat, strict=True) if failed and not finish]
         done = [*baseline, *(one for one in arm if one not in lost)]
-        declared = Declaration(time=TIME, questions=(asked,))
-        (verdict,) = judge(done, declared, [Unfinished(one.path) for one in lost])
+        verdict = judge(done, asked, [Unfinished.of(one) for one in lost])
         return float(verdict.outcome == SUPPORTED)
+
+    return draw
+
+
+def like_these(scenes: int) -> Draw:
+    """Skewed effects with noise: 1 if the statement on a new scene like these is false.
+
+    12 % of scenes gain three deviations of a pair, the others lose a tenth; three seeds. So the
+    median effect is a loss, but of measured means just as many gain.
+    """
+    rng = np.random.default_rng(0)
+    many = np.where(rng.random(400_000) < 0.12, 0.3, -0.01) + rng.normal(0, 0.1 / 3**0.5, 400_000)
+    gains = (many > 0).mean() > 0.5
+
+    def draw(rng: Rng) -> float:
+        effects = np.where(rng.random((scenes, 1)) < 0.12, 0.3, -0.01)
+        shape, part = (scenes, 3), 0.1 * math.sqrt(0.5)
+        made = trials("adc", rng.normal(25, part, shape))
+        made += trials("arm0", 25 + effects + rng.normal(0, part, shape))
+        verdict = judge(made, question("arm0", scenes, 3))
+        assert verdict.like_these is not None
+        return float(verdict.like_these.outcome == (REFUTED if gains else SUPPORTED))
 
     return draw
 
@@ -222,87 +259,14 @@ def largest_size(level: float) -> Measure:
     return found
 
 
-def levels_of_looks(scenes: int, looks: tuple[int, ...], level: float) -> Measure:
-    """The largest rate of false signs over all looks, as a part of the level, by kinds of noise."""
-
-    def found(share: float) -> tuple[float, float]:
-        levels, rates = look_levels(scenes, looks, level), []
-        for noise in (1.0,) if scenes == 1 else (1.0, 2.0, 4.0, 8.0, 15.0, 30.0, 100.0):
-            drawn = simulate_looks(scenes, looks, round(10_000 + 140_000 * share), noise, seed=11)
-            false = [
-                drawn.sizes[look] > drawn.region(look).limits(own)
-                for look, own in enumerate(levels)
-            ]
-            errors = np.any(false, axis=0) * drawn.weights * len(drawn.weights) / level
-            rates.append((float(errors.mean()), float(errors.std()) / math.sqrt(len(errors))))
-        return max(rates)
-
-    return found
-
-
-def in_looks(declaration: Declaration, made: Sequence[TrialResult]) -> list[Verdict]:
-    """The verdicts after all looks; trials are there from the look on that trains them."""
-    by_key = {(one.key, one.seed): one for one in made}
-    done: dict[KeyAndSeed, TrialResult] = {}
-
-    def run(planned: Iterable[KeyAndSeed]) -> None:
-        done.update({key: by_key[key] for key in planned})
-
-    return SequentialTest(declaration, done.values).answer(run)
-
-
-def check(scenes: int, seeds: int, ratio: float, effect: float, claims: int) -> Draw:
-    """A check of claims in looks; 1 if any is false, or with an effect if the first is found."""
-
-    def draw(rng: Rng) -> float:
-        made = arms(rng, noise_of(scenes, ratio), seeds, [effect] * claims)
-        asked = tuple(question(f"arm{k}", scenes, seeds, 1e-9) for k in range(claims))
-        looks = plan_looks(seeds)
-        verdicts = in_looks(Declaration(time=TIME, questions=asked, looks=looks), made)
-        if effect:
-            return float(verdicts[0].outcome == SUPPORTED)
-        return float(any(one.outcome in (SUPPORTED, REFUTED) for one in verdicts))
-
-    return draw
-
-
-def like_these(scenes: int) -> Draw:
-    """Skewed effects with noise: 1 if the statement on a new scene like these is false.
-
-    12 % of scenes gain three deviations of a pair, the others lose a tenth; three seeds. So the
-    median effect is a loss, but of measured means just as many gain.
-    """
-    rng = np.random.default_rng(0)
-    many = np.where(rng.random(400_000) < 0.12, 0.3, -0.01) + rng.normal(0, 0.1 / 3**0.5, 400_000)
-    gains = (many > 0).mean() > 0.5
-
-    def draw(rng: Rng) -> float:
-        effects = np.where(rng.random((scenes, 1)) < 0.12, 0.3, -0.01)
-        shape, part = (scenes, 3), 0.1 * math.sqrt(0.5)
-        made = trials("adc", rng.normal(25, part, shape))
-        made += trials("arm0", 25 + effects + rng.normal(0, part, shape))
-        (verdict,) = judge(
-            made, Declaration(time=TIME, questions=(question("arm0", scenes, 3, 1e-9),))
-        )
-        assert verdict.like_these is not None
-        return float(verdict.like_these.outcome == (REFUTED if gains else SUPPORTED))
-
-    return draw
-
-
 # ---- gate
-
-
-def gate_question(scenes: int, seeds: int) -> Declaration:
-    names = {f"scene{k}": ("sfm-adc", "sfm-adc") for k in range(scenes)}
-    values: Mapping[str, Any] = {"eval": {"extra": {}}}
-    found = gates.declare_gate(METRIC, str(LEAST), names, range(seeds), values)
-    return replace(found, time=TIME)
 
 
 def gate(scenes: int, seeds: int, loss: float, counted: str) -> Draw:
     """A gate of a version with this loss; 1 if its result is the ``counted`` one."""
-    asked = gate_question(scenes, seeds)
+    values: Mapping[str, Any] = {"eval": {"extra": {}}}
+    names = [f"scene{k}" for k in range(scenes)]
+    asked = gates.declare_gate(METRIC, str(LEAST), names, range(seeds), values)
 
     def draw(rng: Rng) -> float:
         noise = 0.1 * math.sqrt(0.5)
@@ -310,9 +274,9 @@ def gate(scenes: int, seeds: int, loss: float, counted: str) -> Draw:
         new = trials("adc", rng.normal(25 - loss, noise, (scenes, seeds)))
         most = 0
 
-        def run(planned: Iterable[KeyAndSeed]) -> None:
+        def run(planned: Iterable[tuple[Any, ...]]) -> None:
             nonlocal most
-            most = 1 + max(seed for _, seed in planned)
+            most = 1 + max(one[-1] for one in planned)
 
         found = gates.ask_gate(
             asked,
@@ -325,122 +289,16 @@ def gate(scenes: int, seeds: int, loss: float, counted: str) -> Draw:
     return draw
 
 
-# ---- ledger
+# ---- commands one after another, nights of ideas
 
 
-def attempt(declaration: Declaration, made: Sequence[TrialResult]) -> Verdict:
-    """The verdict on an idea after its looks."""
-    most = 0
-
-    def run(planned: Iterable[KeyAndSeed]) -> None:
-        nonlocal most
-        most = 1 + max(seed for _, seed in planned)
-
-    asked = rules.ask_idea(declaration, lambda: [one for one in made if one.seed < most])
-    (verdict,) = asked.answer(run)
-    return verdict
-
-
-@dataclass
-class Night:
-    """A ledger whose trials are drawn: PSNR, with a deviation of .1 of a pair's difference."""
-
-    rng: Rng
-    captures: int
-    ideas: int = 40
-    seeds: int = 6
-    least: float = 0.05
-
-    def __post_init__(self) -> None:
-        self.noise = 0.1 * math.sqrt(0.5)
-        self.shape = (self.captures, self.seeds)
-        opened = records.Opened(
-            time=TIME,
-            metric=METRIC,
-            sign=1,
-            least=self.least,
-            ideas=self.ideas,
-            rate=0.1,
-            seeds=tuple(range(self.seeds)),
-            words=(),
-            keys=self.keys("adc"),
-        )
-        self.entries: list[records.Entry] = [opened]
-        self.baseline = self.made("adc", self.rng.standard_normal(self.shape))
-
-    def keys(self, arm: str) -> dict[str, str]:
-        scenes = (f"scene{k}" for k in range(self.captures))
-        return {scene: trial_key(scene, f"sfm-{arm}", "aaaa") for scene in scenes}
-
-    def made(
-        self, arm: str, noise: Array, gain: float = 0.0, first_seed: int = 0
-    ) -> list[TrialResult]:
-        return trials(arm, 25 + gain + self.noise * noise, first_seed=first_seed)
-
-    @property
-    def book(self) -> records.Ledger:
-        return records.Ledger(tuple(self.entries), "")
-
-    def attempt(self, name: str, noise: Array, gain: float = 0.0) -> Verdict:
-        """Try an idea with this noise on the shared seeds; the verdict that decides it."""
-        started = records.Started(
-            time=TIME, idea=name, against=records.BASELINE, identity=name, words=(),
-            keys=self.keys(name),
-        )  # fmt: skip
-        self.entries.append(started)
-        made = [*self.baseline, *self.made(name, noise, gain)]
-        verdict = attempt(rules.screening_of(self.book, name), made)
-        if rules.result_of(verdict) == records.KEPT:
-            test = rules.next_test(self.book, name, TIME)
-            self.entries.append(test)
-            draws = self.rng.standard_normal((2, *self.shape))
-            made = self.made("adc", draws[0], first_seed=test.seeds[0])
-            made += self.made(name, draws[1], gain, test.seeds[0])
-            verdict = attempt(rules.test_of(self.book, name), made)
-        self.entries.append(rules.end_of(name, verdict, TIME))
-        return verdict
-
-
-def night(captures: int, retried: float, correlation: float) -> Draw:
-    """A night of ideas without any effect; 1 if an idea is kept.
-
-    A share of them are other tries of what looked best so far, with correlated noise.
-    """
-
-    def draw(rng: Rng) -> float:
-        own = Night(rng, captures)
-        best, best_noise = -math.inf, np.zeros(own.shape)
-        for number in range(own.ideas):
-            noise = rng.standard_normal(own.shape)
-            if math.isfinite(best) and rng.random() < retried:
-                noise = correlation * best_noise + math.sqrt(1 - correlation**2) * noise
-            verdict = own.attempt(f"idea{number}", noise)
-            if rules.result_of(verdict) == records.KEPT:
-                return 1.0  # of ideas without an effect, the first one kept makes the share 1
-            if verdict.mean is not None and verdict.mean > best:
-                best, best_noise = verdict.mean, noise
-        return 0.0
-
-    return draw
-
-
-def tested(scenes: int, seeds: int, difference: float) -> Draw:
-    """A good idea after a quarter of the ideas were tested; 1 if it is kept."""
-
-    def draw(rng: Rng) -> float:
-        own = Night(rng, scenes, seeds=seeds, least=difference)
-        for number in range(own.ideas // 4 - 1):
-            first = 1000 + seeds * number
-            seen = tuple(range(first, first + seeds))
-            own.entries.append(records.Promoted(time=TIME, idea=str(number), level=0.1, seeds=seen))
-        verdict = own.attempt("good", rng.standard_normal(own.shape), difference)
-        return float(rules.result_of(verdict) == records.KEPT)
-
-    return draw
+def habit(own: habits.Habit, which: int = 0) -> Measure:
+    """The rate of a habit: how often an idea without an effect is ever called better."""
+    return lambda share: habits.rate(own, max(400, round(40_000 * share)), 0, which)
 
 
 def nights_at_once(noise: tuple[float, ...], correlation: float, most: bool = False) -> Measure:
-    """The same of many nights at once, by the rule as `ledger_rates` restates it.
+    """Nights of a ledger without a good idea, by its rule as `ledger_rates` restates it.
 
     With ``most``, nine of ten ideas are other tries of what has the most standard errors.
     """
@@ -449,12 +307,9 @@ def nights_at_once(noise: tuple[float, ...], correlation: float, most: bool = Fa
     least = 0.5 * math.sqrt(sum(one**2 for one in noise) / len(noise))
 
     def found(share: float) -> tuple[float, float]:
-        nights, asked = (
-            round(100 + (NIGHTS - 100) * share),
-            ledger_rates.Night(
-                least, 0.0, 0.0, 0.9 if most else 0.7, correlation, noise, by_size=most
-            ),
-        )
+        nights = round(100 + (NIGHTS - 100) * share)
+        retried = 0.9 if most else 0.7
+        asked = ledger_rates.Night(least, 0.0, 0.0, retried, correlation, noise, by_size=most)
         rate = ledger_rates.simulate(rule, asked, nights).false
         return rate, math.sqrt(max(rate * (1 - rate), 1 / nights) / nights)
 
@@ -464,29 +319,24 @@ def nights_at_once(noise: tuple[float, ...], correlation: float, most: bool = Fa
 # ---- plans
 
 
-def planned(command: str, difference: float) -> Draw:
+PURPOSES = {"sweep": Purpose(), "looks": Purpose(looks=True), "gate": Purpose(looks=True)}
+
+
+def planned(command: str, difference: float, ratio: float = 1.0) -> Draw:
     """A command with the design that `plan` names; 1 if it shows the difference.
 
-    The deviation of trainings is known, and two scenes have it.
+    The deviations of trainings are known; the first of three scenes is ``ratio`` times as noisy.
     """
-    claims = 4 if command == "check" else 1
-    seeds = min(one.seeds for one in PURPOSES[command].designs(difference, 0.1) if one.scenes == 3)
-    if command == "sweep":
-        return sweep(3, seeds, 1.0, difference / 0.1 * math.sqrt(3 * seeds))
+    noise = noise_of(3, ratio)[:, 0]
+    within = float(np.sqrt((noise**2).mean()))
+    shares = tuple(sorted(noise**2 / within**2))
+    known = Components(between=None, within=within, scenes=3, trials=9, shares=shares)
+    designs = PURPOSES[command].designs(difference, known)
+    seeds = min(one.seeds for one in designs if one.scenes == 3)
     if command == "gate":
         return gate(3, seeds, difference, gates.WORSE)
-    if command == "ledger":
-        return tested(3, seeds, difference)
-    return check(3, seeds, 1.0, difference, claims)
-
-
-PURPOSES = {
-    "sweep": Purpose(),
-    "looks": Purpose(looks=True),
-    "check": Purpose(0.05 / 4, looks=True),
-    "gate": Purpose(looks=True),
-    "ledger": purpose_of("ledger", None),
-}
+    effect = difference / (within / math.sqrt(3 * seeds))
+    return sweep(3, seeds, ratio, effect, looks=command == "looks")
 
 
 def unsure(rng: Rng) -> float:
@@ -499,6 +349,24 @@ def unsure(rng: Rng) -> float:
 
 
 def promises() -> Iterator[Promise]:
+    yield from _of_single_questions()
+    yield from _of_habits()
+    for name, counted, loss in (
+        ("worse although nothing changed", gates.WORSE, 0.0),
+        ("passed although the loss is the least that matters", gates.PASSED, LEAST),
+    ):
+        yield Promise(f"gate: {name}, 2 × 6", "`ask_gate`", 0.025, 1500, gate(2, 6, loss, counted))
+    yield from _of_nights()
+    for command in PURPOSES:
+        name = f"plan for a {command}: shows the difference on three scenes"
+        yield Promise(name, "`Purpose`", 0.8, 500, planned(command, 0.1), True)
+    name = "plan for a sweep: shows the difference, deviations 4 : 1 : 1"
+    yield Promise(name, "`Purpose`", 0.8, 500, planned("sweep", 0.25, 4.0), True)
+    name = "plan: range of the deviation from a 3 × 3 pilot"
+    yield Promise(name, "`deviation_range`", 0.8, 8000, unsure, True)
+
+
+def _of_single_questions() -> Iterator[Promise]:
     judged = "`judge`"
     for scenes, seeds, ratio in (
         (1, 3, 1.0),
@@ -510,60 +378,57 @@ def promises() -> Iterator[Promise]:
     ):
         name = f"false signs, {scenes} × {seeds}, one scene {ratio:g} times as noisy"
         yield Promise(name, judged, 0.05, 3000, sweep(scenes, seeds, ratio, 0.0))
-    yield Promise(
-        "false signs, 8 × 6, trainings of a seed correlate by −.17",
-        judged,
-        0.05,
-        2000,
-        sweep(8, 6, 1.0, 0.0, correlation=-0.17),
-    )
-    yield Promise("false signs of four arms, 3 × 3", judged, 0.05, 1500, sweep(3, 3, 1.0, 0.0, 4))
-    yield Promise(
-        "power at three standard errors, 3 × 3", judged, 0.5, 3000, sweep(3, 3, 1.0, 3.0), True
-    )
-    for scenes, seeds, ratio in ((1, 6, 1.0), (3, 4, 4.0), (20, 4, 30.0)):
-        name = (
-            f"a false sign of four claims in looks, {scenes} × {seeds}, one scene {ratio:g} × noise"
-        )
-        yield Promise(name, "`SequentialTest`", 0.05, 1000, check(scenes, seeds, ratio, 0.0, 4))
+    name = "false signs, 8 × 6, trainings of a seed correlate by −.17"
+    yield Promise(name, judged, 0.05, 2000, sweep(8, 6, 1.0, 0.0, correlation=-0.17))
+    for scenes, seeds in ((1, 3), (3, 3), (8, 3)):
+        name = f"false signs, {scenes} × {seeds}, heavy tails (Student's with 3 degrees)"
+        yield Promise(name, judged, 0.05, 3000, sweep(scenes, seeds, 1.0, 0.0, degrees=3.0))
+    name = "false signs of four questions of a command, 3 × 3"
+    yield Promise(name, judged, 0.05, 1500, sweep(3, 3, 1.0, 0.0, 4))
+    for scenes, seeds in ((1, 6), (3, 4), (20, 4)):
+        name = f"false signs in looks, {scenes} × {seeds}"
+        yield Promise(name, judged, 0.05, 1500, sweep(scenes, seeds, 1.0, 0.0, looks=True))
+    name = "power at three standard errors, 3 × 3"
+    yield Promise(name, judged, 0.5, 3000, sweep(3, 3, 1.0, 3.0), True)
     for finish, how in ((True, "finishes, far worse"), (False, "fails")):
         name = f"better, although a training in ten of one arm {how}, 3 × 3"
         yield Promise(name, judged, ONE_ARM_LIMIT, 4000, failing(finish))
     for level, most in ((0.05, 1.04), (0.025, 1.04), (0.0125, 1.07), (0.005, 1.2)):
         name = f"false signs at {100 * level:g} %, in parts of it, at all shapes and kinds of noise"
         yield Promise(name, "`Region`", most, 32_000, found=largest_size(level))
-    for scenes, looks in ((1, (2, 3, 4, 5, 6)), (3, (2, 3, 4))):
-        for level in (0.05, 0.0125, 0.0025):
-            name = f"false signs at {100 * level:g} %, in parts of it, over all looks, "
-            name += f"{scenes} × {looks[-1]}"
-            measure = levels_of_looks(scenes, looks, level)
-            yield Promise(name, "`look_levels`", 1.02, 150_000, found=measure)
     for count in (6, 9, 20):
-        yield Promise(
-            f"scenes like these, {count} scenes, skewed effects with noise",
-            "`judge_like_these`",
-            0.05,
-            1500,
-            like_these(count),
-        )
-    yield Promise(
-        "gate: worse although nothing changed, 2 × 6",
-        "`ask_gate`",
-        0.025,
-        1500,
-        gate(2, 6, 0.0, gates.WORSE),
-    )
-    yield Promise(
-        "gate: passed although the loss is the least that matters, 2 × 6",
-        "`ask_gate`",
-        0.025,
-        1500,
-        gate(2, 6, LEAST, gates.PASSED),
-    )
-    for captures in (1, 3):
-        name = f"ledger: false discoveries, captures: {captures}, retries correlate by 0.8"
-        draw = night(captures, 0.7, 0.8)
-        yield Promise(name, "`next_test`, `ask_idea`", 0.1, 150, draw)
+        name = f"scenes like these, {count} scenes, skewed effects with noise"
+        yield Promise(name, "`judge_like_these`", 0.05, 1500, like_these(count))
+
+
+def _of_habits() -> Iterator[Promise]:
+    """Rows of what people do with one idea: ever called better, whatever they do."""
+    rows: list[tuple[str, habits.Habit]] = [
+        (f"twelve settings one after another, {scenes} × 3", habits.settings(scenes))
+        for scenes in (1, 3, 9)
+    ]
+    rows += [
+        (f"twelve edits that correlate by 0.8, {scenes} × 3", habits.settings(scenes, 0.8))
+        for scenes in (1, 3)
+    ]
+    rows.append(("forty tries on one scene that correlate by 0.8", habits.settings(1, 0.8, 40)))
+    for what, when in product(("seeds", "scenes"), habits.WHEN):
+        rows.append((f"{what} added {when}", habits.adding(what, when)))
+    rows += [
+        ("three seeds added at a time", habits.adding("seeds", "always", 3)),
+        ("seeds, edits and scenes in turn, by the mean so far", habits.mixed),
+        ("four metrics one after another", habits.metrics),
+        ("sweeps stopped where the first seed looks bad, then edited", habits.partial),
+    ]
+    for name, own in rows:
+        found = habit(own)
+        yield Promise(f"habit: {name}", "`level_of`, `count_tries`", 0.05, 40_000, found=found)
+    found = habit(habits.chosen_beginning)
+    name = "habit: a flattering number of a baseline's seen seeds (a half of 5 % for a new idea)"
+    yield Promise(name, "`ask`", 0.06, 40_000, found=found)
+
+
+def _of_nights() -> Iterator[Promise]:
     for correlation, noise in (
         *product((0.0, 0.39, 0.7, 0.8, 0.95), ((1.0,),)),
         *product((0.8, 0.95), ((1.0, 1.0, 1.0), (10.0, 1.0, 1.0), (100.0, 1.0, 1.0), (10.0, 1.0))),
@@ -577,19 +442,6 @@ def promises() -> Iterator[Promise]:
         name += f"nine of ten retry the most standard errors, by {correlation:g}"
         measure = nights_at_once((1.0,), correlation, most=True)
         yield Promise(name, "`in_tests`", 0.1, NIGHTS, found=measure)
-    for command in PURPOSES:
-        name = f"plan for a {command}: shows the difference on three scenes"
-        # With the smaller one, no ledger of three scenes is planned.
-        difference = 0.12 if command == "ledger" else 0.1
-        yield Promise(name, "`Purpose`", 0.8, 500, planned(command, difference), True)
-    yield Promise(
-        "plan: range of the deviation from a 3 × 3 pilot",
-        "`deviation_range`",
-        0.8,
-        8000,
-        unsure,
-        True,
-    )
 
 
 HEAD = (

@@ -30,7 +30,6 @@ from gsbench.settings import MISSING, describe, option_fields
 
 ROOT = Path(__file__).resolve().parents[1]
 PYTHON_BLOCK = re.compile(r"^```python\n(.*?)^```$", re.DOTALL | re.MULTILINE)
-YAML_COMMENT = re.compile(r"^(\w+):[^#\n]* # *(.+)$", re.MULTILINE)
 
 
 # --- comments of fields ---------------------------------------------------------------------------
@@ -70,16 +69,6 @@ def comments_of(cls: type) -> dict[str, str]:
     return comments
 
 
-@cache
-def yaml_comments_of(group: str) -> dict[str, str]:
-    """The comments at the ends of lines in a group's files, by key; the first one of a key."""
-    comments: dict[str, str] = {}
-    for file in sorted((ROOT / "conf" / group).rglob("*.yaml")):
-        for key, words in YAML_COMMENT.findall(file.read_text(encoding="utf-8")):
-            comments.setdefault(key, words)
-    return comments
-
-
 def row(*cells: str) -> str:
     """One row of a table, with pipes and line breaks escaped."""
     return "| " + " | ".join(cell.replace("|", "\\|").replace("\n", " ") for cell in cells) + " |"
@@ -114,9 +103,7 @@ def settings_of(cls: type, group: str, leave_out: frozenset[str] = frozenset()) 
             else entry.default_factory()
         )
         key = f"{group}.{entry.name}" if group else entry.name
-        meaning = comments_of(cls).get(entry.name, "") or yaml_comments_of(group).get(
-            entry.name, ""
-        )
+        meaning = comments_of(cls).get(entry.name, "")
         yield row(f"`{key}`", describe(hints[entry.name]), default_text(default), meaning)
 
 

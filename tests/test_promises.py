@@ -5,9 +5,11 @@ import re
 import numpy as np
 import pytest
 
+from gsbench.analysis.statistics import t_test
 from tests.conftest import script
 
 promises = script("promises")
+habits = promises.habits
 # The page names them at once: to make them takes seconds, and each worker collects all tests.
 FIGURES = re.findall(
     r"^\| (.+?) \| .+ \| [\d.]+ ± [\d.]+ % \| \d+ \| (\S+) \|$",
@@ -53,9 +55,31 @@ def test_draws_of_a_sweep_have_the_stated_noise_and_correlation():
     assert differences.std(axis=1) == pytest.approx(np.array([0.4, 0.1, 0.1]) / 2**0.5, rel=0.05)
 
 
-def test_statements_about_scenes_like_these_share_the_rate_of_named_trials():
-    """So do those of a ledger's confirmation and of an ablation, which name their trials."""
+def test_statements_about_scenes_like_these_have_the_level_of_their_question():
     made = promises.arms(np.random.default_rng(0), promises.noise_of(8, 1.0), 3, [0.0] * 4)
-    asked = tuple(promises.question(f"arm{k}", 8, 3) for k in range(4))
-    verdicts = promises.judge(made, promises.Declaration(time=promises.TIME, questions=asked))
-    assert [one.like_these.level for one in verdicts] == pytest.approx([0.05 / 4] * 4)
+    asked = [promises.question(f"arm{k}", 8, 3, 0.05 / 4) for k in range(4)]
+    levels = [promises.judge(made, one).like_these.level for one in asked]
+    assert levels == pytest.approx([0.05 / 4] * 4)
+
+
+def test_habits_judge_as_the_program_does():
+    """The test of many draws at once is that of one, on the same differences."""
+    rng = np.random.default_rng(0)
+    for scenes, seeds in ((1, 3), (3, 3), (9, 2)):
+        differences = rng.standard_normal((20, scenes, seeds))
+        means, p = habits.p_values(differences)
+        for own, mean, value in zip(differences, means, p, strict=True):
+            test = t_test(own)
+            assert (mean, value) == pytest.approx((test.mean, test.p), rel=1e-9)
+
+
+def test_an_idea_that_works_is_found_by_a_habit():
+    """So the rates of habits are no zeros of a rule that never decides."""
+
+    def good(rng, draws):
+        search = habits.Search(rng, draws, 3, 3)
+        search.idea = search.idea + 3
+        search.command()
+        return search.rates
+
+    assert habits.rate(good, 500)[0] > 0.9

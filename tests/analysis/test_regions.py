@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
+from gsbench.analysis.comparison import compare
+from gsbench.analysis.images import regions_of
 from gsbench.analysis.regions import (
     _p_values,
     compare_regions,
@@ -12,7 +14,13 @@ from gsbench.analysis.regions import (
     region_errors,
     region_psnr,
 )
+from gsbench.analysis.report.build import build_report
+from gsbench.analysis.report.where import region_maps
+from gsbench.analysis.results import load_experiment
+from gsbench.claims.archive import unpack_archive
+from gsbench.claims.export import write_archive
 from tests.helpers import refusal
+from tests.trials import ask_about, write_runs
 
 GRID = {"a": (6, 10), "b": (6, 10), "c": (5, 10)}
 
@@ -134,3 +142,49 @@ def test_trainings_of_one_arm_light_a_region_in_at_most_one_report_of_twenty(see
         found = compare_regions(trials(rng, seeds, **noise), trials(rng, seeds, **noise))
         lit += any(each.any() for each in discoveries(list(found.p.values())))
     assert lit / reports <= 0.07  # 5 % and two standard errors of the simulation
+
+
+def report_of(folder, **plan):
+    write_runs(folder, scenes=("garden",), densifiers=("adc", "volumetric"), inits=("sfm",), **plan)
+    ask_about(folder)
+    return load_experiment(folder, "exp")
+
+
+def test_the_report_maps_where_the_arm_is_better_and_where_it_is_worse(tmp_path):
+    """`write_pictures`: volumetric blurs the grass at the right less, and is off in a corner."""
+    experiment = report_of(tmp_path, seeds=(0, 1, 2), views=2, pictures=True)
+    answers = compare(experiment).answers
+    ((found,),) = region_maps(experiment.trials, answers).values()
+    assert (found.scene, found.seeds, found.regions) == ("garden", 3, 2 * 4 * 5)
+    assert found.better >= 2 * 4 * 2  # two columns of grass in each view
+    assert 2 <= found.worse <= 2 * 4  # the corner, and parts of its neighbours
+    page = build_report(experiment)
+    said = f"{found.better} of 40 regions are better, {found.worse} worse"
+    assert f"garden, 3 seeds: {said}. View {found.view} has most of them." in page
+
+
+def test_two_seeds_or_no_pictures_give_no_map(tmp_path):
+    for name, plan in (
+        ("two", {"seeds": (0, 1), "pictures": True}),
+        ("none", {"seeds": (0, 1, 2)}),
+    ):
+        experiment = report_of(tmp_path / name, views=2, **plan)
+        assert region_maps(experiment.trials, compare(experiment).answers) == {}
+        assert "beyond noise" not in build_report(experiment)
+
+
+def test_an_archive_keeps_the_errors_of_regions_in_place_of_pictures(tmp_path):
+    experiment = report_of(tmp_path / "runs", seeds=(0, 1, 2), views=2, pictures=True)
+    write_archive(experiment, tmp_path / "exp.zip")
+    unpacked = unpack_archive(tmp_path / "exp.zip", tmp_path / "elsewhere")
+    assert not list((tmp_path / "elsewhere").rglob("*.png"))
+    for one, other in zip(experiment.trials, unpacked.trials, strict=True):
+        for view, errors in regions_of(one).items():
+            np.testing.assert_allclose(regions_of(other)[view], errors, rtol=1e-3)
+    maps = [
+        next(iter(region_maps(own.trials, compare(own).answers).values()))[0]
+        for own in (experiment, unpacked)
+    ]
+    assert (maps[0].better, maps[0].worse) == (maps[1].better, maps[1].worse)
+    assert maps[0].truth
+    assert not maps[1].truth

@@ -22,11 +22,10 @@ from gsbench.analysis.statistics import (
     outcome_of,
     t_test,
 )
-from tests.analysis.untruths import KINDS, rates
 from tests.conftest import script
 from tests.helpers import refusal
 
-shared_baseline = script("shared_baseline")  # all draws at once; test_comparison.py compares them
+habits = script("habits")  # all draws at once; test_promises.py compares them with one
 
 
 def test_the_test_of_one_scene_is_the_paired_t_test():
@@ -163,29 +162,12 @@ def test_the_statement_agrees_with_the_sign_test_at_every_level():
 # --- false outcomes of simulated checks; scripts/untruths.py has the large table
 
 
-CHECKS = 300
-LIMIT = 0.05 + 3 * (0.05 * 0.95 / CHECKS) ** 0.5  # three standard errors above the stated rate
-
-
-@pytest.mark.parametrize(
-    "kind",
-    ["normal", "one scene in eight stands out", "a training in ten fails, either arm"],
-)
-def test_no_outcome_is_false_in_more_than_5_percent(kind):
-    """By the fast simulator, which test_decision_rules.py compares with the judge."""
-    for effect in (0.0, 0.5, 1.0, 2.0):
-        found = rates(KINDS[kind], effect, CHECKS, fast=True)
-        assert max(found.untrue.values()) < LIMIT, (effect, found)
-        assert found.like_these < LIMIT, (effect, found)
-    assert kind != "normal" or found.outcomes["supported"] > 0.8
-
-
 def test_seeds_needed_give_the_promised_power():
     seeds = seeds_needed(deviation=0.1, scenes=2, difference=0.1)
     rng = np.random.default_rng(0)
 
     def power(count):
-        found = shared_baseline.p_values(rng.normal(0.1, 0.1, (2000, 2, count)))
+        found = habits.p_values(rng.normal(0.1, 0.1, (2000, 2, count)))[1]
         return (found < ALPHA).mean()
 
     assert 0.76 < power(seeds) < 0.93
@@ -237,7 +219,7 @@ def test_power_is_the_share_of_simulated_sweeps_that_see_the_difference(like_ask
         agree = (values.mean(axis=2) > 0).sum(axis=1)
         seen = [scipy.stats.binomtest(int(count), design.scenes).pvalue <= 0.05 for count in agree]
     else:
-        seen = shared_baseline.p_values(values) < 0.05
+        seen = habits.p_values(values)[1] < 0.05
     assert power(design, effect, KNOWN, like_asked) == pytest.approx(np.mean(seen), abs=0.03)
 
 

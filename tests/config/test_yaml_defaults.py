@@ -11,7 +11,7 @@ from tests.conftest import script
 from tests.helpers import read_json
 
 class_defaults = script("class_defaults")
-GROUPS = ("densify", "eval", "launch", "raster", "scene", "tracking", "train")
+GROUPS = ("densify", "eval", "init", "launch", "raster", "scene", "tracking", "train")
 # keys that tell the files of a group apart
 NAMES = ("name", "kind", "protocol", "path", "_target_", "enabled", "defaults")
 FILES = [f"{g}/{file.stem}" for g in GROUPS for file in sorted((conf_dir() / g).glob("*.yaml"))]
@@ -22,10 +22,17 @@ def test_the_defaults_of_classes_are_current():
     assert read_json(CLASS_DEFAULTS) == class_defaults.class_defaults()
 
 
-@pytest.mark.parametrize("cls", class_defaults.classes_of("densify"), ids=lambda cls: cls.__name__)
-def test_a_composed_arm_has_each_option_of_its_class(cls):
-    names = [f for f in FILES if f.startswith("densify/") and _target(f) == cls.__name__]
-    values = compose_one(["scene=courtyard", names[0].replace("/", "=")]).values["densify"]
+CLASSES = [
+    (group, cls) for group in class_defaults.GROUPS for cls in class_defaults.classes_of(group)
+]
+REQUIRED = {"Ply": ["init.path=a.ply"], "Points": ["init.path=a.ply"]}
+
+
+@pytest.mark.parametrize("group,cls", CLASSES, ids=[cls.__name__ for _, cls in CLASSES])
+def test_a_composed_choice_has_each_option_of_its_class(group, cls):
+    names = [f for f in FILES if f.startswith(f"{group}/") and _target(f) == cls.__name__]
+    words = ["scene=courtyard", names[0].replace("/", "="), *REQUIRED.get(cls.__name__, [])]
+    values = compose_one(words).values[group]
     options = {option.name: getattr(cls, option.name, None) for option in option_fields(cls)}
     assert values.keys() - {"name", "_target_"} == options.keys()
 

@@ -1,5 +1,6 @@
 """COLMAP models fitted to files: sizes, subsets, names, poses."""
 
+import shutil
 import struct
 from types import SimpleNamespace
 
@@ -346,3 +347,62 @@ def test_rotations_of_sensors_in_a_rig_get_unit_length():
     assert_allclose(long.rotation.quat, kept, rtol=1e-15)
     assert exact.rotation.quat.tolist() == kept.tolist()
     assert long.translation.tolist() == [1, 2, 3]
+
+
+@pytest.mark.parametrize(
+    "file, change, said",
+    [
+        ("cameras", lambda w: [*w[:2], f"{w[2]}.0", *w[3:]], r"camera 1 has the size 40\.0: write"),
+        ("points3D", lambda w: [*w[:4], "128.0", *w[5:]], r"has the colour 128\.0: colours are"),
+        ("points3D", lambda w: [*w[:4], "0.502", *w[5:]], r"the colour 0\.502: .* 0 to 255$"),
+    ],
+)
+def test_numbers_that_are_not_whole_are_named(make_scene, file, change, said):
+    path = make_scene(text=True) / f"sparse/0/{file}.txt"
+    lines = path.read_text().splitlines()
+    path.write_text(
+        "\n".join(line if line[0] == "#" else " ".join(change(line.split())) for line in lines)
+    )
+    with refusal(said):
+        read_model(path.parent)
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_points_of_files_that_disagree_are_read_without_tracks(make_scene, caplog, text):
+    """images.* of one model beside points3D.* of another, in which each point has another id."""
+    root = make_scene(text=text)
+    whole = read_model(root / "sparse/0")
+    lines = root / "images.txt"
+    whole.write_text(root)
+    rows = lines.read_text().splitlines()
+    for at in range(rows.index(next(row for row in rows if row[0] != "#")) + 1, len(rows), 2):
+        words = rows[at].split()
+        words[2::3] = [str(int(word) % 9 + 1) for word in words[2::3]]
+        rows[at] = " ".join(words)
+    lines.write_text("\n".join(rows) + "\n")
+    if text:
+        shutil.copy(lines, root / "sparse/0/images.txt")
+    else:
+        with pytest.raises(Exception, match="Check failed"):
+            pycolmap.Reconstruction(root)
+        data = (root / "sparse/0/images.bin").read_bytes()
+        swapped = bytearray(data)
+        first = data.index(b"00.png\0") + 7 + 8 + 16
+        struct.pack_into("<Q", swapped, first, 2)
+        (root / "sparse/0/images.bin").write_bytes(bytes(swapped))
+    model = read_model(root / "sparse/0")
+    assert "points are read without the images that see them" in caplog.text
+    assert len(model.points3D) == len(whole.points3D) == 9
+    for image_id, image in whole.images.items():
+        assert_allclose(
+            model.images[image_id].cam_from_world().matrix(), image.cam_from_world().matrix()
+        )
+    assert not any(point.track.elements for point in model.points3D.values())
+
+
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
+def test_a_pointer_of_git_lfs_is_named(make_scene, name):
+    folder = make_scene() / "sparse/0"
+    (folder / name).write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:4e\n")
+    with refusal(rf"{name}: a pointer of Git LFS \(git lfs pull\)"):
+        read_model(folder)

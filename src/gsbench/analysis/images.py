@@ -2,7 +2,7 @@
 
 import base64
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from gsbench.analysis.regions import region_errors
 from gsbench.analysis.results import TrialPair, TrialResult
 from gsbench.errors import InputError
 from gsbench.parsing import Number, Record, read_if_sound
-from gsbench.runs.layout import FROM_PIXELS, GROUND_TRUTH, MASKS, RENDERS
+from gsbench.runs.layout import FROM_PIXELS, GROUND_TRUTH, MASKS, REGIONS, RENDERS
 from gsbench.scene.images import read_image
 from gsbench.scene.masks import read_mask
 
@@ -77,6 +78,40 @@ def textured_error(trial: TrialResult) -> float:
             )
         )
     return float(np.mean(errors))
+
+
+class RegionErrors(Record):
+    """``regions.json`` in an archive: mean squared errors [R][C] of regions by view."""
+
+    views: dict[str, list[list[Number]]]
+
+
+def regions_of(trial: TrialResult) -> Mapping[str, Array]:
+    """The mean squared errors [R, C] in regions of each test view, in 8-bit levels².
+
+    Masked pixels have no error. Raises InputError if neither pictures nor stored errors exist.
+    """
+    stored = read_if_sound(trial.path / REGIONS, RegionErrors)
+    if stored is not None:
+        return {view: np.array(rows, dtype=float) for view, rows in stored.views.items()}
+    errors = {}
+    for view in view_names(trial):
+        truth = read_image(trial.path / GROUND_TRUTH / f"{view}.png")
+        render = read_image(trial.path / RENDERS / f"{view}.png")
+        if render.shape != truth.shape:
+            raise InputError(f"{trial.label}: {view} has different sizes")
+        counted = read_counted(trial, view, truth.shape[:2])
+        errors[view] = region_errors(np.where(counted[..., None], render, truth), truth)
+    return errors
+
+
+def region_record(trial: TrialResult) -> RegionErrors:
+    """The errors of a trial's regions, with six digits, for an archive."""
+    rounded = {
+        view: [[float(f"{error:.6g}") for error in row] for row in errors]
+        for view, errors in regions_of(trial).items()
+    }
+    return RegionErrors(views=rounded)
 
 
 def view_names(trial: TrialResult) -> list[str]:
@@ -183,6 +218,14 @@ def _jpeg_uri(image: Pixels) -> str:
     picture = Image.fromarray(image)
     picture.thumbnail((WIDEST, WIDEST))
     return _data_uri(picture, "jpeg", quality=92, subsampling=0)
+
+
+def truth_uri(trial: TrialResult, view: str) -> str:
+    """The photograph of a test view as a JPEG data URI; "" if it is not there."""
+    try:
+        return _jpeg_uri(read_image(trial.path / GROUND_TRUTH / f"{view}.png"))
+    except InputError:
+        return ""
 
 
 def png_uri(image: Pixels) -> str:

@@ -21,7 +21,7 @@ import yaml
 from gsbench import __version__
 from gsbench.analysis.comparison import compare
 from gsbench.analysis.fairness import searches_of
-from gsbench.analysis.images import PixelMeasures, textured_error
+from gsbench.analysis.images import PixelMeasures, region_record, textured_error
 from gsbench.analysis.old_declarations import all_questions
 from gsbench.analysis.quantities import TEXTURED
 from gsbench.analysis.results import Experiment, TrialResult, group_by, newest_code, read_views
@@ -49,6 +49,7 @@ from gsbench.runs.layout import (
     FROM_PIXELS,
     LEDGER,
     PER_VIEW,
+    REGIONS,
     RESULTS,
     TUNING,
 )
@@ -130,6 +131,8 @@ def _of_trial(trial: TrialResult, pictures: bool) -> dict[str, bytes]:
         f"{folder}/{CONFIG}": _configuration(trial.path),
         f"{folder}/{PER_VIEW}": read_bytes(trial.path / PER_VIEW),
     }
+    with suppress(InputError):  # pictures may have been deleted to make room
+        files[f"{folder}/{REGIONS}"] = _page(region_record(trial).to_json())
     for kind in PICTURES if pictures else ():
         for path in trial.folder.pictures(kind):
             files[f"{folder}/{kind}/{path.name}"] = read_bytes(path)

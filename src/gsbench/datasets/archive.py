@@ -5,7 +5,6 @@ request (remotezip). The missing folders of a scene appear in the data folder on
 complete.
 """
 
-import lzma
 import shutil
 import struct
 import zipfile
@@ -179,39 +178,23 @@ def extract(
         raise _cause(error, member) from error
 
 
-# Errors that zipfile and its decompressors raise for damaged bytes; the last two come from LZMA's
-# filter.
-DAMAGE = (
-    zipfile.BadZipFile,
-    zlib.error,
-    struct.error,
-    lzma.LZMAError,
-    EOFError,
-    ValueError,
-    IndexError,
-    TypeError,
-)
-
-
 def _cause(error: Exception, member: zipfile.ZipInfo) -> Exception:
-    """The error that `extract` raises: one of gsbench for a known cause, else ``error`` itself."""
-    from remotezip import RemoteIOError, RemoteZipError
+    """The error that `extract` raises: of the network or disk as it is, else damage."""
+    from remotezip import RemoteIOError
 
-    if isinstance(error, InputError | DamagedMemberError):
-        return error
     if isinstance(error, RemoteIOError):
-        cause = error.__context__
-        return cause if isinstance(cause, Exception) else error
-    # An OSError with EINVAL is a seek before the start of the file; bzip2 raises one without a
-    # number.
-    bad_seek = isinstance(error, OSError) and error.errno in (None, EINVAL)
-    if bad_seek or isinstance(error, (*DAMAGE, RemoteZipError)):
-        return DamagedMemberError(str(error) or type(error).__name__)
-    if isinstance(error, NotImplementedError | RuntimeError):
+        error = error.__context__ if isinstance(error.__context__, Exception) else error
+        return error
+    if isinstance(error, RuntimeError):  # a password, or an unknown compression
         return InputError(
             f"{member.filename} is packed in a way that cannot be read here ({error})"
         )
-    return error
+    # zipfile and its decompressors raise almost any exception on damaged bytes, among them an
+    # OSError for a seek before the start of the file.
+    is_of_disk = isinstance(error, OSError) and error.errno not in (None, EINVAL)
+    if is_of_disk or isinstance(error, InputError | DamagedMemberError | MemoryError):
+        return error
+    return DamagedMemberError(str(error) or type(error).__name__)
 
 
 STAGING = ".fetch"  # folder of unfinished scenes, below the data folder

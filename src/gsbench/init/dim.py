@@ -93,17 +93,24 @@ class Dim(ColmapOptions):
     name: ClassVar[str] = "dim"
 
     extractor: Extractor = "superpoint"
+    # lightglue | mutual_nearest (mutual nearest neighbours with a ratio test)
     matcher: Matcher = "lightglue"
-    max_keypoints: PositiveInt = 2048
+    max_keypoints: PositiveInt = 2048  # per image, the strongest
+    # px, longest side for the network; keypoints are scaled back to the size of the files
     max_image_size: ImageSize = 1600
+    # mutual_nearest: distance to the best over the second-best match, tested in both directions
     max_ratio: MatchRatio = 0.95
+    # least detection score; null: the extractor's (superpoint 0.0005, aliked 0.2, disk 0); 0: no
+    # threshold
     keypoint_threshold: NonNegativeFloat | None = None
+    # px between keypoints; null: the extractor's (superpoint 3, aliked 2, disk 2)
     nms_radius: Annotated[int, Interval(ge=1, le=50)] | None = None
-    aliked_model: AlikedModel = "n16"
-    filter_threshold: Fraction = 0.1
+    aliked_model: AlikedModel = "n16"  # n16 | n16rot | n32 | t16 (LightGlue's weights are for n16)
+    filter_threshold: Fraction = 0.1  # lightglue: least score of a match
+    # folder with the weights files; null: $GSBENCH_WEIGHTS, then the torch hub cache
     weights: AnyPath | None = None
-    download: bool = True
-    device: str = "cpu"
+    download: bool = True  # fetch missing weights into the torch hub cache
+    device: str = "cpu"  # of the networks
 
     def __post_init__(self) -> None:
         super().__post_init__()

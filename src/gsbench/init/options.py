@@ -47,22 +47,40 @@ class ColmapOptions(Initializer):
     # estimates the poses itself if poses=shared and there is no reference
     is_own_reference: ClassVar[bool] = False
 
+    # shared: points under the reference cameras (the scene's, or those of init=sfm) | own:
+    # estimated here
     poses: Poses = "shared"
+    # own poses: move the model into the gauge of the reference (false: keep COLMAP's gauge)
     align: bool = True
+    # estimated cameras: exif (one for each size, camera, lens and focal length in EXIF) | single
+    # (one for each size) | per_folder | per_image
     camera: CameraSharing = "exif"
     camera_model: CameraModel = "SIMPLE_RADIAL"
+    # px of the image files, an initial value; null: from EXIF, else 1.2 x the longest side
     focal_length: PositiveFloat | None = None
+    # with own poses: estimate | reference (those of the reference, fixed)
     intrinsics: Literal["estimate", "reference"] = "estimate"
+    # exhaustive | auto (above 30 images, pairs that a preview proposes) | sequential (file names
+    # in the order of shooting)
     pairs: Pairing = "exhaustive"
+    # sequential: neighbours on each side, and as many at distances 1, 2, 4, 8, …
     overlap: Annotated[int, Interval(ge=1, le=60)] = 10
     min_inliers: Annotated[int, Ge(7)] = 15  # a fundamental matrix needs seven
-    min_inlier_ratio: Fraction = 0.0
+    min_inlier_ratio: Fraction = 0.0  # the same, as a share of the pair's matches
+    # auto (incremental; if it places few images: smaller angles, global, assumed focal lengths) |
+    # incremental | global
     mapper: Literal["auto", "incremental", "global"] = "auto"
-    min_model_size: Annotated[int, Ge(2)] = 3
+    min_model_size: Annotated[int, Ge(2)] = 3  # images; smaller models of the mapper are dropped
+    # keep points that only two images see: 1.7 times the points of sfm, but less accurate
     two_view_tracks: bool = False
+    # all views | train (test views contribute no points or colours: docs/splits.md)
     points_from: PointsFrom = "all"
-    seed: Seed = 0
+    seed: Seed = 0  # of RANSAC and mapper
+    # of extraction and matching; results of SIFT do not depend on it, results of networks are
+    # repeatable for 1
     threads: Threads | Literal["auto"] = "auto"
+    # of mapping and triangulation; 2 and more are faster on large scenes and not repeatable to
+    # the bit
     mapper_threads: Threads = 1
 
     def __post_init__(self) -> None:
@@ -111,11 +129,14 @@ class SiftOptions(ColmapOptions):
     keypoints are scaled back to the files' size.
     """
 
+    # px, longest side for detection; keypoints are scaled back to the size of the files
     max_image_size: ImageSize = 1600
-    max_num_features: PositiveInt = 8192
+    max_num_features: PositiveInt = 8192  # per image
     peak_threshold: PositiveFloat = 0.02 / 3  # COLMAP's default, as is the next
+    # ratio of curvatures (COLMAP's default); higher: more points along edges
     edge_threshold: PositiveFloat = 10.0
+    # -1 doubles the image before detection; 0 is several times faster, with fewer points
     first_octave: Annotated[int, Interval(ge=-1, le=5)] = -1
-    max_ratio: MatchRatio = 0.8
-    cross_check: bool = True
-    guided_matching: bool = False
+    max_ratio: MatchRatio = 0.8  # distance to the best over the second-best match
+    cross_check: bool = True  # matches must be mutual
+    guided_matching: bool = False  # match again along the epipolar lines

@@ -116,6 +116,8 @@ class Dataset(GivenCameras):
 
     name: ClassVar[str] = "dataset"
 
+    # all views | train (points that at least two training views see, in the colours of those:
+    # docs/splits.md)
     points_from: PointsFrom = "all"
 
     def needs_reference(self, capture: Capture) -> bool:
@@ -177,9 +179,10 @@ class Random(PlacedCloud):
     name: ClassVar[str] = "random"
     random_points: ClassVar[bool] = True
 
+    # points (gsplat's default for a random start)
     count: Annotated[int, Interval(ge=1, le=10_000_000)] = 100_000
-    size: PositiveFloat = 3.0
-    seed: Seed = 0
+    size: PositiveFloat = 3.0  # half the cube's edge, in scene extents (gsplat's default)
+    seed: Seed = 0  # of positions and colours
 
     def cloud(self, capture: Capture, model: pycolmap.Reconstruction) -> PointCloud:
         from gsbench.init.colmap.alignment import training_centers, training_extent
@@ -225,7 +228,7 @@ GREY = 128  # for points without a colour in the file and out of view of all tra
 class FromFile(GivenCameras):
     """Base of initialisers that read the file ``path``."""
 
-    path: AnyPath
+    path: AnyPath  # the file, for example a trial's point_cloud.ply
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -254,8 +257,8 @@ class Points(FromFile, PlacedCloud):
 
     name: ClassVar[str] = "points"
 
-    max_points: PositiveInt | None = 200_000
-    seed: Seed = 0
+    max_points: PositiveInt | None = 200_000  # a random choice of at most so many; null: all
+    seed: Seed = 0  # of the random choice
 
     def cloud(self, capture: Capture, model: pycolmap.Reconstruction) -> PointCloud:
         points, colors = read_points(self.file)

@@ -49,10 +49,10 @@ class SfmDense(Sfm):
     name: ClassVar[str] = "sfm_dense"
     is_own_reference: ClassVar[bool] = False
 
-    max_num_features: PositiveInt = 16384
+    max_num_features: PositiveInt = 16384  # per image
     # Together, these thresholds give 2.9 times the points on low-contrast ground, at a lower error.
     peak_threshold: PositiveFloat = 0.02 / 12
-    edge_threshold: PositiveFloat = 20.0
+    edge_threshold: PositiveFloat = 20.0  # twice COLMAP's default
 
 
 def match_by_sift(task: DatabaseTask, job: Job, progress: Progress, timer: Timer) -> dict[str, int]:

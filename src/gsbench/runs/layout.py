@@ -40,6 +40,7 @@ INIT_REPORT = "init_report.json"
 PER_VIEW = "per_view.csv"
 # measures of pictures, in a trial from an archive without pictures
 FROM_PIXELS = "from_pixels.json"
+REGIONS = "regions.json"
 CURVES = "metrics.jsonl"  # of the training
 EVENTS = "events.jsonl"  # counts of every refinement by cause
 HISTOGRAMS = "volume_histograms.jsonl"

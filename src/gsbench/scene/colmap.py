@@ -1,6 +1,7 @@
 """Reading COLMAP models safely, fitting them to image files, and writing models."""
 
 import codecs
+import logging
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -14,11 +15,18 @@ from gsbench.errors import InputError
 from gsbench.normalization import IDENTITY, Normalization
 from gsbench.parsing import without_byte_order_mark
 from gsbench.scene.colmap_checks import PARAMETERS as PARAMETERS
-from gsbench.scene.colmap_files import check_model, model_files, text_names
+from gsbench.scene.colmap_files import (
+    check_model,
+    model_files,
+    text_names,
+    write_without_tracks,
+)
 from gsbench.scene.distortion import without_distortion
 from gsbench.scene.images import check_size, image_size
 from gsbench.scene.names import match_anywhere
 from gsbench.scene.types import Array, Camera, CameraModel, Capture, to_pinhole
+
+log = logging.getLogger(__name__)
 
 Cloud = tuple[Array, NDArray[np.uint8]]  # positions [P, 3] in world units, colours [P, 3]
 UNIT_TOLERANCE = 1e-9  # a quaternion whose length differs from 1 by no more is not normalised again
@@ -32,7 +40,20 @@ def read_model(folder: Path) -> pycolmap.Reconstruction:
     """
     check_model(folder)
     try:
-        model = _read(folder)
+        try:
+            model = _read(folder)
+        except (ValueError, IndexError, RuntimeError) as error:
+            # COLMAP requires that images and points name each other; files of two models do not.
+            if "Check failed" not in str(error):
+                raise
+            with tempfile.TemporaryDirectory() as copy:
+                write_without_tracks(folder, Path(copy))
+                model = _read(Path(copy))
+            log.warning(
+                "%s: images and points3D name each other differently, as files of two models do: "
+                "points are read without the images that see them",
+                folder,
+            )
         _normalize_quaternions(model)
         for image in model.images.values():
             if image.has_pose and not np.isfinite(image.cam_from_world().matrix()).all():

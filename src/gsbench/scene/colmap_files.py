@@ -10,11 +10,13 @@ from __future__ import annotations
 
 import math
 import re
+import shutil
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from gsbench.errors import InputError
+from gsbench.files import GIT_LFS, LFS_REMEDY
 from gsbench.parsing import one_line, without_byte_order_mark
 from gsbench.scene.colmap_checks import (
     MODELS,
@@ -81,6 +83,9 @@ def check_model(folder: Path) -> None:
     for file in model_files(folder):  # in this order: images refer to cameras, points to images
         binary_record, text_record = _RECORDS[file.stem]
         try:
+            with file.open("rb") as stream:
+                if stream.read(len(GIT_LFS)) == GIT_LFS:
+                    raise NamesError(LFS_REMEDY)
             if file.suffix == ".bin":
                 _walk_binary(file, binary_record, checks)
             else:
@@ -95,6 +100,36 @@ def check_model(folder: Path) -> None:
             ) from error
         except OSError as error:
             raise InputError(f"{file}: cannot be read ({error.strerror})") from error
+
+
+def write_without_tracks(folder: Path, target: Path) -> None:
+    """Write the model of ``folder`` without 2D points and tracks, for files that disagree."""
+    for file in model_files(folder):
+        if file.stem not in ("images", "points3D"):
+            shutil.copyfile(file, target / file.name)
+        elif file.suffix == ".bin":
+            (target / file.name).write_bytes(_bare(file.read_bytes(), file.stem == "images"))
+        else:
+            text = without_byte_order_mark(file.read_bytes()).decode()
+            rows = [line for line in text.split("\n") if not line.lstrip().startswith("#")]
+            if file.stem == "images":  # a line of 2D points may be empty
+                kept = [f"{rows[at]}\n" for at in range(0, len(rows), 2) if rows[at].strip()]
+            else:
+                kept = [" ".join(row.split()[:8]) for row in rows if row.strip()]
+            (target / file.name).write_text("".join(f"{line}\n" for line in kept), "utf-8")
+
+
+def _bare(data: bytes, of_images: bool) -> bytes:
+    """The records of a sound images.bin or points3D.bin, each with an empty list at its end."""
+    kept, offset = [data[: _COUNT.size]], _COUNT.size
+    while offset < len(data):
+        if of_images:
+            end, size = data.index(b"\0", offset + _IMAGE.size) + 1, _POINT2D_BYTES
+        else:
+            end, size = offset + _POINT3D.size, _TRACK_ELEMENT.size
+        kept += [data[offset:end], _COUNT.pack(0)]
+        offset = end + _COUNT.size + _COUNT.unpack_from(data, end)[0] * size
+    return b"".join(kept)
 
 
 def _walk_binary(
@@ -232,7 +267,16 @@ def _text_camera(line: str, _: Lines, checks: ModelChecks) -> None:
     words = line.split()
     if PARAMETERS.get(words[1]) != len(words) - 4:
         raise InputError(f"camera {words[0]} is of an unknown model or lacks parameters")
+    for word in words[2:4]:
+        said = f"camera {words[0]} has the size {word}: write whole numbers of px, without a point"
+        _require_whole(word, said)
     checks.camera(int(words[0]), words[1], int(words[2]), int(words[3]), _numbers(words[4:]))
+
+
+def _require_whole(word: str, said: str) -> None:
+    """Raise `NamesError` for a number that is not written as a whole one."""
+    if not float(word).is_integer() or not word.lstrip("-").isdecimal():
+        raise NamesError(said)
 
 
 def _text_image(line: str, lines: Lines, checks: ModelChecks) -> None:
@@ -266,6 +310,9 @@ def _is_image_line(line: str) -> bool:
 
 def _text_point(line: str, _: Lines, checks: ModelChecks) -> None:
     words = line.split()
+    for word in words[4:7]:
+        said = f"point {words[0]} has the colour {word}: colours are whole numbers, 0 to 255"
+        _require_whole(word, said)
     track = [int(word) for word in words[8:]]
     if len(words) < 8 or len(track) % 2 or not all(0 <= int(word) <= 255 for word in words[4:7]):
         raise InputError(f"point {words[0]} lacks numbers or has no colour")

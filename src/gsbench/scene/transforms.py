@@ -21,6 +21,7 @@ from typing import Any
 from pydantic_core import from_json
 
 from gsbench.errors import InputError
+from gsbench.files import GIT_LFS, LFS_REMEDY
 from gsbench.parsing import (
     DamagedError,
     parse_typed,
@@ -177,6 +178,8 @@ def _relative_path(path: Path, written: str) -> PurePosixPath:
 
 def _read_record(path: Path, backdrop: Backdrop) -> TransformsRecord:
     content = read_bytes(resolved(path))
+    if content.startswith(GIT_LFS):
+        raise DamagedError(path, f"is {LFS_REMEDY}")
     try:
         content = text_of(content).encode()
     except InputError as error:

@@ -26,6 +26,7 @@ from gsbench.analysis.report.curves import event_charts, event_table, training_c
 from gsbench.analysis.report.quality import quality_charts
 from gsbench.analysis.report.sweeps import sweep_charts
 from gsbench.analysis.report.volumes import volume_charts
+from gsbench.analysis.report.where import region_maps
 from gsbench.analysis.results import Experiment, TrialResult, group_by, trials_of
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry, fill
 from gsbench.analysis.tables import build_table, with_agreement
@@ -66,6 +67,7 @@ def build_report(
     else:
         tables = paper_tables(experiment, paper_table, trials, comparison=comparison)
     volumes, volume_notes = volume_charts(trials, arms)
+    maps = region_maps(trials, comparison.answers)
     return fill(
         "report.html.j2",
         script=files("gsbench.analysis.report").joinpath("script.js").read_text(encoding="utf-8"),
@@ -75,7 +77,11 @@ def build_report(
         scenes=sorted({trial.scene for trial in trials}),
         seeds=experiment.seeds,
         trials=trials,
-        versus=[compare_arms(trials, own, experiment.older) for own in comparison.answers],
+        versus=[
+            compare_arms(trials, own, experiment.older)
+            | {"maps": maps.get((own.baseline, own.arm), [])}
+            for own in comparison.answers
+        ],
         ledger=show_ledger(experiment.folder),
         risk=comparison.risk,
         sweeps=sweep_charts(comparison),

@@ -1,0 +1,86 @@
+"""Where an arm helps beyond noise, in the report: maps of regions (`analysis.regions`)."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsbench.analysis.comparison import Answer
+from gsbench.analysis.images import png_uri, regions_of, truth_uri
+from gsbench.analysis.pairs import pair_trials
+from gsbench.analysis.regions import FEWEST_SEEDS, SceneRegions, compare_regions, discoveries
+from gsbench.analysis.results import Arm, TrialPair, TrialResult, group_by
+from gsbench.errors import InputError
+
+MAP_SIDE = 12  # px of a region on a map
+NOISY = 3.0  # dB: the deviation over seeds that is drawn black
+BETTER, WORSE, NOTHING = (33, 102, 172), (178, 24, 43), (235, 235, 235)
+
+Flags = NDArray[np.bool_]
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RegionMap:
+    """The test view of a scene with most lit regions, and the counts of all views of the scene."""
+
+    scene: str
+    view: str
+    seeds: int
+    better: int
+    worse: int
+    regions: int
+    truth: str  # data URIs; the photograph is empty where there is none
+    lit: str
+    noise: str
+
+
+def region_maps(
+    trials: Sequence[TrialResult], answers: Iterable[Answer]
+) -> dict[tuple[Arm, Arm], list[RegionMap]]:
+    """The maps of each scene by (baseline, arm); all regions of the report are one family.
+
+    A scene has none with fewer than three pairs of seeds, or without pictures or their errors.
+    """
+    found: list[tuple[tuple[Arm, Arm], Sequence[TrialPair], SceneRegions]] = []
+    for arms in dict.fromkeys((one.baseline, one.arm) for one in answers):
+        for own in group_by(pair_trials(trials, *arms), lambda pair: pair[0].scene).values():
+            if len(own) >= FEWEST_SEEDS:
+                try:
+                    errors = [[regions_of(pair[side]) for pair in own] for side in (1, 0)]
+                    found.append((arms, own, compare_regions(*errors)))
+                except InputError:
+                    continue
+    family = [p for _, _, scene in found for p in scene.p.values()]
+    lit = iter(discoveries(family)) if family else iter(())
+    maps: dict[tuple[Arm, Arm], list[RegionMap]] = {}
+    for arms, pairs, scene in found:
+        of_views = {view: next(lit) for view in scene.p}
+        maps.setdefault(arms, []).append(_map(pairs, scene, of_views))
+    return maps
+
+
+def _map(own: Sequence[TrialPair], scene: SceneRegions, lit: dict[str, Flags]) -> RegionMap:
+    better = {view: flags & (scene.change[view] > 0) for view, flags in lit.items()}
+    view = max(lit, key=lambda name: int(lit[name].sum()))
+    colours = np.full((*lit[view].shape, 3), NOTHING, dtype=np.uint8)
+    colours[lit[view]] = WORSE
+    colours[better[view]] = BETTER
+    grey = 255 * (1 - np.clip(scene.spread[view] / NOISY, 0, 1))
+    trial = own[0][0]
+    return RegionMap(
+        trial.scene,
+        view,
+        len(own),
+        better=sum(int(flags.sum()) for flags in better.values()),
+        worse=sum(int((lit[name] & ~flags).sum()) for name, flags in better.items()),
+        regions=sum(flags.size for flags in lit.values()),
+        truth=truth_uri(trial, view),
+        lit=png_uri(_enlarged(colours)),
+        noise=png_uri(_enlarged(np.repeat(grey[..., None], 3, axis=2).astype(np.uint8))),
+    )
+
+
+def _enlarged(colours: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    return colours.repeat(MAP_SIDE, axis=0).repeat(MAP_SIDE, axis=1)
