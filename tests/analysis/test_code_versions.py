@@ -112,9 +112,8 @@ def test_arms_are_compared_unless_they_share_code_in_two_versions(tmp_path, firs
     write_trial(tmp_path, 0, "aaaaaaaa", psnr=27.0, **first)
     write_trial(tmp_path, 0, "bbbbbbbb", psnr=28.0, densify="other", **second)
     table = table_of(tmp_path)
-    assert [entry.bold for row in table.rows for entry in row.entries] == [False, best]
-    said = "garden: not compared, no best marked: the arms differ in code of mine."
-    assert (said in table.notes) == (not best)
+    said = "the arms differ in code of mine, so they are not compared"
+    assert (said in table.verdicts[0]) == (not best)
 
 
 def test_explain_names_the_commit_and_the_edited_packages(tmp_path):

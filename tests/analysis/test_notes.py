@@ -3,7 +3,6 @@
 import html
 import itertools
 from dataclasses import replace
-from shlex import split
 from types import SimpleNamespace
 
 import pytest
@@ -80,19 +79,6 @@ def test_one_sentence_names_all_arms_with_unequal_counts(tmp_path):
     assert note.endswith(
         "give all arms densify.cap=governor densify.max_gaussians=60 and another name."
     )
-
-
-OF_FILE = ["hydra.searchpath=['file:///home/me/conf']"]
-DEMO, MINE = (
-    ["+experiment=demo"],
-    split("densify=adc densify._target_=mine.A allow_targets=[mine]"),
-)
-
-
-GRIDDED = (
-    '\'allow_targets=[mine]\' \'hydra.sweeper.grids=[{densify: "adc"}, {densify: "adc", '
-    'densify._target_: "mine.A"}]\''
-)
 
 
 def test_arms_that_the_governor_did_not_make_equal_need_a_longer_training():

@@ -6,17 +6,15 @@ import io
 import math
 import re
 import xml.etree.ElementTree as ElementTree
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from gsbench.analysis.pairing import pair_trials
-from gsbench.analysis.verdict_words import by_scene_lines, sentence
 from PIL import Image
 from plyfile import PlyData
 
 from gsbench.analysis.images import _jpeg_uri, choose_views, read_compared, texture_energy
+from gsbench.analysis.pairs import pair_trials
 from gsbench.analysis.quantities import quantity
 from gsbench.analysis.report.build import _forest, build_report, search_summary, trial_figures
 from gsbench.analysis.report.charts import Axis, ForestRow, forest_plot, line_chart, short_number
@@ -30,12 +28,11 @@ from gsbench.analysis.report.volumes import (
 )
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.statistics import Interval
-from gsbench.analysis.verdicts import judge_pairs
 from gsbench.runs.rows import Histogram
 from tests.analysis.helpers import ADC, VOLUMETRIC, loaded, page_of, rows_of, trials_of
 from tests.helpers import refusal, write
 from tests.markup import Page
-from tests.trials import search_record, write_arms, write_runs
+from tests.trials import ask_about, search_record, write_arms, write_runs, write_trial
 
 ONE_TRIAL = {"scenes": ("a",), "seeds": (0,), "pictures": True}
 
@@ -45,6 +42,7 @@ def runs(tmp_path_factory):
     """Two scenes with pictures, in which "volumetric" differs only by a clearly better LPIPS."""
     folder = tmp_path_factory.mktemp("runs")
     write_runs(folder, effect={"lpips_vgg_raw": -0.05}, views=3, pictures=True, random_seed=1)
+    ask_about(folder, metric="lpips_vgg_raw")
     return folder
 
 
@@ -104,15 +102,30 @@ def test_the_page_suits_screen_readers_and_keyboards(page):
 def test_the_verdict_comes_first(page):
     headings = re.findall(r"<h2[^>]*>([^<]+)", page)
     assert headings[:2] == ["Verdict", "Tables"]
-    assert "sfm-volumetric against sfm-adc, on these scenes: better in LPIPS VGG raw (−" in page
-    verdicts = page.split('aria-label="Verdicts, ')[1].split("</table>")[0]
-    assert "LPIPS VGG raw" in verdicts
-    assert "LPIPS Alex" not in verdicts  # not run: no row
+    row = page.split("<summary>")[1].split("</summary>")[0]
+    assert '<span class="badge better">BETTER</span>' in row
+    assert "sfm-volumetric" in row
+    assert re.search(r"LPIPS VGG raw −0\.\d+ \(95 % interval −", row)
+    assert "sfm-volumetric against sfm-adc: better in LPIPS VGG raw on these scenes: −" in page
+    metrics = page.split('aria-label="Metrics, ')[1].split("</table>")[0]
+    assert metrics.count("not tested") == 3
+    assert "LPIPS VGG raw" in metrics.split("</tr>")[1]
+    assert "LPIPS Alex" not in metrics  # not run: no row
+
+
+def test_each_idea_has_a_row_and_its_details_are_folded(tmp_path):
+    write_runs(tmp_path, densifiers=("adc", "mcmc", "volumetric"), views=3)
+    ask_about(tmp_path, lambda trial: trial.densify != "mcmc")
+    page = Page(page_of(tmp_path))
+    ideas = [attrs for attrs in page.all("details") if attrs.get("class") == "idea"]
+    assert [("open" in attrs) for attrs in ideas] == [False, False]
+    badges = re.findall(r'<span class="badge ?([a-z]*)">([^<]*)<', page_of(tmp_path))
+    assert sorted(badges) == [("", "NOT ASKED"), ("", "UNDECIDED")]
 
 
 def test_unequal_counts_and_training_times_are_stated_beside_the_verdict(page):
     """The arms have other counts, and equal trials other times."""
-    headline = re.search(r'<div class="verdict"><p><strong>([^<]*)</strong>', page)
+    headline = re.search(r'<div class="inside">\s*<p>([^<]*)</p>', page)
     assert re.search(
         r"Unequal numbers of Gaussians: sfm-volumetric \d+ % more than sfm-adc",
         headline[1],
@@ -469,8 +482,8 @@ def test_one_trial_of_each_arm_gives_no_verdict(tmp_path):
     page = page_of(tmp_path)
     assert ">garden</text>" in page
     assert "mean of scenes" not in page
-    assert "no verdict, one trial of each on this scene; run more seeds" in page
-    assert "▲ better" not in page
+    assert "NOT ASKED" in page
+    assert "one pair of trainings has no interval" in page
 
 
 def test_a_report_on_a_table_of_the_paper_compares_with_its_numbers(tmp_path):
@@ -511,56 +524,20 @@ def test_a_single_arm_and_bare_results_still_make_a_report(tmp_path):
 
 
 def test_arms_that_never_differ_are_called_equal_and_not_undecided(tmp_path):
-    write_runs(tmp_path, trial_noise=0, residual_noise=0, views=3)
-    page = page_of(tmp_path)
-    assert "equal in every metric" in page
-    assert "had no effect" in page
-
-
-def test_scenes_that_disagree_are_named_under_a_verdict_on_their_mean(tmp_path):
-    write_runs(tmp_path, scenes=("courtyard",), effect={"psnr": 2.0}, views=3)
-    write_runs(tmp_path, scenes=("garden",), effect={"psnr": -2.0}, views=3)
-    write_runs(tmp_path, scenes=("stump",), views=3)
-    (judged,) = judge_pairs(trials_of(tmp_path), [(ADC, VOLUMETRIC)])
-    assert "too small to matter in PSNR" in sentence(judged)
-    line = next(line for line in by_scene_lines(judged.verdicts) if line.startswith("PSNR"))
-    assert (
-        line == "PSNR (dB) by scene: better on courtyard, worse on garden: the scenes disagree, so "
-        "their mean says little"
-    )
-    assert line in page_of(tmp_path)
-    psnr = next(one for one in judged.verdicts if one.quantity.key == "psnr")
-    both = tuple(replace(scene, mean=abs(scene.mean)) for scene in psnr.scenes[:2])
-    for sign, word in ((1, "better"), (-1, "worse")):
-        alike = replace(psnr, scenes=both, question=replace(psnr.question, sign=sign))
-        assert by_scene_lines([alike]) == [f"PSNR (dB) by scene: {word} on courtyard, garden"]
-    unclear = (both[0], replace(both[1], p=0.05))
-    alone = replace(psnr, scenes=unclear)
-    assert by_scene_lines([alone]) == ["PSNR (dB) by scene: better on courtyard"]
-
-
-@pytest.mark.parametrize(
-    "plan, decided",
-    [
-        ({"trial_noise": 0, "residual_noise": 0}, False),
-        ({"scenes": ("garden",), "effect": {"psnr": 5.0}, "trial_noise": 0.01}, True),
-    ],
-)
-def test_no_scene_is_named_where_none_is_decided_or_where_there_is_one(tmp_path, plan, decided):
-    write_runs(tmp_path, views=3, **plan)
-    (judged,) = judge_pairs(trials_of(tmp_path), [(ADC, VOLUMETRIC)])
-    scenes = [scene for one in judged.verdicts for scene in one.scenes]
-    assert any(scene.p is not None and scene.p < 0.05 for scene in scenes) is decided
-    assert by_scene_lines(judged.verdicts) == []
+    for densify in ("adc", "mine"):
+        for seed in range(3):
+            write_trial(tmp_path, seed, densify=densify, psnr=20.0 + seed)
+    ask_about(tmp_path)
+    assert "had no effect" in page_of(tmp_path)
 
 
 def test_points_of_a_search_are_not_compared(tmp_path):
     write_runs(tmp_path)
-    assert "Verdicts, " in page_of(tmp_path)
+    assert "Metrics, " in page_of(tmp_path)
     points = [{"value": 27.5, "settings": {"densify.volume_threshold": 0.6841}}]
     write(tmp_path / "exp/tuning.json", search_record(points))
     page = page_of(tmp_path)
-    assert "Verdicts, " not in page
+    assert "Metrics, " not in page
     assert "so there is no verdict" in page
     assert "densify.volume_threshold = 0.6841 (point 1)" in page
 
@@ -591,3 +568,33 @@ def test_a_forest_plot_has_at_least_two_grid_lines_for_any_range():
         row = ForestRow("a", 0.1 * reach, Interval(-reach, reach))
         chart = forest_plot("t", [row], "difference", 1)
         assert chart.count('class="grid"') >= 2, reach
+
+
+def test_a_sweep_over_a_setting_has_a_chart_with_its_baseline(tmp_path):
+    write_arms(tmp_path, {"adc": {}})
+    for number, value in enumerate((0.01, 0.1, 1.0), 1):
+        for seed in range(3):
+            write_trial(
+                tmp_path,
+                seed,
+                f"{number:08x}",
+                {"densify": {"name": "mine", "growth": value}},
+                scene="courtyard",
+                densify="mine",
+                psnr=20 + value + seed / 10,
+            )
+    page = page_of(tmp_path)
+    title = "sfm-mine: PSNR (dB) by densify.growth"
+    assert page.count(f"<figcaption>{title}</figcaption>") == 1
+    chart = page.split(f"<figcaption>{title}</figcaption>")[1].split("</svg>")[0]
+    assert ">sfm-adc</text>" in chart  # the baseline's line
+    assert chart.count('<line class="axis"') == 3  # an interval for each value
+
+
+def test_a_wide_interval_of_one_scene_does_not_stretch_the_axis():
+    rows = [ForestRow(f"s{k}", 0.1, Interval(-0.1, 0.3)) for k in range(3)]
+    wide = forest_plot("t", [*rows, ForestRow("wide", 0.1, Interval(-9.0, 9.2))], "d", 1)
+    lines = re.findall(r'<line x1="([\d.]+)" x2="([\d.]+)"', wide)
+    own, cut = (float(b) - float(a) for a, b in (lines[0], lines[-1]))
+    assert 1 < cut / own < 6
+    assert "wide 0.1, interval −9 to 9.2" in wide  # the words have it whole

@@ -38,7 +38,7 @@ from tests.analysis.helpers import page_of, rows_of, table_of, trials_of
 from tests.helpers import refusal
 from tests.markup import Page
 from tests.processes import completed
-from tests.trials import BUDGET, write_runs, write_trial
+from tests.trials import BUDGET, ask_about, write_runs, write_trial
 
 SIDE_BY_SIDE = {"rows": ["scene"], "columns": ["densify"]}
 
@@ -50,23 +50,50 @@ def texts(table):
     ]
 
 
-def test_the_best_is_bold_and_ties_after_rounding_are_both_best(tmp_path):
-    write_trial(tmp_path, psnr=27.001, flip=0.1)
-    write_trial(tmp_path, densify="none", psnr=26.0, flip=0.3)
-    write_trial(tmp_path, densify="volumetric", psnr=26.996, flip=0.05)
-    table = table_of(tmp_path, "psnr", "flip", "gaussians")
-    assert [row[3:5] for row in texts(table)] == [
-        ["*27.00*", "0.100"],
-        ["26.00", "0.300"],
-        ["*27.00*", "*0.050*"],
+def bold_of(table):
+    """The labels of rows whose first entry is bold."""
+    return {row.labels[:3] for row in table.rows if row.entries[0].bold}
+
+
+def test_bold_is_the_best_mean_that_was_shown_to_be_better(tmp_path):
+    """A verdict is about the mean of its scenes, so no cell of a single scene is bold."""
+    write_runs(tmp_path, effect={"psnr": 1.0}, densifiers=("adc", "volumetric", "mcmc"))
+    assert bold_of(table_of(tmp_path, "psnr")) == set()  # nobody asked beforehand
+    ask_about(tmp_path)
+    table = table_of(tmp_path, "psnr", "gaussians")
+    assert bold_of(table) == {("mean of 2 scenes", "sfm", "volumetric")}
+    assert not any(row.entries[1].bold for row in table.rows)
+    assert table.notes[0].endswith("Bold: the best mean, and shown to be better.")
+    assert [line.partition(":")[0] for line in table.verdicts[:2]] == ["UNDECIDED", "BETTER"]
+    assert table.verdicts[-1].startswith("2 questions, 2 statements; if none had an effect")
+
+
+def test_the_largest_mean_is_not_bold_without_a_verdict_for_it(tmp_path):
+    write_runs(tmp_path, effect={"psnr": 0.001}, scenes=("garden",))
+    ask_about(tmp_path)
+    assert bold_of(table_of(tmp_path, "psnr")) == set()
+
+
+def test_a_baseline_is_bold_where_the_arm_was_shown_to_be_worse(tmp_path):
+    write_runs(tmp_path, effect={"psnr": -1.0}, scenes=("garden",))
+    ask_about(tmp_path)
+    assert bold_of(table_of(tmp_path, "psnr")) == {("garden", "sfm", "adc")}
+
+
+def test_at_most_five_notes_stand_below_a_table(make_experiment):
+    table = build_table(make_experiment())
+    many = replace(table, notes=tuple(f"note {k}" for k in range(9)))
+    lines = to_markdown(many).splitlines()
+    shown = [line for line in lines if line.startswith("- ") and ": sfm" not in line]
+    assert shown == [
+        "- note 0",
+        "- note 1",
+        "- note 2",
+        "- note 3",
+        "- 5 more notes: in the report.",
     ]
-    assert not any(row.entries[2].bold for row in table.rows)  # a count is a cost, not a merit
-
-
-def test_bold_is_by_scene_not_by_table(make_experiment):
-    table = build_table(make_experiment(effect={"psnr": 1.0}), metrics=["psnr"])
-    bold = {row.labels[:3] for row in table.rows if row.entries[0].bold}
-    assert bold == {(s, "sfm", "volumetric") for s in ("courtyard", "garden", "mean of 2 scenes")}
+    few = replace(table, notes=tuple(f"note {k}" for k in range(5)))
+    assert to_markdown(few).splitlines()[-1] == "- note 4"
 
 
 def test_no_mean_is_shown_if_no_scene_has_every_arm(tmp_path):
@@ -162,7 +189,7 @@ def test_arms_under_different_conditions_are_shown_but_not_compared(tmp_path):
     write_trial(tmp_path, psnr=28.0, densify="volumetric", _iterations=7000)
     table = table_of(tmp_path, "psnr")
     assert [row[3] for row in texts(table)] == ["27.00", "28.00"]
-    assert "garden: not compared, no best marked: the arms differ in iterations." in table.notes
+    assert "the arms differ in iterations, so they are not compared" in table.verdicts[0]
 
 
 UNLIMITED = {"max_gaussians": None, "cap": None}
@@ -188,9 +215,8 @@ def test_arms_are_compared_under_one_budget_or_under_none_that_acted(
     write_trial(tmp_path, psnr=27.0, _events=first)
     write_trial(tmp_path, psnr=28.0, densify="none", _budget=second_budget, _events=second)
     table = table_of(tmp_path, "psnr")
-    assert [row[3] for row in texts(table)] == ["27.00", "*28.00*" if compared else "28.00"]
-    note = "garden: not compared, no best marked: the arms differ in budget."
-    assert (note in table.notes) is not compared
+    assert [row[3] for row in texts(table)] == ["27.00", "28.00"]
+    assert ("the arms differ in budget" in table.verdicts[0]) is not compared
 
 
 def test_the_mean_of_scenes_gives_each_the_same_weight(tmp_path):
@@ -239,16 +265,18 @@ def test_the_notes_say_how_to_read_the_table_and_what_is_left_out(tmp_path):
     paths = write_runs(tmp_path)
     (paths[-1] / "results.json").write_text("{")
     notes = table_of(tmp_path, "psnr", "lpips_alex").notes
-    assert notes[:4] == (
-        "Mean over 3 trials; ± is the deviation (n − 1) over trials.",
-        "Bold: best mean of a scene after rounding; this is not a test.",
-        "(k/3): k of 3 trials with a value; —: none.",
-        "Protocol paper-1.",
+    assert notes[0] == (
+        "Mean over 3 trials; ± is the deviation (n − 1) over trials. Protocol paper-1."
     )
+    assert notes[1].startswith("Left out (1): exp/garden/sfm-volumetric/c0ffee00-seed2: damaged")
+    assert "(k/3): k of 3 trials with a value; —: none." in notes
     assert any(note.endswith("n/a, weights file alexnet.pth not found.") for note in notes)
-    assert notes[-1].startswith("Left out (1): exp/garden/sfm-volumetric/c0ffee00-seed2: damaged")
-    assert table_of(tmp_path, "psnr", rows=["densify"]).notes[0] == (
-        "Mean over 3 trials; ± is the deviation (n − 1) over the trials' means of scenes."
+    assert (
+        table_of(tmp_path, "psnr", rows=["densify"])
+        .notes[0]
+        .startswith(
+            "Mean over 3 trials; ± is the deviation (n − 1) over the trials' means of scenes."
+        )
     )
 
 
@@ -264,7 +292,6 @@ def test_markdown_has_a_line_for_each_row_and_equal_numbers_of_cells(make_experi
     assert lines[0].startswith("| scene | PSNR (dB) ↑ adc | PSNR (dB) ↑ volumetric |")
     assert len({line.count("|") for line in lines}) == 1
     assert len(lines) == 2 + 2 + 1
-    assert "**" in text
 
 
 def test_csv_has_a_line_for_each_cell_in_full_precision(make_experiment):

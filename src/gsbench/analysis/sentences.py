@@ -150,7 +150,8 @@ def in_words(verdict: Verdict) -> str:
     if verdict.untestable is not None:
         return reason(verdict)
     if not (shown := numbers(verdict)):
-        return reason(verdict)
+        # without a pair of trials, the first note says why there is none
+        return "; ".join([reason(verdict), *map(str, verdict.pairs.left_out[:1])])
     return (
         f"{reason(verdict)}; {verdict.quantity.name} on {scope(verdict)}: {shown}"
         if (verdict.state != ANSWERED or verdict.favours_lacking)

@@ -180,10 +180,13 @@ def extract(
 
 def _cause(error: Exception, member: zipfile.ZipInfo) -> Exception:
     """The error that `extract` raises: of the network or disk as it is, else damage."""
+    import requests
+    import urllib3
     from remotezip import RemoteIOError
 
-    if isinstance(error, RemoteIOError):
-        error = error.__context__ if isinstance(error.__context__, Exception) else error
+    if isinstance(error, RemoteIOError) and isinstance(error.__context__, Exception):
+        error = error.__context__
+    if isinstance(error, requests.RequestException | urllib3.exceptions.HTTPError | RemoteIOError):
         return error
     if isinstance(error, RuntimeError):  # a password, or an unknown compression
         return InputError(

@@ -74,8 +74,9 @@ def list_images(folder: Path) -> list[str]:
     if unread:
         files = " and ".join(counted(count, f"{kind} file") for kind, count in unread.items())
         is_one = unread.total() == 1
-        are = "is" if is_one else "are"
-        log.warning("%s: %s %s not read: save as PNG or JPEG", folder, files, are)
+        log.warning(
+            "%s: %s %s not read: save as PNG or JPEG", folder, files, "is" if is_one else "are"
+        )
     if strange := sorted(name for name in names if not is_one_line(name)):
         advice = "rename them"
         if sys.getfilesystemencoding() != "utf-8":
