@@ -12,6 +12,7 @@ from rich.console import Console
 
 from gsbench.config.compose import compose_one
 from gsbench.errors import GsbenchError
+from gsbench.launch import states
 from gsbench.launch.progress import Progress
 from gsbench.launch.record import record
 from gsbench.launch.states import TrialState
@@ -118,7 +119,7 @@ def test_a_state_without_a_time_has_no_age_and_one_in_the_future_is_new():
 def test_superseded_trials_are_shown_and_deleted_on_demand(folders, monkeypatch, said):
     done = folders[0]
     reasons = {done: "helper was 1, it is now 2"}
-    monkeypatch.setattr(trials, "find_superseded", lambda *_: reasons)
+    monkeypatch.setattr(states, "find_superseded", lambda *_: reasons)
     assert said("status").endswith(" 3 trials: 1 superseded, 1 missing, 1 failed\n")
     lines = said("status x --forget-superseded").splitlines()
     assert lines == [f"removed {done}: helper was 1, it is now 2", "1 superseded trial removed"]
@@ -131,9 +132,9 @@ def test_user_modules_are_looked_up_where_the_command_of_each_trial_was_given(
 ):
     asked = []
     monkeypatch.setattr(
-        trials, "find_superseded", lambda trials, folders: asked.append(folders) or {}
+        states, "find_superseded", lambda trials, folders: asked.append(folders) or {}
     )
-    trials.progress_with_superseded(folders[0].parents[2])
+    states.states_now(folders[0].parents[2])
     assert asked == [dict.fromkeys(folders, str(tmp_path))]
 
 
@@ -236,7 +237,7 @@ def test_a_trial_whose_configuration_has_changed_takes_the_place_of_the_old_one(
 
 
 def test_retry_of_a_trial_without_a_plan_uses_its_configuration(folders, runs):
-    (runs / "x/plan.json").unlink()
+    (runs / "x/commands.jsonl").unlink()
     again = trials.recompose(folders[1], None, runs, [], str(runs.parent))
     assert TrialFolder.of(again.values).path == folders[1]
     assert again.values == compose_one(split("name=x densify=adc seed=1")).values
@@ -256,7 +257,7 @@ def test_a_trial_from_renders_is_entered_by_its_own_command(folders, runs):
 
 
 def test_a_second_retry_without_a_plan_runs_the_same_trial(folders, runs, monkeypatch):
-    (runs / "x/plan.json").unlink()
+    (runs / "x/commands.jsonl").unlink()
     ran = []
 
     def killed(given):

@@ -13,6 +13,8 @@ from typing import Annotated, Any, Literal
 import psutil
 from pydantic import Field
 
+from gsbench.analysis.differences import find_superseded
+from gsbench.analysis.results import read_experiment
 from gsbench.errors import InputError
 from gsbench.files import write_json
 from gsbench.parsing import Record, read_if_sound
@@ -53,6 +55,21 @@ def states_of_experiment(home: Path) -> list[TrialState]:
     queue = ask_queue(folders)
     states = [_state(folder, plan.get(folder), queue) for folder in folders]
     return _mark_superseded([replace(state, planned=plan.get(state.folder)) for state in states])
+
+
+def states_now(home: Path) -> list[TrialState]:
+    """The same, with finished trials that older code made as ``superseded``; reads all results."""
+    states = states_of_experiment(home)
+    folders = {state.folder: state.planned.cwd for state in states if state.planned is not None}
+    # The user's modules are read in the folder where the trial's command was given: another may
+    # have a namesake.
+    reasons = find_superseded(read_experiment(home).trials, folders)
+    return [
+        replace(state, state="superseded", note=str(reasons[state.folder]))
+        if state.state == "done" and state.folder in reasons
+        else state
+        for state in states
+    ]
 
 
 def _mark_superseded(trials: Sequence[TrialState]) -> list[TrialState]:

@@ -144,7 +144,7 @@ class Store:
                         return self._read_verified(final)
                     except ValueError as error:
                         log.warning("store: %s is damaged (%s) and is built again", final, error)
-                        _remove(final)
+                        remove(final)
                 log.debug("store: %s %s is computed", step.stage.name, step.key[:8])
                 return self._build(step)
 
@@ -172,7 +172,7 @@ class Store:
             seconds = read_manifest(partial, step.key).seconds
         if seconds is None:
             if partial.exists() and not stage.resumable:
-                _remove(partial)
+                remove(partial)
             partial.mkdir(exist_ok=True)
             remove_temporaries(partial)
             remove_special_files(partial)
@@ -202,7 +202,7 @@ class Store:
                 if not stage.resumable or self.folder(stage, key).exists():
                     lock = partial.with_name(f".{key}.lock")
                     with suppress(BusyError), suppress(OSError), hold(lock, key, wait=False):
-                        _remove(partial)
+                        remove(partial)
             for removed in (self.root / stage.name).glob(".*.removed"):
                 shutil.rmtree(removed, ignore_errors=True)
         # photographs are prepared in such folders, which have no lock
@@ -280,7 +280,7 @@ def is_sound(folder: Path, name: str, recorded: Output, thorough: bool) -> bool:
         return False
 
 
-def _remove(folder: Path) -> None:
+def remove(folder: Path) -> None:
     """Remove a folder.
 
     It is renamed first, so that a kill in between leaves nothing that looks like a result.

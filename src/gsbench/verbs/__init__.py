@@ -26,6 +26,7 @@ VERBS = {  # their modules, with their purposes as `gsbench --help` lists them
     "status": ("trials", "the state of every trial: done, running, failed, missing"),
     "retry": ("trials", "run failed, stopped, damaged and missing trials again"),
     "bench": ("machine", "time rasterizers and the training step"),
+    "clean": ("clean", "what the store holds, and removing what no trial refers to"),
     "sync": ("trials", "send to MLflow the trials that it lacks"),
     "ui": ("servers", "compare the arms of an experiment in MLflow, in the browser"),
     "export": (

@@ -15,8 +15,6 @@ from rich.live import Live
 from rich.markup import escape
 from rich.table import Table
 
-from gsbench.analysis.differences import find_superseded
-from gsbench.analysis.results import read_experiment
 from gsbench.config.command_words import makes_other_trials, typed_permissions
 from gsbench.config.compose import Trial, compose_one
 from gsbench.config.overrides import key_of
@@ -24,7 +22,13 @@ from gsbench.errors import GsbenchError, InputError
 from gsbench.launch.dry_run import describe_plan
 from gsbench.launch.progress import Progress, progress_of
 from gsbench.launch.record import remove
-from gsbench.launch.states import TrialState, label_of, names_of, states_of_experiment
+from gsbench.launch.states import (
+    TrialState,
+    label_of,
+    names_of,
+    states_now,
+    states_of_experiment,
+)
 from gsbench.runs.commands import PlannedTrial, drop
 from gsbench.runs.experiments import experiment_home, list_experiments, trial_folders
 from gsbench.runs.trial_folder import TrialFolder
@@ -72,7 +76,7 @@ def status(argv: Sequence[str], runs: Path) -> int:
     home = experiment_home(runs, options.experiment)
     if options.watch:
         _watch(home)
-    trials = progress_with_superseded(home)
+    trials = states_now(home)
     if options.verify:
         trials = [_verified(trial) for trial in trials]
     if options.forget_superseded:
@@ -143,19 +147,6 @@ def _cell(counts: dict[str, int]) -> str:
     return ", ".join([f"{counts['done']}/{sum(counts.values())}", *others])
 
 
-def progress_with_superseded(home: Path) -> list[TrialState]:
-    """The state of every trial in ``home``; those that older code made are ``superseded``."""
-    states = states_of_experiment(home)
-    folders = {state.folder: state.planned.cwd for state in states if state.planned is not None}
-    # The user's modules are read in the folder where the trial's command was given: another may
-    # have a namesake.
-    reasons = find_superseded(read_experiment(home).trials, folders)
-    for place, trial in enumerate(states):
-        if trial.state == "done" and trial.folder in reasons:
-            states[place] = replace(trial, state="superseded", note=str(reasons[trial.folder]))
-    return states
-
-
 def lines_of(trials: list[TrialState], with_done: bool) -> list[str]:
     """A line for each trial not done or in doubt (``with_done``: for each), and a summary."""
     lines, names = [], names_of(trials)
@@ -179,7 +170,7 @@ def _overview(runs: Path) -> int:
     if not names:
         print(f"no experiment in {runs} yet")
     for name in names:
-        print(f"{name:<20} {summary_of(progress_with_superseded(runs / name))}")
+        print(f"{name:<20} {summary_of(states_now(runs / name))}")
     return 0
 
 
