@@ -65,7 +65,7 @@ def measure_folders(
                 PicturePair(view, path, folder / matching.pairs[view])
                 for view, path in images.photographs.items()
             ]
-            check_pairs(pairs)
+            check_pairs(pairs, str(folder))
             evaluator = _evaluator(images, None, settings)
             means = summarize(measure(pairs, evaluator), evaluator.unavailable)
             rows.append({"method": method, "scene": scene, "seed": seed} | means)
@@ -97,7 +97,7 @@ def _measure(
         PicturePair(view, path, renders / matching.pairs[view], truth.masks.get(view))
         for view, path in truth.photographs.items()
     ]
-    notes = check_pairs(pairs)
+    odd = check_pairs(pairs, options.renders)
     torch.set_num_threads(available_threads())
     evaluator = _evaluator(truth, options.protocol, options.settings)
     with progress("evaluate") as report:
@@ -105,7 +105,7 @@ def _measure(
     source = {
         "folder": str(Path(options.renders).expanduser().resolve()),
         "names matched": matching.rule or "as they are",
-    } | ({"notes": "; ".join(notes)} if notes else {})
+    } | ({"notes": "; ".join(found.line for found in odd)} if odd else {})
     measured = Measured(truth, pairs, per_view, evaluator, source)
     folder = None
     if destination is not None:
