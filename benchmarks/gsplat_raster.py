@@ -43,7 +43,6 @@ from gsbench.raster.staged import Readback, bad_values, check_settings, raise_fo
 from gsbench.scene.types import Camera
 from gsbench.system.install import install_command
 
-MAX_RADIUS = 2**24  # px; keeps the tile numbers of a huge Gaussian within int32
 COEFFICIENTS = {0: 1, 1: 4, 2: 9, 3: 16}  # number of harmonics up to each degree
 
 
@@ -248,7 +247,8 @@ def _square_radii(conics: Tensor, seen: Tensor) -> Tensor:
     half_trace = 0.5 * (a + c) * determinant
     root = (half_trace * half_trace - determinant).clamp_min(CONSTANTS.eigenvalue_floor).sqrt()
     radii = (CONSTANTS.sigma_extent * (half_trace + root).sqrt()).ceil()
-    return torch.where(seen, radii.nan_to_num(0, 0, 0).clamp(0, MAX_RADIUS), 0.0).to(torch.int32)
+    radii = radii.nan_to_num(0, 0, 0).clamp(0, CONSTANTS.max_radius)
+    return torch.where(seen, radii, 0.0).to(torch.int32)
 
 
 def _reaches_image(means: Tensor, radii: Tensor, width: int, height: int) -> Tensor:

@@ -262,6 +262,16 @@ def test_a_job_gets_the_search_path_and_the_gpus_of_its_sweep(tmp_path, monkeypa
     )
 
 
+def test_a_job_whose_code_changed_since_its_command_fails_and_runs_nothing(
+    tmp_path, machine, monkeypatch
+):
+    monkeypatch.setattr(jobs, "run_one", lambda *arguments, **named: pytest.fail("it ran"))
+    one = trial(tmp_path, launch=SLURM)
+    outcome = TrialJob(one.values, [], {}, None, f"{digest_of(one.values)}-before")()
+    assert (outcome.status, outcome.bad_input) == ("failed", True)
+    assert outcome.message == "code changed since the command; give it again"
+
+
 class Jobs:
     """Stands in for submitit's executor; ``steps`` says after how many questions each job ends."""
 

@@ -1,10 +1,12 @@
 """Writing commands and questions down before trials run."""
 
 import logging
+from dataclasses import replace
 from shlex import split
 
 import pytest
 
+from gsbench.app.command import compose_trials
 from gsbench.launch.record import asked_metrics, check_looks, planned_rows, record, remove
 from gsbench.runs.commands import digest_of, read_history, remember_result
 from gsbench.runs.experiments import Arm
@@ -145,3 +147,72 @@ def test_looks_need_equal_seeds_of_all_scenes_and_arms(tmp_path):
     single = sweep(tmp_path, 0)
     with refusal("at least 2 seeds"):
         check_looks(single, planned_rows(single))
+
+
+def named(runs, *entries, error_rate="each", densifiers=("adc", "mine", "other")):
+    """The questions of a sweep whose file names these."""
+    values = {"questions": list(entries), "error_rate": error_rate}
+    trials = [trial(runs, seed, name) for name in densifiers for seed in (0, 1)]
+    return record([replace(one, values=one.values | values) for one in trials])
+
+
+def test_an_experiments_file_names_other_questions_in_place_of_the_usual_ones(tmp_path):
+    (one,) = named(
+        tmp_path,
+        {
+            "idea": "other",
+            "baseline": "mine",
+            "metric": "gaussians",
+            "direction": "lower",
+            "least": "10%",
+            "says": "fewer",
+            "where": "Table 3",
+        },
+    )
+    assert (one.idea.densify, one.baseline.densify) == ("other", "mine")
+    assert (one.metric, one.sign, one.least, one.relative) == ("gaussians", -1, 0.1, True)
+    assert (one.says, one.where, one.level) == ("fewer", "Table 3", 0.05)
+
+
+def test_questions_may_share_one_error_rate(tmp_path):
+    entries = ({"idea": "mine"}, {"idea": "other"})
+    assert [one.level for one in named(tmp_path / "a", *entries)] == [0.05, 0.05]
+    shared = named(tmp_path / "b", *entries, error_rate="shared")
+    assert [one.level for one in shared] == [0.025, 0.025]
+
+
+def test_a_question_may_be_about_some_scenes_alone(tmp_path):
+    entry = {"idea": "mine", "scenes": ["elsewhere"]}
+    with refusal("mine names no arm of this sweep"):
+        named(tmp_path, entry)
+    (found,) = named(tmp_path / "b", entry | {"scenes": ["courtyard"]})
+    assert [*found.seeds] == ["courtyard"]
+
+
+@pytest.mark.parametrize(
+    "entry, said",
+    [
+        ({"baseline": "adc"}, r"questions\[1\] must be a mapping with idea"),
+        ({"idea": "nothing"}, "nothing names no arm of this sweep"),
+        ({"idea": "mine", "least": 0}, r"questions\[1\]\.least must be a number above 0"),
+        ({"idea": "mine", "metric": "psn"}, "psn"),
+        ({"idea": "mine", "metric": "gaussians", "direction": "same"}, "least is needed"),
+        ({"idea": "mine", "sez": "x"}, "sez"),
+    ],
+)
+def test_a_wrong_question_is_refused_in_one_line_before_anything_is_written(tmp_path, entry, said):
+    with refusal(said):
+        named(tmp_path, entry)
+    assert not (tmp_path / "exp").exists()
+
+
+def test_declare_writes_questions_and_single_trainings_ask_nothing_more(runs, said):
+    words = [*(word for word in TINY if word != "densify=none"), "name=loop"]
+    sweep_words = ["densify=adc,volumetric", "seed=0,1"]
+    assert "4 trials and 1 question" in said("declare", *words, *sweep_words)
+    assert not list(runs.glob("loop/*/*/*"))
+    (question,) = read_history(runs / "loop").questions
+    for densify in ("adc", "volumetric"):
+        single = compose_trials([*words, f"densify={densify}", "seed=1"])
+        assert record(single) == ([question] if densify == "volumetric" else [])
+    assert read_history(runs / "loop").questions == (question,)

@@ -11,6 +11,7 @@ import yaml
 from numpy.testing import assert_array_equal
 from PIL import Image
 
+from gsbench.analysis.comparison import compare
 from gsbench.analysis.results import load_experiment
 from gsbench.cli import run
 from gsbench.config.compose import compose_one
@@ -113,6 +114,29 @@ def test_renders_are_entered_beside_the_trial_of_their_photographs(trial, runs, 
     said(*words[:-1], "new:dnn-theirs")
     (other,) = runs.glob("new/garden/dnn-theirs/*-seed0")
     assert yaml.safe_load((other / "config.yaml").read_text())["init"] == {"name": "dnn"}
+
+
+def test_a_named_metric_writes_the_question_about_all_seeds_of_the_baseline(trial, runs, said):
+    second = trial.with_name(trial.name.replace("seed0", "seed1"))
+    shutil.copytree(trial, second)
+    record = read_json(second / "results.json")
+    write(second / "results.json", record | {"seed": 1})
+    words = ["evaluate", trial / "renders", "--truth", "exp:garden:adc:0", "--as", "exp:theirs"]
+    for seed in (0, 1):
+        said(*words, "eval.primary=psnr", "--seed", seed)
+    experiment = load_experiment(runs, "exp")
+    (question,) = experiment.history.questions
+    assert question.seeds == {"garden": (0, 1)}
+    (answer,) = compare(experiment).answers
+    assert (answer.verdict.state, answer.verdict.done) == ("answered", 4)
+
+
+@pytest.mark.parametrize(
+    "word, said",
+    [("eval.primary=psnr", "add --as"), ("eval.maps=true", "no effect on renders")],
+)
+def test_settings_without_effect_on_renders_are_refused(trial, runs, refused, word, said):
+    assert said in refused("evaluate", trial / "renders", "--truth", trial, word)
 
 
 def test_photographs_are_found_by_trial_folder_and_address(trial, runs, tmp_path, refused, said):

@@ -5,11 +5,17 @@ from types import SimpleNamespace as Facts
 
 import numpy as np
 import pytest
+from PIL import Image
 
+from gsbench.config.compose import compose_one
+from gsbench.runs.config_hash import arm_hash, config_hash
 from gsbench.scene import rules
+from gsbench.scene.load import load_scene
+from gsbench.scene.options import SceneConfig
 from gsbench.scene.rules import BY_ID, RULES, Finding, Rule, check_accept, inspect
 from gsbench.scene.types import Camera, Scene, Twins, View
 from tests.helpers import refusal
+from tests.scene.captures import read_colmap, read_photos
 
 
 def camera(place=0.0, **changes):
@@ -224,6 +230,44 @@ def test_what_is_not_usable_is_refused_unless_its_rule_is_accepted(table, caplog
     assert caplog.messages[-1].endswith("(accepted: odd)")
     with refusal("take less$"):  # what was accepted when it was stored is judged again
         rules.settle([replace(found, rule="hard")], "here", accept=("odd",))
+
+
+XMP = b'<rdf:Description GPano:ProjectionType="equirectangular"/>'
+
+
+@pytest.mark.parametrize("size, refused", [((40, 20), True), ((40, 30), False)])
+def test_panoramas_are_refused_unless_they_are_accepted(tmp_path, size, refused):
+    for number in range(4):
+        picture = Image.new("RGB", size, (60 * number, 0, 0))
+        picture.save(tmp_path / f"{number}.jpg", xmp=XMP)
+    with refusal(r"4 photographs declared as panoramas .*accept=\[panorama\]" if refused else None):
+        read_photos("toy", tmp_path)
+    capture = read_photos("toy", tmp_path, accept=["panorama"])
+    assert [(odd.rule, odd.refused) for odd in capture.oddities] == [("panorama", True)] * refused
+    with refusal("scene.accept=panoramas is no rule: .*did you mean panorama"):
+        SceneConfig("toy", "photos", path="/x", accept=["panoramas"])
+
+
+def test_prepared_views_of_an_accepted_lens_are_judged_again(make_scene, tmp_path):
+    root = make_scene(model="SIMPLE_RADIAL", params=[30, 20, 15, -0.5])
+    plain, accepting = (
+        read_colmap("toy", root, accept=accept) for accept in ([], ["lens-turns-back"])
+    )
+    scene = load_scene(accepting, accepting.model, tmp_path / "cache")
+    again = load_scene(accepting, accepting.model, tmp_path / "cache")
+    assert [odd.refused for odd in again.oddities if odd.rule == "lens-turns-back"] == [True]
+    assert again.oddities == scene.oddities
+    with refusal("turns back inside the picture"):
+        load_scene(plain, plain.model, tmp_path / "cache")
+
+
+def test_what_is_accepted_changes_no_hash_of_a_trial():
+    plain, accepting = (
+        compose_one(["scene=courtyard", *words]).values
+        for words in ([], ["scene.accept=[lens-turns-back]"])
+    )
+    assert config_hash(plain) == config_hash(accepting)
+    assert arm_hash(plain) == arm_hash(accepting)
 
 
 def test_only_known_rules_that_may_be_broken_can_be_accepted():

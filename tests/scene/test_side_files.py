@@ -48,6 +48,9 @@ def photographs(folder, pattern="{}.jpg", scale=1, seed=0, change=lambda picture
         ("depth_{}.png", 1, "…depth.png"),
         ("SYNOPHOTO_THUMB_{}.jpg", 4, "SYNO….jpg"),
         ("lowres/{}.jpg", 4, "lowres/"),
+        ("sam/{}.png", 1, "sam/"),
+        ("tn_{}.png", 4, "…tn.png"),
+        ("{}@half.jpg", 2, "…half.jpg"),
         (".thumbnails/{}.jpg", 4, ""),
     ],
 )

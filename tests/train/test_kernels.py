@@ -9,10 +9,11 @@ import pytest
 import torch
 
 from gsbench.densify import NoDensifier
+from gsbench.gaussians.trainable import ParameterState, Update
 from gsbench.raster.cpu import CpuRasterizer, executor
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.system.compile_clock import CLOCK, CompileClock
-from gsbench.train import loss_cpu, trainer
+from gsbench.train import adam_cpu, loss_cpu, trainer
 from gsbench.train.kernels import compiled_beside, kernels_of
 from gsbench.train.loss import PhotometricLoss
 from tests.raster.strategies import Case
@@ -32,7 +33,7 @@ def test_the_signatures_are_those_of_a_training_step(monkeypatch):
     for kernel, signature in kernels_of(CpuRasterizer(1)):
         name = kernel.py_func.__name__
         listed[name] = signature
-        for module in (executor, loss_cpu):
+        for module in (executor, loss_cpu, adam_cpu):
             if hasattr(module, name):
                 monkeypatch.setattr(module, name, noting(name, kernel))
     case = Case(33, 17, 30, sh_degree=1)
@@ -40,6 +41,8 @@ def test_the_signatures_are_those_of_a_training_step(monkeypatch):
     image = CpuRasterizer(1).render(gaussians, case.camera(), 1, torch.zeros(3)).image
     loss, _, _ = PhotometricLoss(threads=1)(image, torch.zeros(17, 33, 3, dtype=torch.uint8))
     loss.backward()
+    state = ParameterState(0.1, 1, {key: torch.zeros(30, 3) for key in ("first", "second")})
+    adam_cpu.CpuAdam(1)([Update(gaussians.means, gaussians.means.grad, state)])
     assert called == listed
 
 

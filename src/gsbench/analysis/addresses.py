@@ -6,7 +6,7 @@ An arm is typed as `Arm` prints it, with or without its initialiser and its sett
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, Protocol, Self
 
 from gsbench.analysis.results import Arm, TrialResult, group_by
 from gsbench.errors import InputError
@@ -21,6 +21,17 @@ CELL = (
     "'demo:courtyard:psnr:momentum[decay=0.9]'"
 )
 ARM = re.compile(r"(?P<name>[^\[\]]+)(\[(?P<settings>.*)\])?")
+
+
+class OfAnArm(Protocol):
+    """A trial, finished or planned."""
+
+    @property
+    def arm(self) -> Arm: ...
+    @property
+    def config(self) -> Mapping[str, Any]: ...
+    @property
+    def variant(self) -> tuple[tuple[str, str], ...]: ...
 
 
 @dataclass(frozen=True)
@@ -47,7 +58,7 @@ class ArmName:
         """Return whether initialiser (if given) and densifier are those of ``arm``."""
         return self.name in (f"{arm.init}-{arm.densify}", arm.densify)
 
-    def fits(self, trial: TrialResult) -> bool:
+    def fits(self, trial: OfAnArm) -> bool:
         """Return whether a trial has the name and the settings."""
         if not self.names(trial.arm):
             return False

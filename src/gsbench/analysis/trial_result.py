@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from gsbench.analysis.trial_settings import Configurations, canonical, config_if_readable
-from gsbench.runs.commands import Digest, make_digest
+from gsbench.runs.commands import Digest, make_digest, shared_hash
 from gsbench.runs.experiments import QUESTIONS, Arm, trial_key, unix_time
 from gsbench.runs.freshness import Part, code_of
 from gsbench.runs.layout import RESULTS
@@ -112,8 +112,10 @@ class TrialResult:
         if self.alias:
             return self.alias
         code = self.record.code
-        arm = f"{self.init}-{self.densify}"
-        return make_digest(arm, self.config_hash, code.sources, code.packages)
+        arm, config_hash = f"{self.init}-{self.densify}", self.config_hash
+        if self.from_renders and not self.program:
+            config_hash = shared_hash(config_hash, self.folder.settings()["densify"])
+        return make_digest(arm, config_hash, code.sources, code.packages)
 
     @property
     def asked(self) -> bool:

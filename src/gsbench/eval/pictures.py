@@ -4,8 +4,7 @@ Photographs of a capture are read by `gsbench.scene.images.read_image`. A render
 measurement, so nothing is blended or cut here, and what lowers its values is told.
 """
 
-import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,11 +16,10 @@ from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator
 from gsbench.files import DAMAGE
 from gsbench.logs import Progress, no_progress
+from gsbench.runs.trial_record import Oddity
 from gsbench.scene.images import EXIF_ORIENTATION, open_image, read_image
 from gsbench.scene.masks import read_mask
-from gsbench.words import counted, some_of
-
-log = logging.getLogger(__name__)
+from gsbench.scene.rules import ANY, Finding, Rule, at_most, settle
 
 # A view of so many pixels takes half a minute; a file of some kB may claim more.
 MAX_PIXELS = 64_000_000
@@ -87,69 +85,65 @@ def read_picture(path: Path, is_render: bool) -> NDArray[np.uint8]:
     return pixels
 
 
-@dataclass(frozen=True)
-class PictureRule:
-    """A row of `RULES`: ``applies`` to a render and its photograph; ``says`` what it means."""
-
-    id: str
-    applies: Callable[[Look, Look], bool]
-    says: str  # after the number of renders or photographs
+Looks = Sequence[tuple[str, Look, Look]]  # a view, its render, its photograph
 
 
+def _where(applies: Callable[[Look, Look], bool]) -> Callable[[Looks], Iterable[Finding]]:
+    """A measure that finds the views to whose render and photograph something ``applies``."""
+    return lambda looks: [Finding(1, [view]) for view, *both in looks if applies(*both)]
+
+
+def _row(id: str, applies: Callable[[Look, Look], bool], say: str, mend: str) -> Rule:
+    return Rule(id, "pictures", _where(applies), at_most(0), ANY, f"{say} ({{names:few}})", mend)
+
+
+# Rows of the table of rules (`gsbench.scene.rules`) about pictures; all may be measured.
 RULES = (
-    PictureRule(
+    _row(
         "transparent-render",
         lambda render, _: render.transparent,
-        "{renders} transparent pixels (alpha below 1), and the colours are measured as stored: "
+        "{count:n render} with transparent pixels (alpha below 1), whose colours are measured as "
+        "they are stored",
         "blend them over the background of the photographs first if they are not",
     ),
-    PictureRule(
+    _row(
         "lossy-render",
         lambda render, _: render.lossy,
-        "{renders} the compression of JPEG or WebP, which lowers every value: write PNG",
+        "{count:n render} compressed as JPEG or WebP, which lowers every value",
+        "write PNG",
     ),
-    PictureRule(
+    _row(
         "palette-render",
         lambda render, _: render.mode == "P",
-        "{renders} a palette of at most 256 colours, which lowers every value: write RGB",
+        "{count:n render} with a palette of at most 256 colours, which lowers every value",
+        "write RGB",
     ),
-    PictureRule(
+    _row(
         "grey-render",
         lambda render, truth: render.is_grey and not truth.is_grey,
-        "{renders} grey pixels only, and the photographs colours: are they depth maps or masks?",
+        "{count:n render} in grey, of photographs in colour",
+        "check that they are no depth maps or masks",
     ),
-    PictureRule(
+    _row(
         "turned",
         lambda render, truth: (render.orientation in UPRIGHT) != (truth.orientation in UPRIGHT),
-        "{photographs} another EXIF orientation than the renders: one of them is stored on its "
-        "side, and both are compared as stored",
+        "{count:n photograph} of another EXIF orientation than the render: one of the two is "
+        "stored on its side, and both are compared as stored",
+        "turn its pixels",
     ),
-    PictureRule(
+    _row(
         "transparent-photograph",
         lambda _, truth: truth.transparent,
-        "{photographs} transparent pixels, which are blended over black: blend them over the "
-        "background of the renders first if that is another",
+        "{count:n photograph} with transparent pixels, which are blended over black",
+        "blend them over the background of the renders first if that is another",
     ),
 )
 
 
-def find_odd_pictures(looks: Sequence[tuple[str, Look, Look]]) -> list[str]:
-    """Log and return one line for each rule that applies to some views.
-
-    ``looks`` has the name of each view and what its render and its photograph look like.
-    """
-    lines = []
-    for rule in RULES:
-        odd = [view for view, render, truth in looks if rule.applies(render, truth)]
-        if odd:
-            have = "has" if len(odd) == 1 else "have"
-            renders, photographs = (
-                f"{counted(len(odd), what)} {have}" for what in ("render", "photograph")
-            )
-            says = rule.says.format(renders=renders, photographs=photographs)
-            lines.append(f"{says} ({some_of(odd)})")
-            log.warning("%s", lines[-1])
-    return lines
+def find_odd_pictures(looks: Looks, where: str) -> tuple[Oddity, ...]:
+    """Log and return what is odd: one line for each rule that applies to some views."""
+    judged = (rule.judge(looks) for rule in RULES)
+    return settle([found for found in judged if found is not None], where)
 
 
 @dataclass(frozen=True)
@@ -162,8 +156,8 @@ class PicturePair:
     mask: Path | None = None
 
 
-def check_pairs(pairs: Sequence[PicturePair]) -> list[str]:
-    """Look at all pictures before any is measured; returns what is odd, one line a kind.
+def check_pairs(pairs: Sequence[PicturePair], where: str) -> tuple[Oddity, ...]:
+    """Look at all pictures, which are from ``where``, before any is measured: what is odd.
 
     Raises `InputError` for a picture whose size differs from its photograph's, or is too large:
     pictures are never resized.
@@ -185,7 +179,7 @@ def check_pairs(pairs: Sequence[PicturePair]) -> list[str]:
                 f"{MAX_PIXELS / 1e6:g} megapixels are not measured; render and shrink both"
             )
         looks.append((pair.view, render, truth))
-    return find_odd_pictures(looks)
+    return find_odd_pictures(looks, where)
 
 
 def measure(

@@ -116,7 +116,7 @@ def collect_renders(
         else:
             matching = match_pictures(wanted, names, "densify.by_order=true")
         looks = [(name, look_at(output / matching.pairs[name]), Look()) for name in wanted]
-        find_odd_pictures(looks)
+        find_odd_pictures(looks, str(output))
         for name, view in zip(wanted, views, strict=True):
             picture = read_picture(output / matching.pairs[name], is_render=True)  # [H, W, 3]
             (height, width), camera = picture.shape[:2], view.camera

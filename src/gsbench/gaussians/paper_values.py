@@ -6,6 +6,8 @@ from dataclasses import dataclass, fields
 from pydantic import PositiveFloat, PositiveInt
 
 VOLUME_THRESHOLD = 0.03  # V_th of arXiv 2508.05187, in cubed units of its COLMAP models
+ADAM_BETAS = (0.9, 0.999)  # torch's defaults, as in 3DGS
+ADAM_EPSILON = 1e-15  # 3DGS
 PAPER_CAP = 3_400_000  # Gaussians; the same paper has it for the baseline and for its own rule
 
 

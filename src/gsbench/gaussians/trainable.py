@@ -12,11 +12,8 @@ from torch import Tensor
 from torch.optim.adam import adam
 
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
-from gsbench.gaussians.paper_values import LearningRates
+from gsbench.gaussians.paper_values import ADAM_BETAS, ADAM_EPSILON, LearningRates
 from gsbench.words import attributes_of, no_such
-
-ADAM_BETAS = (0.9, 0.999)  # torch's defaults, as in 3DGS
-ADAM_EPSILON = 1e-15  # 3DGS
 
 
 @dataclass
@@ -38,6 +35,15 @@ class ParameterState:
     @property
     def second(self) -> Tensor:
         return self.tensors["second"]
+
+    @property
+    def factors(self) -> tuple[float, float]:
+        """Factors (a, b) of Adam's step t, which is a m / (b sqrt(v) + eps) for the moments m, v.
+
+        With m' = m / (1 - b1^t) and v' = v / (1 - b2^t), it is rate m' / (sqrt(v') + eps).
+        """
+        beta1, beta2 = ADAM_BETAS
+        return self.rate / (1 - beta1**self.step), (1 - beta2**self.step) ** -0.5
 
     def edit(self, count: int, keep: Tensor | None, added: int) -> None:
         """Keep the rows at ``keep`` [``count``] (None: all) of each tensor, then add ``added``."""
@@ -227,9 +233,16 @@ class TrainableGaussians:
                 if (own := self._own(name)) is not None:
                     own.step(parameter, parameter.grad, state.tensors, state.rate, state.step)
                 else:
-                    updates.append(Update(parameter, parameter.grad, state))
+                    active = 3 * ((sh_degree + 1) ** 2 - 1) if name == "sh_rest" else None
+                    updates.append(Update(parameter, parameter.grad, state, active))
                 parameter.grad = None
         self.step_all(updates, None, visible)
+
+    def count_step(self) -> list[ParameterState]:
+        """Count a step of all parameters, which the caller makes; return their states in order."""
+        for state in self.adam.values():
+            state.step += 1
+        return [*self.adam.values()]
 
     def advance(self, known: KnownGradients) -> list[ParameterState | None]:
         """Count a step with ``known`` gradients; return the state of each parameter to update.
@@ -314,11 +327,14 @@ class TrainableGaussians:
 def torch_adam(
     updates: Sequence[Update], seen: Tensor | None = None, visible: Tensor | None = None
 ) -> None:
-    """Apply Adam (Kingma and Ba 2015), to whole parameters by torch's fused kernel."""
+    """Apply Adam (Kingma and Ba 2015), to whole parameters by torch's fused kernel.
+
+    Gradients must be defined everywhere, as autograd's are.
+    """
     index = None if visible is None else visible.nonzero().squeeze(-1)  # [V]
     for update in updates:
-        parameter, gradient, state, active, further = update
-        if any(known is not None for known in (seen, active, further)):
+        parameter, gradient, state, _, further = update
+        if seen is not None or further is not None:
             raise NotImplementedError("torch_adam: a gradient is one tensor, defined everywhere")
         if index is not None:
             _step_rows(update, index)

@@ -15,6 +15,7 @@ from typing import Any
 from gsbench.config.compose import Trial
 from gsbench.errors import InputError
 from gsbench.eval.facts import LPIPS
+from gsbench.launch.guess import Guess, guess_training
 from gsbench.launch.states import arm_names, ask_queue, label_of, state_in_queue
 from gsbench.parsing import DamagedError
 from gsbench.runs.config_hash import determining_settings
@@ -82,6 +83,7 @@ def describe_plan(trials: Sequence[Trial], parallel: int = 1) -> list[str]:
     """Lines for ``--dry-run``: each trial with its state, and the time for the unfinished ones."""
     lines: list[str] = []
     remaining, without_estimate, learned_from = 0.0, 0, 0
+    guess: Guess | None = None  # of the last trial that no finished one is similar to
     counts: Counter[str] = Counter()
     finished = FinishedTrials(trials[0].files.runs)
     queue = ask_queue(trial.folder for trial in trials)
@@ -100,9 +102,11 @@ def describe_plan(trials: Sequence[Trial], parallel: int = 1) -> list[str]:
             seconds, known_from = finished.estimate(trial.values)
             # a stopped training goes on from its checkpoint
             done = folder.stage_and_step()[1] / max(1, trial.values["train"]["iterations"])
+            if not known_from and (found := guess_training(trial.values, parallel)):
+                seconds, guess = found.seconds, found
             remaining += seconds * (1 - min(1.0, done))
             learned_from = max(learned_from, known_from)
-            without_estimate += known_from == 0
+            without_estimate += seconds == 0
         if state == "missing" and (change := _change_since_last(trial, arms)):
             note += f"  {change}"
         counts[state] += 1
@@ -116,14 +120,14 @@ def describe_plan(trials: Sequence[Trial], parallel: int = 1) -> list[str]:
             "no estimate: no finished trial of this scene with this rasterizer tells how long "
             "one takes here"
         )
-    elif learned_from == 0:
+    elif learned_from == 0 and guess is None:
         time = "seconds, since other experiments have the results"
     else:
         at_once = f", {parallel} at once" if parallel > 1 else ""
         duration = readable_time(remaining / parallel)
-        time = (
-            f"about {duration}{at_once}, estimated from {counted(learned_from, 'finished trial')}"
-        )
+        sources = [f"estimated from {counted(learned_from, 'finished trial')}"] * (learned_from > 0)
+        sources += [str(guess)] * (guess is not None)
+        time = f"about {duration}{at_once}, {'; '.join(sources)}"
     return [*lines, f"time: {time}"]
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import yaml
 
 from gsbench.analysis.cells import with_variants
-from gsbench.analysis.quantities import COSTS, TEXTURED
+from gsbench.analysis.quantities import COSTS, TEXTURED, askable_names
 from gsbench.analysis.questions import (
     FIRST_LOOK,
     Asked,
@@ -38,6 +38,7 @@ from gsbench.runs.experiments import QUESTIONS, metric_and_question
 from gsbench.runs.layout import LEDGER, RESULTS, SEED, TUNING
 from gsbench.runs.nested import flatten
 from gsbench.settings import check_values
+from gsbench.words import did_you_mean
 
 log = logging.getLogger(__name__)
 
@@ -145,7 +146,7 @@ def asked_of(trials: Sequence[Trial], rows: Sequence[Row]) -> Asked | None:
     if not facts.direction:
         log.warning("whether more of %s is better is not known: nothing is tested", metric)
         return None
-    named = _named(values, metric)
+    named = _named(values, metric, rows)
     split = next((key for key, question in QUESTIONS.items() if question == about), "")
     return Asked(
         metric=metric,
@@ -163,7 +164,7 @@ def asked_of(trials: Sequence[Trial], rows: Sequence[Row]) -> Asked | None:
 
 
 def _named(
-    values: Mapping[str, Any], metric: str
+    values: Mapping[str, Any], metric: str, rows: Sequence[Row]
 ) -> tuple[tuple[NamedQuestion, int, LeastEffect | None], ...]:
     """The questions that the experiment's file names; raises InputError for a wrong one."""
     found = []
@@ -173,6 +174,11 @@ def _named(
             raise InputError(f"{where} must be a mapping with idea, baseline, metric, …")
         named = NamedQuestion(**check_values(NamedQuestion, entry, where))
         asked = named.metric or metric
+        known = (*askable_names(), *(values["eval"].get("extra") or {}))
+        if asked not in known:
+            raise InputError(f"{where}.metric={asked} is no metric{did_you_mean(asked, known)}")
+        for word in (named.idea, named.baseline):
+            named.rows(word, rows)  # raises unless it is one arm
         facts = None if asked in (*COSTS, TEXTURED.key) else facts_for(asked, values)
         sign = DIRECTIONS.get(named.direction, facts.direction if facts else -1)
         usual = facts.worthwhile if facts else None

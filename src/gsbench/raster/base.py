@@ -35,6 +35,14 @@ class RasterConstants:
     alpha_max: float = 0.99  # a larger alpha is clamped to it (its gradient passes, as in 3DGS)
     # a pixel stops before the Gaussian that would lower it below this
     transmittance_min: float = 1e-4
+    # Guards of gsbench's own, which change no result of 3DGS; beyond them float32 fails.
+    max_radius: float = 2.0**24  # px; keeps the radius of a huge Gaussian within int32
+    max_center: float = 1e9  # px; a Gaussian so far outside the image is culled
+    max_variance: float = 1e18  # px^2; one with a larger variance is culled: squares stay finite
+    # rounding must not lose a pixel of the contour alpha = 1/255:
+    contour_margin: float = 0.01  # px, and relative, of the box around it
+    pixel_margin: float = 0.02  # px, of a row of tiles
+    log2_alpha_margin: float = 1e-3
 
 
 CONSTANTS = RasterConstants()

@@ -19,7 +19,6 @@ from gsbench.raster.splitting import SPLITTING_MATRIX, on_image, probed
 from gsbench.raster.staged import check_inputs, make_probe
 from gsbench.scene.types import Camera
 
-MAX_RADIUS = 2**24  # px; keeps the radius of a huge Gaussian within int32
 Tile = tuple[slice, slice]  # the rows and the columns of a tile's pixels
 
 
@@ -154,7 +153,7 @@ def project(gaussians: Gaussians, camera: Camera) -> Projection:
         usable = (
             (determinant > 0) & determinant.isfinite() & radii.isfinite() & means.isfinite().all(-1)
         )
-        index, radii = index[usable], radii[usable].clamp_max(MAX_RADIUS)
+        index, radii = index[usable], radii[usable].clamp_max(CONSTANTS.max_radius)
     means, (xx, xy, yy), z = _to_image(gaussians.select(index), camera)
     conics = torch.stack([yy, -xy, xx], -1) / (xx * yy - xy * xy).unsqueeze(-1)  # [M, 3]
     return Projection(index, means, conics, z.detach(), radii)

@@ -4,6 +4,10 @@ Such a trial has only metrics and pictures: no model, no times, and an unknown n
 Tables show unknown values as missing, and say which arms were evaluated from renders.
 """
 
+import logging
+import os
+import sys
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +17,8 @@ import yaml
 from PIL import Image
 
 from gsbench.analysis.addresses import ArmName
-from gsbench.analysis.quantities import COSTS
+from gsbench.analysis.quantities import COSTS, asked_quantity
+from gsbench.analysis.questions import Asked, Row, announce, ask, rows_of
 from gsbench.analysis.results import TrialResult, read_experiment
 from gsbench.analysis.trial_settings import config_if_readable
 from gsbench.config.overrides import parse_word
@@ -24,14 +29,24 @@ from gsbench.files import atomic, file_sha256, write_text
 from gsbench.pipeline.steps.evaluate import summary_of, write_per_view
 from gsbench.pipeline.trial import versions
 from gsbench.renders.truth import ReferenceImages
+from gsbench.runs.commands import (
+    Command,
+    History,
+    append,
+    make_digest,
+    read_history,
+    shared_hash,
+)
 from gsbench.runs.keys import CODE_OF_STAGE, EVALUATE
 from gsbench.runs.layout import CONFIG, GROUND_TRUTH, IN_RUNS, MASKS, PER_VIEW, RENDERS, SEED
-from gsbench.runs.nested import sha256_of
+from gsbench.runs.nested import flatten, sha256_of
 from gsbench.runs.package_code import states_of
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS, RENDERS_ALONE, Code, TrialRecord
 from gsbench.scene.images import png_name
 from gsbench.settings import is_folder_name
+
+log = logging.getLogger(__name__)
 
 PerView = Mapping[str, Mapping[str, float]]  # values by metric, by view
 # groups of the configuration that apply to renders too
@@ -127,8 +142,12 @@ def check_destination(destination: Destination, truth: ReferenceImages, runs: Pa
             )
 
 
-def import_trial(destination: Destination, measured: Measured, runs: Path) -> Path:
+def import_trial(
+    destination: Destination, measured: Measured, runs: Path, primary: str = ""
+) -> Path:
     """Write the trial's folder and return it. The same renders always go to the same folder.
+
+    With a metric ``primary``, their question is written first.
 
     Raises `InputError` if the destination already holds other renders.
     """
@@ -158,16 +177,59 @@ def import_trial(destination: Destination, measured: Measured, runs: Path) -> Pa
                 Image.fromarray(pixels).save(temporary, format="PNG")
     write_text(folder / CONFIG, yaml.safe_dump(config, sort_keys=False))
     write_per_view(folder / PER_VIEW, measured.per_view)
-    TrialFolder(folder).write_finished(config, _results(destination, measured, identity))
+    asked = ask_about(destination, config, primary, folder) if primary else []
+    results = _results(destination, measured, identity, asked)
+    TrialFolder(folder).write_finished(config, results)
     return folder
 
 
-def _results(destination: Destination, measured: Measured, identity: str) -> TrialRecord:
+def ask_about(
+    destination: Destination, config: Mapping[str, Any], primary: str, folder: Path
+) -> list[str]:
+    """Write the question about renders, unless it was asked; returns the ids of those that cover.
+
+    It is about all scenes and seeds that the baseline has: the other renders of the method come by
+    further commands, and there is no verdict before all are there.
+    """
+    home, name = folder.parents[2], f"{destination.init}-{destination.densify}"
+    baseline = config["eval"].get("baseline") or "adc"
+    trials = read_experiment(home).trials
+    own = [t for t in trials if (t.init, t.densify) == (destination.init, baseline)]
+    this = destination.scene, destination.seed
+    places = dict.fromkeys([*((trial.scene, trial.seed) for trial in own), this])
+    config_hash = shared_hash("", config["densify"])
+    digest = make_digest(name, config_hash, {}, states_of(CODE_OF_STAGE[EVALUATE.name]))
+    flat = flatten(config)
+    planned = [
+        Row(scene, destination.init, destination.densify, config_hash, seed, flat, digest)
+        for scene, seed in places
+    ]
+    quantity = asked_quantity(primary, trials)
+    least, sign = quantity.worthwhile, quantity.direction
+    asked = Asked(metric=primary, sign=sign, least=least, baseline=baseline)
+
+    def make(history: History) -> Command | None:
+        found, _ = ask(planned, asked, rows_of(trials), history)
+        for question in found:
+            log.info("%s: %s", home.name, announce(question))
+        words, cwd = tuple(sys.argv[1:]), os.getcwd()
+        now = Command(words=words, cwd=cwd, time=time.time(), questions=tuple(found))
+        return now if found else None
+
+    append(home, make)
+    covering = read_history(home).covering(digest, *this)
+    return [question.id for question in covering]
+
+
+def _results(
+    destination: Destination, measured: Measured, identity: str, asked: list[str]
+) -> TrialRecord:
     evaluation = summary_of(measured.evaluator, measured.per_view)
     place = {name: value for name, value in vars(destination).items() if name != "settings"}
     return TrialRecord(
         status="complete",
         **place,
+        questions=asked,
         evaluated_from=FROM_RENDERS,
         raster="unknown",
         protocol=measured.evaluator.protocol.id,

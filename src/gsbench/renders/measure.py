@@ -65,7 +65,7 @@ def measure_folders(
                 PicturePair(view, path, folder / matching.pairs[view])
                 for view, path in images.photographs.items()
             ]
-            check_pairs(pairs)
+            check_pairs(pairs, str(folder))
             evaluator = _evaluator(images, None, settings)
             means = summarize(measure(pairs, evaluator), evaluator.unavailable)
             rows.append({"method": method, "scene": scene, "seed": seed} | means)
@@ -77,6 +77,7 @@ def _measure(
     options: argparse.Namespace, renders: Path, photographs: Path | None, runs: Path
 ) -> None:
     """Measure the pictures in ``renders``; ``photographs`` are used if the command names none."""
+    primary = _asked_metric(options)
     if options.truth is not None:
         truth = _reference_images(options, runs)
     elif photographs is not None:
@@ -96,7 +97,7 @@ def _measure(
         PicturePair(view, path, renders / matching.pairs[view], truth.masks.get(view))
         for view, path in truth.photographs.items()
     ]
-    notes = check_pairs(pairs)
+    odd = check_pairs(pairs, options.renders)
     torch.set_num_threads(available_threads())
     evaluator = _evaluator(truth, options.protocol, options.settings)
     with progress("evaluate") as report:
@@ -104,16 +105,36 @@ def _measure(
     source = {
         "folder": str(Path(options.renders).expanduser().resolve()),
         "names matched": matching.rule or "as they are",
-    } | ({"notes": "; ".join(notes)} if notes else {})
+    } | ({"notes": "; ".join(found.line for found in odd)} if odd else {})
     measured = Measured(truth, pairs, per_view, evaluator, source)
     folder = None
     if destination is not None:
         with storage_errors(runs):
-            folder = import_trial(destination, measured, runs)
+            folder = import_trial(destination, measured, runs, primary)
     if options.json:
         print(json.dumps(_as_dict(measured, matching, folder), indent=1))
     else:
         print("\n".join(_lines(measured, matching, folder)))
+
+
+# settings of an evaluation that renders of another program do not use
+WITHOUT_EFFECT = ("eval.at", "eval.maps", "eval.fps", "eval.controls")
+
+
+def _asked_metric(options: argparse.Namespace) -> str:
+    """The metric of the question (``eval.primary``), if it is typed, else "".
+
+    Raises InputError for settings that have no effect on renders.
+    """
+    for word in options.settings:
+        key, _, value = word.lstrip("+").partition("=")
+        if key in WITHOUT_EFFECT:
+            raise InputError(f"{word}: it has no effect on renders: leave it out")
+        if key == "eval.primary" and options.place is None:
+            raise InputError(f"{word}: a question is about a trial: add --as EXPERIMENT:ARM")
+        if key == "eval.primary":
+            return value
+    return ""
 
 
 def _reference_images(options: argparse.Namespace, runs: Path) -> ReferenceImages:

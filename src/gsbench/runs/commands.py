@@ -37,6 +37,7 @@ from gsbench.runs.keys import CODE_OF_STAGE
 from gsbench.runs.layout import COMMANDS, PLAN, SEED
 from gsbench.runs.nested import SHOWN, sha256_of
 from gsbench.runs.package_code import edited, states_of
+from gsbench.runs.trial_record import FROM_RENDERS
 from gsbench.runs.user_code import user_modules
 from gsbench.settings import ARM_BYTES, is_folder_name
 from gsbench.system.locks import hold
@@ -67,6 +68,15 @@ def make_digest(arm: str, config_hash: str, sources: Mapping[str, str], packages
     """
     code = code_digest(sources, packages)
     return f"{arm}/{config_hash}{code and '+'}{code}"
+
+
+def shared_hash(config_hash: str, densify: Mapping[str, Any]) -> str:
+    """The hash of the settings in a digest: for renders of other programs, that of their method.
+
+    Each set of pictures has a folder of its own, but all seeds are of one method.
+    """
+    is_renders = densify.get("evaluated_from") == FROM_RENDERS
+    return sha256_of(dict(densify))[:SHOWN] if is_renders else config_hash
 
 
 def code_digest(sources: Mapping[str, str], packages: Mapping[str, str]) -> str:
@@ -274,10 +284,6 @@ class History:
     def covering(self, digest: Digest, scene: str, seed: int) -> list[Question]:
         """The questions about a trial."""
         return [one for one in self.questions if one.has(digest, scene, seed)]
-
-    def gave_result(self, digest: Digest, places: Iterable[Place]) -> bool:
-        """Return whether a trial with this digest at one of these places gave a result."""
-        return any((digest, place) in self.results for place in places)
 
 
 def read_history(home: Path) -> History:

@@ -34,7 +34,7 @@ from gsbench.parsing import (
     read_yaml,
 )
 from gsbench.runs import layout
-from gsbench.runs.commands import make_digest, remember_result
+from gsbench.runs.commands import make_digest, remember_result, shared_hash
 from gsbench.runs.config_hash import config_hash
 from gsbench.runs.freshness import (
     Change,
@@ -265,7 +265,7 @@ class TrialFolder:
             finished = (self._origin and self._origin.finished) or before.st_mtime
         origin = origin_of(self.path, content, values, sources, entries or {}, published)
         origin = replace(origin, finished=finished)
-        config_hash = self.path.name.partition(layout.SEED)[0]
+        config_hash = shared_hash(self.path.name.partition(layout.SEED)[0], values["densify"])
         code = record.code
         digest = make_digest(self.path.parent.name, config_hash, code.sources, code.packages)
         remember_result(self.home, self.path, digest)

@@ -24,7 +24,8 @@ WORDS = frozenset(
     for word in (
         *("mask", "thumb", "thumbnail", "preview", *DEPTH),
         *("normal", "normalmap", "segmentation", "seg", "semantic", "instance", "label", "matte"),
-        *("annotation", "overlay", "flow", "heatmap", "render", "undistorted", "lowres"),
+        *("annotation", "overlay", "flow", "heatmap", "render", "undistorted", "lowres", "half"),
+        *("tn", "sam"),
     )
     for ending in ("", "s")
 )

@@ -49,8 +49,8 @@ class Finding(NamedTuple):
 
 # file: one file, by `given` · read: a folder with photographs · capture: as it is used
 # lens: cameras with distortion · views: that have a pose · scene: views as they are trained on
-# model: of the initialisation · cloud: before training
-Stage = Literal["file", "read", "capture", "lens", "views", "scene", "model", "cloud"]
+# model: of the initialisation · cloud: before training · pictures: renders (eval/pictures.py)
+Stage = Literal["file", "read", "capture", "lens", "views", "scene", "model", "cloud", "pictures"]
 
 
 @dataclass(frozen=True)

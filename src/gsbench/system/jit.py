@@ -29,8 +29,10 @@ PACKAGE = Path(__file__).resolve().parents[1]
 SOURCES = (
     "raster/cpu",
     "raster/base.py",
+    "raster/formulas.py",
     "raster/staged.py",
     "gaussians/model.py",
+    "gaussians/paper_values.py",
     "eval/ssim.py",
     "train/loss_cpu.py",
     "scene/courtyard",

@@ -12,7 +12,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from gsbench.gaussians.trainable import ADAM_BETAS, ADAM_EPSILON, Update
+from gsbench.gaussians.paper_values import ADAM_BETAS, ADAM_EPSILON
+from gsbench.gaussians.trainable import Update
 from gsbench.raster.staged import upload
 from gsbench.raster.triton.launch import launch
 
@@ -41,7 +42,7 @@ def adam_step(
 ):
     """Apply Adam (Kingma and Ba 2015, algorithm 1) to ``values`` [count, WIDTH], in place.
 
-    ``first`` and ``second`` are the moments, ``factors`` [2] those of `adam_factors`. The gradient
+    ``first`` and ``second`` are the moments, ``factors`` [2] `ParameterState.factors`. The gradient
     is 0 from column ``ACTIVE`` on and, if ``HAS_SEEN``, where ``seen`` [count] is 0; ``gradients``
     is not read there and may be undefined. If ``HAS_FURTHER``, ``further`` is added to it. If
     ``HAS_VISIBLE``, rows where ``visible`` [count] is 0 do not change.
@@ -67,15 +68,6 @@ def adam_step(
     tl.store(values + place, value - step, mask=inside)
 
 
-def adam_factors(rate: float, step: int) -> tuple[float, float]:
-    """The two numbers of step ``step`` (1, 2, …) that `adam_step` multiplies by.
-
-    With m' = m / (1 - b1^step) and v' = v / (1 - b2^step), the step is rate m' / (sqrt(v') + eps).
-    """
-    beta1, beta2 = ADAM_BETAS
-    return rate / (1 - beta1**step), (1 - beta2**step) ** -0.5
-
-
 class TritonAdam:
     """Adam for `TrainableGaussians` on a GPU; see `gsbench.gaussians.trainable.StepAll`."""
 
@@ -84,9 +76,7 @@ class TritonAdam:
     ) -> None:
         """Apply Adam; the host does not wait."""
         if updates:
-            numbers = [
-                x for update in updates for x in adam_factors(update.state.rate, update.state.step)
-            ]
+            numbers = [x for update in updates for x in update.state.factors]
             factors = upload(numbers, updates[0].parameter.device).view(-1, 2)
             self.launch(updates, factors, seen, visible)
 

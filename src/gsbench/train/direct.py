@@ -36,7 +36,7 @@ from gsbench.raster.triton.executor import Started, TritonFrame, TritonRasterize
 from gsbench.raster.triton.launch import Workspace
 from gsbench.raster.triton.lists import UNITS_AT_FIRST, Room, check_pairs
 from gsbench.scene.types import Camera
-from gsbench.train.adam_triton import TritonAdam, adam_factors
+from gsbench.train.adam_triton import TritonAdam
 from gsbench.train.loss_triton import TritonLoss
 
 log = logging.getLogger(__name__)
@@ -318,7 +318,7 @@ class _Plan:
         """Apply the recorded Adam with the present rates and step counts."""
         assert self.adam_graph is not None
         host = self.factors_on_host[self.adam[0].step % FACTORS_KEPT]
-        host.numpy()[:] = [adam_factors(one.rate, one.step) for one in self.adam]
+        host.numpy()[:] = [one.factors for one in self.adam]
         self.factors.copy_(host, non_blocking=True)
         self.adam_graph()
 

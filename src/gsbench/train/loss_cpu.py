@@ -255,6 +255,9 @@ class CompiledLoss:
     def __call__(self, image: Tensor, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         return _CompiledLossFunction.apply(self, image, target)
 
+    def total(self, l1: float, similarity: float) -> float:
+        return (1 - self.ssim_weight) * l1 + self.ssim_weight * (1 - similarity)
+
     def compute(
         self, image: Tensor, target: Tensor, differentiate: bool
     ) -> tuple[float, float, Tensor | None]:
@@ -308,12 +311,11 @@ class _CompiledLossFunction(torch.autograd.Function):
         ctx: Any, compiled: CompiledLoss, image: Tensor, target: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         similarity, l1, ctx.gradient = compiled.compute(image, target, ctx.needs_input_grad[1])
-        weight = compiled.ssim_weight
         l1_tensor, similarity_tensor = torch.tensor(l1), torch.tensor(similarity)
         ctx.mark_non_differentiable(l1_tensor, similarity_tensor)
         ctx.set_materialize_grads(False)
         return (
-            torch.tensor((1 - weight) * l1 + weight * (1 - similarity)),
+            torch.tensor(compiled.total(l1, similarity)),
             l1_tensor,
             similarity_tensor,
         )

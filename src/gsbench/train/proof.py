@@ -108,9 +108,9 @@ def prove(
         broken.append(f"{type(error).__name__}: {reason}")
     failures = [str(error) for error in errors if error.is_departure] + broken
     largest: dict[str, float] = {}
-    for error in errors:
-        if math.isfinite(error.off):
-            largest[error.quantity] = max(largest.get(error.quantity, 0.0), error.off)
+    for found in errors:
+        if math.isfinite(found.off):
+            largest[found.quantity] = max(largest.get(found.quantity, 0.0), found.off)
     return RasterProof(
         raster=rasterizer.name,
         device=_device_name(device),

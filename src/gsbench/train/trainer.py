@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from gsbench.densify import Densifier, DensifyContext, NoDensifier
+from gsbench.densify import Densifier, DensifyContext, NoDensifier, Refinement
 from gsbench.errors import InputError, TrainingError
 from gsbench.eval.images import as_unit_range, replace_ignored
 from gsbench.events import FEWEST_ROUNDS, RefineEvent, few_rounds
@@ -47,6 +47,7 @@ from gsbench.train.resolution import Resolution, ScaledViews
 from gsbench.train.views import CameraOrder, SceneViews, Targets, generators
 
 if TYPE_CHECKING:
+    from gsbench.train.adam_cpu import FusedStep
     from gsbench.train.direct import DirectStep
 
 log = logging.getLogger(__name__)
@@ -107,8 +108,10 @@ class Trainer:
         self.background = torch.tensor(color, dtype=torch.float32, device=self.device)  # [3]
         self.loss = PhotometricLoss(options.ssim_weight, torch.get_num_threads())
         self.direct, step_all = fast_steps(rasterizer, self.loss, options, self.background)
+        self.fused = fused_step(rasterizer, self.loss, options, self.background)
+        self.stepped = False  # whether the fused step of this iteration has applied Adam
         if ideas.reads_renders or ideas.optimizer is not None or self.needs_depth:
-            self.direct = None  # such parts need autograd
+            self.direct = self.fused = None  # such parts need autograd
         self.gaussians = TrainableGaussians(
             initial, options, scene.extent, step_all, ideas.optimizer
         )
@@ -272,6 +275,11 @@ class Trainer:
                 regularizer,
             )
             return step.render, step.losses
+        free = self.fused is not None and regularizer is None and mask is None
+        self.stepped = free and self._nobody_looks()
+        if self.fused is not None and self.stepped:
+            wanted = self.densifier.needs_absolute_gradient
+            return self.fused(self.gaussians, cameras[index], target, self.sh_degree, wanted)
         render = self.render(index)
         depth_points = self._add_depth(render, cameras[index]) if self.needs_depth else None
         total, scalars = self._loss(render, index, replace_ignored(render.image, target, mask))
@@ -377,7 +385,24 @@ class Trainer:
         """The divisor of the sides of pictures in the current iteration."""
         return 1 if self.resolution is None else self.resolution.scale(self.step)
 
+    def _nobody_looks(self) -> bool:
+        """Return whether nothing sees the model between the backward pass and Adam.
+
+        Only gsbench's own densifiers are known to look at it in no other way than these.
+        """
+        densifier, step = self.densifier, self.step
+        if not type(densifier).__module__.startswith("gsbench."):
+            return False
+        if step == self.options.iterations or step in self.snapshot_at:
+            return False
+        if self.shows_view or densifier.needs_footprint or densifier.needs_extra is not None:
+            return False
+        event = RefineEvent(step=step, before=len(self.gaussians))
+        return not densifier.rules(Refinement(step, self.gaussians, self.rngs["densify"], event))
+
     def _optimize(self, render: RenderOutput) -> None:
+        if self.stepped:
+            return
         if self.direct is not None:
             self.direct.optimize(self.gaussians)
             return
@@ -443,8 +468,12 @@ def snapshot_file(step: int) -> str:
 def fast_steps(
     rasterizer: Rasterizer, loss: PhotometricLoss, options: TrainConfig, background: Tensor
 ) -> tuple["DirectStep | None", StepAll | None]:
-    """Make direct steps, if they can be used, and Adam for a GPU with Triton; None without."""
+    """Make direct steps for a GPU, if they can be used, and compiled Adam; None without."""
     device = background.device
+    if device.type == "cpu":
+        from gsbench.train.adam_cpu import CpuAdam
+
+        return None, CpuAdam(torch.get_num_threads())
     if device.type != "cuda" or find_executor("triton").obstacle(device.type) is not None:
         return None, None
     # They import Triton.
@@ -462,6 +491,23 @@ def fast_steps(
         visible_only = options.visible_adam
         direct = DirectStep(rasterizer, kernels, background, graphs=True, visible_only=visible_only)
     return direct, TritonAdam()
+
+
+def fused_step(
+    rasterizer: Rasterizer, loss: PhotometricLoss, options: TrainConfig, background: Tensor
+) -> "FusedStep | None":
+    """Make fused steps for the CPU, if rasterizer, loss and Adam are those that can be fused."""
+    if background.device.type != "cpu" or options.visible_adam:
+        return None
+    from gsbench.raster.cpu import CpuRasterizer
+    from gsbench.train.adam_cpu import FusedStep
+    from gsbench.train.loss_cpu import CompiledLoss
+
+    kernels = loss.implementation("cpu")
+    # a user's subclass may render otherwise
+    if type(rasterizer) is not CpuRasterizer or not isinstance(kernels, CompiledLoss):
+        return None
+    return FusedStep(rasterizer, kernels, background)
 
 
 def sh_degree_at(options: TrainConfig, step: int) -> int:

@@ -10,13 +10,12 @@ import math
 
 import numpy as np
 
+from gsbench.raster.base import CONSTANTS
 from gsbench.raster.cpu import layout as at
 from gsbench.raster.cpu.simd import prefetch
 from gsbench.system.jit import inlined, kernel
 
-# Margins for float32 rounding: it must not lose a pixel of the contour.
-LOG2_ALPHA_MIN_MARGIN = 1e-3  # of log2(alpha)
-PIXEL_MARGIN = 0.02  # px
+LOG2_ALPHA_MIN_MARGIN, PIXEL_MARGIN = CONSTANTS.log2_alpha_margin, CONSTANTS.pixel_margin
 LOW_WORD = np.uint64(0xFFFFFFFF)  # the bits of a key that hold the record
 AHEAD = 12  # records ahead that are prefetched
 TILE_WORK = 16  # fixed work of a tile, in list entries

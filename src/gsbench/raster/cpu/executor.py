@@ -101,7 +101,7 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         record_ints = records.view(np.int32)
         keys = arena.take("keys", (count,), np.uint64)
         flags = np.zeros((GAUSSIAN_SHARDS, 2), np.int64)
-        edges, arrays = _edges(count), _arrays(gaussians)
+        edges, arrays = _edges(count), parameter_arrays(gaussians)
         projected = (records, record_ints, keys, radii.numpy(), flags)
 
         def project(first: int, past: int) -> None:
@@ -194,60 +194,90 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         g_alpha: Tensor | None,
     ) -> Gradients:
         """See `StagedRasterizer`."""
+        gradients = gaussians.map(lambda tensor: self._tensors.empty(tuple(tensor.shape)))
+        g_screen, g_extra = self._backward(
+            passed, gaussians, request, (g_image, g_alpha), gradients, at.NO_STEP
+        )
+        return Gradients(list(gradients.tensors().values()), g_screen, g_extra)
+
+    def backward_and_step(
+        self,
+        passed: ForwardPass,
+        gaussians: Gaussians,
+        request: RenderRequest,
+        g_image: Tensor,
+        adam: at.AdamStep,
+    ) -> Tensor:
+        """Apply Adam in place of writing the gradients; return those by the screen points [N, 2].
+
+        Parameters and moments get the same bits as by `backward` and `train.adam_cpu`.
+        """
+        g_screen, _ = self._backward(passed, gaussians, request, (g_image, None), None, adam)
+        return g_screen
+
+    def _backward(
+        self,
+        passed: ForwardPass,
+        gaussians: Gaussians,
+        request: RenderRequest,
+        g_pixels: tuple[Tensor, Tensor | None],
+        gradients: Gaussians | None,
+        adam: at.AdamStep,
+    ) -> tuple[Tensor, Tensor | None]:
+        """Fill ``gradients``, or step by ``adam``; return the screen gradient and the extra output.
+
+        ``g_pixels`` are the gradients by the image and by alpha. ``request.absolute`` is filled.
+        """
         lifetime = Lifetime()
         arena = self._scratch.lease(lifetime)
-        rows = arena.take("rows", (TILE_SHARDS, len(gaussians) * at.ROW), np.float32, zero=True)
-        g_pixels = g_image.numpy().reshape(-1)
-        g_alphas = np.empty(0, np.float32) if g_alpha is None else g_alpha.numpy().reshape(-1)
+        count, take = len(gaussians), self._tensors.empty
+        rows = arena.take("rows", (TILE_SHARDS, count * at.ROW), np.float32, zero=True)
+        g_image, g_alpha = (
+            np.empty(0, np.float32) if given is None else given.numpy().reshape(-1)
+            for given in g_pixels
+        )
         want_absolute = None if request.absolute is None else True
 
         def composite_backward(first: int, past: int) -> None:
             composite_backward_tiles(
-                *_tiles(passed.frame, first, past), g_pixels, g_alphas, rows, want_absolute
+                *_tiles(passed.frame, first, past), g_image, g_alpha, rows, want_absolute
+            )
+
+        g_screen = take((count, 2))
+        shape = self.extras[request.extra] if request.extra else ()
+        g_extra = take((count, *shape)) if shape else None
+        of_pixels = (
+            g_screen.numpy(),
+            _rows_or_none(request.absolute, 2),
+            _rows_or_none(g_extra, math.prod(shape)),
+        )
+        inputs = (
+            _edges(count),
+            passed.visible,
+            parameter_arrays(gaussians),
+            request.degree,
+            passed.frame,
+        )
+
+        def backproject(first: int, past: int) -> None:
+            own = (
+                parameter_arrays(gradients)
+                if gradients is not None
+                else at.new_parameters(at.CHUNK)
+            )
+            backproject_shards(
+                at.kernel_memory(), first, past, *inputs, rows.reshape(-1), (own, *of_pixels), adam
             )
 
         try:
             self._runner.run(TILE_SHARDS, composite_backward)
-            return self._backproject(passed, gaussians, request, rows)
+            self._runner.run(GAUSSIAN_SHARDS, backproject)
         except BaseException:
             # The kernels need rows of zeros and clear them after use; an interrupt may have left
             # sums in them.
             arena.drop("rows")
             raise
-
-    def _backproject(
-        self,
-        passed: ForwardPass,
-        gaussians: Gaussians,
-        request: RenderRequest,
-        rows: NDArray[np.float32],
-    ) -> Gradients:
-        """Compute all gradients from the gradient sums in ``rows``; fill ``request.absolute``."""
-        count, take = len(gaussians), self._tensors.empty
-        gradients = gaussians.map(lambda tensor: take(tuple(tensor.shape)))
-        g_screen = take((count, 2))
-        shape = self.extras[request.extra] if request.extra else ()
-        g_extra = take((count, *shape)) if shape else None
-        arguments = (
-            _edges(count),
-            passed.visible,
-            _arrays(gaussians),
-            request.degree,
-            passed.frame,
-            rows.reshape(-1),
-            (
-                _arrays(gradients),
-                g_screen.numpy(),
-                _rows_or_none(request.absolute, 2),
-                _rows_or_none(g_extra, math.prod(shape)),
-            ),
-        )
-
-        def backproject(first: int, past: int) -> None:
-            backproject_shards(at.kernel_memory(), first, past, *arguments)
-
-        self._runner.run(GAUSSIAN_SHARDS, backproject)
-        return Gradients(list(gradients.tensors().values()), g_screen, g_extra)
+        return g_screen, g_extra
 
     def footprint(
         self,
@@ -297,7 +327,8 @@ def _flat(tensor: Tensor, columns: int) -> NDArray[np.float32]:
     return tensor.numpy().reshape(-1, columns)
 
 
-def _arrays(gaussians: Gaussians) -> at.Parameters:
+def parameter_arrays(gaussians: Gaussians) -> at.Parameters:
+    """The tensors of ``gaussians`` as kernels take them."""
     means, log_scales, quaternions, logits, sh_dc, sh_rest = (
         t.detach().numpy() for t in gaussians.tensors().values()
     )

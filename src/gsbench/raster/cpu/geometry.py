@@ -1,7 +1,6 @@
-"""Projection geometry and spherical harmonics for 16 Gaussians at a time, float32, for both passes.
+"""Access to 16 Gaussians at a time, their spherical harmonics, and the formulas for vectors.
 
-Matrices are tuples of rows, and vectors are tuples. No formula subtracts large numbers (see
-``spread``). The harmonics of 16 Gaussians are a 16x16 matrix with one row per basis function. The
+The harmonics of 16 Gaussians are a 16x16 matrix with one row per basis function. The
 kernels transpose it into one row per Gaussian and multiply that by the coefficients.
 """
 
@@ -10,7 +9,7 @@ import math
 import numpy as np
 
 from gsbench.gaussians.model import C0, C1, C2, C3
-from gsbench.raster.base import CONSTANTS
+from gsbench.raster import formulas
 from gsbench.raster.cpu.shuffle import transpose
 from gsbench.raster.cpu.simd import (
     LANES,
@@ -20,6 +19,7 @@ from gsbench.raster.cpu.simd import (
     maximum,
     minimum,
     scatter,
+    select,
     splat,
     square_root,
     store,
@@ -27,7 +27,6 @@ from gsbench.raster.cpu.simd import (
 from gsbench.system.jit import inlined
 
 LOG2_E = 1.0 / math.log(2.0)
-BLUR = CONSTANTS.blur
 # Beyond this, exp2 is undefined. The variance of a scale of 2^126 is not finite, so such a Gaussian
 # is culled.
 MAX_LOG2 = 126.0
@@ -39,100 +38,15 @@ ZERO = np.float32(0)
 MATRIX = LANES * LANES
 
 
+OF_VECTORS = formulas.compiled(
+    inlined, select=select, minimum=minimum, maximum=maximum, square_root=square_root
+)
+dot, stretched = OF_VECTORS.dot, OF_VECTORS.stretched
+
+
 @inlined
 def exponential(x):
     return exp2(maximum(minimum(x * LOG2_E, MAX_LOG2), -MAX_LOG2))
-
-
-@inlined
-def dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@inlined
-def times(row, matrix):
-    """``row`` [3] times ``matrix`` [3, 3]."""
-    return (
-        row[0] * matrix[0][0] + row[1] * matrix[1][0] + row[2] * matrix[2][0],
-        row[0] * matrix[0][1] + row[1] * matrix[1][1] + row[2] * matrix[2][1],
-        row[0] * matrix[0][2] + row[1] * matrix[1][2] + row[2] * matrix[2][2],
-    )
-
-
-@inlined
-def through(matrix, column):
-    """``matrix`` [3, 3] times ``column`` [3]."""
-    return dot(column, matrix[0]), dot(column, matrix[1]), dot(column, matrix[2])
-
-
-@inlined
-def scaled(row, scales):
-    return row[0] * scales[0], row[1] * scales[1], row[2] * scales[2]
-
-
-@inlined
-def stretched(row, factor):
-    return row[0] * factor, row[1] * factor, row[2] * factor
-
-
-@inlined
-def plus(a, factor, b):
-    """``a + factor * b`` of two vectors [3]."""
-    return a[0] + factor * b[0], a[1] + factor * b[1], a[2] + factor * b[2]
-
-
-@inlined
-def mixed(p, a, q, b):
-    """``p * a + q * b`` of two vectors [3]."""
-    return p * a[0] + q * b[0], p * a[1] + q * b[1], p * a[2] + q * b[2]
-
-
-@inlined
-def rotation_matrix(quaternion):
-    """The rows of the rotation matrix of a unit quaternion (w, x, y, z)."""
-    w, x, y, z = quaternion
-    return (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-
-
-@inlined
-def view_axes(v):
-    """The rows of the camera's rotation W, from world to view."""
-    return (v.r00, v.r01, v.r02), (v.r10, v.r11, v.r12), (v.r20, v.r21, v.r22)
-
-
-@inlined
-def from_camera(mean, v):
-    """The vector from the camera centre to the mean, in world axes.
-
-    The difference is computed before the rotation, so no digits are lost even if the scene is far
-    from the origin.
-    """
-    return mean[0] - v.center_x, mean[1] - v.center_y, mean[2] - v.center_z
-
-
-@inlined
-def clamped_slopes(slope_x, slope_y, v):
-    """x/z and y/z within the limits of the Jacobian (`raster.base.slope_limits`)."""
-    return (
-        minimum(maximum(slope_x, v.slope_x_min), v.slope_x_max),
-        minimum(maximum(slope_y, v.slope_y_min), v.slope_y_max),
-    )
-
-
-@inlined
-def image_rows(slope_x, slope_y, inverse_z, v):
-    """A = J W, the derivative of the pixel by the world position, as two rows.
-
-    J is the derivative of x fx / z and y fy / z by the position in view space, at the slopes x/z
-    and y/z (EWA splatting, Zwicker et al. 2001; computeCov2D in 3DGS).
-    """
-    right, down, ahead = view_axes(v)
-    first = stretched(plus(right, -slope_x, ahead), inverse_z * v.fx)
-    return first, stretched(plus(down, -slope_y, ahead), inverse_z * v.fy)
 
 
 @inlined
@@ -160,25 +74,6 @@ def gather_quaternions(quaternions, indices):
     squared = w * w + x * x + y * y + z * z
     inverse = 1 / square_root(squared)
     return (w * inverse, x * inverse, y * inverse, z * inverse), inverse, squared
-
-
-@inlined
-def spread(m0, m1):
-    """xx, xy, yy of the covariance C = M M^T + BLUR I, for the rows of M; and a = yy / det C.
-
-    1/a is the variance of x given y. det(M M^T) is the squared cross product of the rows. Dividing
-    one row by sqrt(yy) first gives 1/a without cancellation and overflow.
-    """
-    xx, xy, yy = dot(m0, m0), dot(m0, m1), dot(m1, m1) + BLUR
-    inverse = 1 / square_root(yy)
-    n1 = stretched(m1, inverse)
-    cross = (
-        m0[1] * n1[2] - m0[2] * n1[1],
-        m0[2] * n1[0] - m0[0] * n1[2],
-        m0[0] * n1[1] - m0[1] * n1[0],
-    )
-    given = dot(cross, cross) + BLUR * (xx + yy) / yy
-    return xx + BLUR, xy, yy, 1 / given
 
 
 @inlined

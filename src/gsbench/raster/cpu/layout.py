@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbench.raster.base import CameraNumbers
+from gsbench.raster.cpu.shuffle import REST
 from gsbench.raster.cpu.simd import LANES, SUM_LANES
 
 # px; a tile is 4x4 blocks, row by row. Fixed by the 16-bit masks; must equal RasterConstants.tile
@@ -56,6 +57,30 @@ class Parameters(NamedTuple):
     logits: NDArray[np.float32]  # [N, 1]
     sh_dc: NDArray[np.float32]  # [N, 3]
     sh_rest: NDArray[np.float32]  # [N, 45]
+
+
+COLUMNS = (3, 3, 4, 1, 3, REST)  # of `Parameters`
+
+
+CHUNK = 512  # Gaussians whose gradients, 120 kB, stay in the cache until Adam reads them
+
+
+def new_parameters(count: int) -> Parameters:
+    """Uninitialised arrays for ``count`` Gaussians."""
+    return Parameters(*(np.empty((count, columns), np.float32) for columns in COLUMNS))
+
+
+class AdamStep(NamedTuple):
+    """What Adam needs besides parameters and gradients, which are those of one step."""
+
+    first: Parameters  # moments
+    second: Parameters
+    # [6, 2] of each parameter, `ParameterState.factors`; [0, 2]: no step
+    factors: NDArray[np.float32]
+    active: int  # columns of ``sh_rest`` that can have a gradient
+
+
+NO_STEP = AdamStep(new_parameters(0), new_parameters(0), np.empty((0, 2), np.float32), 0)
 
 
 class CpuFrame(NamedTuple):

@@ -10,31 +10,20 @@ import numpy as np
 
 from gsbench.raster.base import CONSTANTS
 from gsbench.raster.cpu import layout as at
+from gsbench.raster.cpu.adam import step_all
 from gsbench.raster.cpu.geometry import (
     F0,
     LOG2_E,
     MATRIX,
-    clamped_slopes,
+    OF_VECTORS,
     direction_gradient,
-    dot,
     exponential,
     exponentials,
     fill_basis,
-    from_camera,
     gather_quaternions,
     gather_vectors,
-    image_rows,
-    mixed,
     normalized,
-    plus,
-    rotation_matrix,
-    scaled,
     scatter_vectors,
-    spread,
-    stretched,
-    through,
-    times,
-    view_axes,
 )
 from gsbench.raster.cpu.shuffle import (
     REST,
@@ -70,13 +59,27 @@ from gsbench.raster.cpu.splitting import scatter_splitting
 from gsbench.raster.staged import MIN_QUATERNION_NORM
 from gsbench.system.jit import inlined, kernel
 
+clamped_slopes, image_rows, view_axes = (
+    OF_VECTORS.clamped_slopes,
+    OF_VECTORS.image_rows,
+    OF_VECTORS.view_axes,
+)
+dot, plus, scaled, stretched = (
+    OF_VECTORS.dot,
+    OF_VECTORS.plus,
+    OF_VECTORS.scaled,
+    OF_VECTORS.stretched,
+)
+from_camera, through, times = OF_VECTORS.from_camera, OF_VECTORS.through, OF_VECTORS.times
+rotation_matrix, spread = OF_VECTORS.rotation_matrix, OF_VECTORS.spread
+covariance_gradients = OF_VECTORS.covariance_gradients
+position_gradient = OF_VECTORS.position_gradient
+quaternion_gradient = OF_VECTORS.quaternion_gradient
+
 NEAR, SIGMA_EXTENT = CONSTANTS.near, CONSTANTS.sigma_extent
 ALPHA_MIN, LOG2_ALPHA_MIN = CONSTANTS.alpha_min, math.log2(CONSTANTS.alpha_min)
-MAX_RADIUS = 2.0**24  # px; keeps the radius of a huge Gaussian within int32
-MAX_CENTER = 1e9  # px; so far outside the image, float32 cannot resolve a pixel
-MAX_VARIANCE = 1e18  # px^2; the same for standard deviations; also keeps squares finite
-# px, and relative: rounding must not lose a pixel of the contour alpha = 1/255
-CONTOUR_MARGIN = 0.01
+MAX_RADIUS, MAX_CENTER = CONSTANTS.max_radius, CONSTANTS.max_center
+MAX_VARIANCE, CONTOUR_MARGIN = CONSTANTS.max_variance, CONSTANTS.contour_margin
 ZERO, HALF, ONE, TWO, FOUR = (np.float32(value) for value in (0, 0.5, 1, 2, 4))
 
 AHEAD = 16  # records ahead that the backward pass prefetches
@@ -309,7 +312,7 @@ def _take_rows(record, count, past, v, record_ints, tile_shard, rows, indices, s
 
 @kernel
 def backproject_shards(
-    memory, first, past, edges, visible, gaussians, degree, frame, rows, outputs
+    memory, first, past, edges, visible, gaussians, degree, frame, rows, outputs, adam
 ):
     """Write the gradients of the shards ``first`` to ``past`` and clear their ``rows``.
 
@@ -317,30 +320,52 @@ def backproject_shards(
     records. ``rows`` is [shards of tiles * N * 16]. ``outputs`` are the gradients by the
     parameters, by the screen points [N, 2], the absolute ones [N, 2] and the extra output
     [N, C]; the last two are empty if not requested.
+
+    If ``adam`` has factors, the parameters are stepped, too, `layout.CHUNK` Gaussians at a time.
+    The gradients by the parameters then have the rows of one chunk only, which stay in the cache.
     """
+    steps = len(adam.factors) > 0
     for shard in range(first, past):
         begin, end = edges[shard], edges[shard + 1]
-        _clear_unseen(begin, end, visible[shard], frame.record_ints, outputs)
-        for record in range(begin, begin + visible[shard], LANES):
-            _backproject(
-                memory, record, begin + visible[shard], gaussians, degree, frame, rows, outputs
-            )
+        record, last = begin, begin + visible[shard]
+        for start in range(begin, end, at.CHUNK):
+            stop, origin = min(start + at.CHUNK, end), start if steps else 0
+            past_record = record
+            while past_record < last and _gaussian(frame.record_ints, past_record) < stop:
+                past_record += 1
+            _clear_unseen(start, stop, origin, record, past_record, frame.record_ints, outputs)
+            for sixteen in range(record, past_record, LANES):
+                _backproject(
+                    memory, sixteen, past_record, origin, gaussians, degree, frame, rows, outputs
+                )
+            record = past_record
+            if steps:
+                step_all(gaussians, adam, outputs[0], start, stop, memory[0])
 
 
 @inlined
-def _clear_unseen(begin, end, visible, record_ints, outputs):
-    """Set the gradients of a shard's Gaussians without a record to 0."""
+def _gaussian(record_ints, record):
+    return record_ints[record * at.RECORD + at.INDEX]
+
+
+@inlined
+def _clear_unseen(begin, end, origin, record, past_record, record_ints, outputs):
+    """Set the gradients of the Gaussians from ``begin`` to ``end`` without a record to 0.
+
+    Those with one have the records ``record`` to before ``past_record``. Row 0 of the gradients by
+    the parameters is that of the Gaussian ``origin``.
+    """
     gradients, g_screen, g_absolute, g_extra = outputs
     unseen = begin  # the first Gaussian whose gradients are not written yet
-    for record in range(begin, begin + visible + 1):
-        past = end if record == begin + visible else record_ints[record * at.RECORD + at.INDEX]
+    for own in range(record, past_record + 1):
+        past = end if own == past_record else _gaussian(record_ints, own)
         if past > unseen:
-            _clear(gradients.means, unseen, past)
-            _clear(gradients.log_scales, unseen, past)
-            _clear(gradients.quaternions, unseen, past)
-            _clear(gradients.logits, unseen, past)
-            _clear(gradients.sh_dc, unseen, past)
-            _clear(gradients.sh_rest, unseen, past)
+            _clear(gradients.means, unseen - origin, past - origin)
+            _clear(gradients.log_scales, unseen - origin, past - origin)
+            _clear(gradients.quaternions, unseen - origin, past - origin)
+            _clear(gradients.logits, unseen - origin, past - origin)
+            _clear(gradients.sh_dc, unseen - origin, past - origin)
+            _clear(gradients.sh_rest, unseen - origin, past - origin)
             _clear(g_screen, unseen, past)
             if len(g_absolute) > 0:
                 _clear(g_absolute, unseen, past)
@@ -350,14 +375,20 @@ def _clear_unseen(begin, end, visible, record_ints, outputs):
 
 
 @inlined
-def _backproject(memory, record, past, gaussians, degree, frame, rows, outputs):
-    """Write the gradients of up to 16 Gaussians: those of the records ``record`` to ``past``."""
+def _backproject(memory, record, past, origin, gaussians, degree, frame, rows, outputs):
+    """Write the gradients of up to 16 Gaussians: those of the records ``record`` to ``past``.
+
+    Row 0 of the gradients by the parameters is that of the Gaussian ``origin``.
+    """
     gradients, g_screen, g_absolute, g_extra = outputs
     v, record_ints = frame.camera, frame.record_ints
     floats, indices = memory
+    own = indices[LANES:]  # rows of the gradients by the parameters
     sums, colors = floats[:MATRIX], floats[3 * MATRIX :]
     count = min(LANES, past - record)
     _take_rows(record, count, past, v, record_ints, frame.tile_shard, rows, indices, sums)
+    for lane in range(LANES):
+        own[lane] = indices[lane] - origin
     mean = gather_vectors(gaussians.means, indices)
     log_scale = gather_vectors(gaussians.log_scales, indices)
     offset = from_camera(mean, v)
@@ -365,9 +396,9 @@ def _backproject(memory, record, past, gaussians, degree, frame, rows, outputs):
     # Colour. A channel below 0 was clamped and has no gradient.
     to, inverse_distance = normalized(offset)
     rgb = _unclamped(record, count, record_ints, sums, colors)
-    scatter_vectors(gradients.sh_dc, indices, stretched(rgb, F0))
+    scatter_vectors(gradients.sh_dc, own, stretched(rgb, F0))
     turned = _backproject_harmonics(
-        degree, to, indices, gaussians.sh_rest, gradients.sh_rest, floats[MATRIX:]
+        degree, to, indices, own, gaussians.sh_rest, gradients.sh_rest, floats[MATRIX:]
     )
 
     # Repeat the geometry of the forward pass.
@@ -394,9 +425,6 @@ def _backproject(memory, record, past, gaussians, degree, frame, rows, outputs):
         scatter(g_absolute, indices, 2, 0, absolute_t * half_width)
         scatter(g_absolute, indices, 2, 1, load(sums, at.SUM_ABS_Y * LANES) * half_height)
 
-    # Covariance: M = N S and N = A R. d loss / d M = U^T Q U M with Q = D G D, D = diag(a, e),
-    # U = [[1, shear], [0, 1]] and G the second moments of h over (t, dy). For a needle the
-    # first row of U M is small, so U N is computed first, before large numbers can cancel.
     q00 = a * a * load(sums, at.SUM_H_TT * LANES)
     q01 = a * e * load(sums, at.SUM_H_TY * LANES)
     q11 = e * e * load(sums, at.SUM_H_YY * LANES)
@@ -404,68 +432,29 @@ def _backproject(memory, record, past, gaussians, degree, frame, rows, outputs):
     if len(g_extra) > 0:
         free = image_rows(free_x, free_y, inverse_z, v)
         scatter_splitting(g_extra, indices, q00 - a * h, q01, q11 - e * h, shear, free)
-    u0 = plus(n0, shear, n1)
-    g0, g1 = mixed(q00, u0, q01, n1), mixed(q01, u0, q11, n1)
-    variances = scaled(scales, scales)
-    along = (
-        u0[0] * g0[0] + n1[0] * g1[0],
-        u0[1] * g0[1] + n1[1] * g1[1],
-        u0[2] * g0[2] + n1[2] * g1[2],
-    )
-    scatter_vectors(gradients.log_scales, indices, scaled(along, variances))
-
-    # Rotation by small angles w about the Gaussian's own axes changes R S^2 R^T by a
-    # commutator, so the gradient by w has differences of variances as factors. Computing these
-    # differences first makes the gradient of a sphere exactly 0; otherwise rounding errors
-    # would remain, which Adam scales to full steps. The quaternion changes by q (0, w) / 2.
-    w_x = (u0[1] * g0[2] + n1[1] * g1[2]) * _difference(scales[1], scales[2])
-    w_y = (u0[2] * g0[0] + n1[2] * g1[0]) * _difference(scales[2], scales[0])
-    w_z = (u0[0] * g0[1] + n1[0] * g1[1]) * _difference(scales[0], scales[1])
-    qw, qx, qy, qz = quaternion
-    twice = inverse_norm + inverse_norm
-    g_quaternions = gradients.quaternions
-    scatter(g_quaternions, indices, 4, 0, -(qx * w_x + qy * w_y + qz * w_z) * twice)
-    scatter(g_quaternions, indices, 4, 1, (qw * w_x + qy * w_z - qz * w_y) * twice)
-    scatter(g_quaternions, indices, 4, 2, (qw * w_y + qz * w_x - qx * w_z) * twice)
-    scatter(g_quaternions, indices, 4, 3, (qw * w_z + qx * w_y - qy * w_x) * twice)
+    g_scales, turn, s0, s1 = covariance_gradients(q00, q01, q11, n0, n1, shear, scales)
+    scatter_vectors(gradients.log_scales, own, g_scales)
+    g_quaternion = quaternion_gradient(quaternion, turn, inverse_norm + inverse_norm)
+    scatter(gradients.quaternions, own, 4, 0, g_quaternion[0])
+    scatter(gradients.quaternions, own, 4, 1, g_quaternion[1])
+    scatter(gradients.quaternions, own, 4, 2, g_quaternion[2])
+    scatter(gradients.quaternions, own, 4, 3, g_quaternion[3])
 
     # Mean: through A = J W and the position on the image, and through the view direction of the
     # colour, whose gradient is projected to the tangent of the sphere.
-    s0 = scaled(g0, variances)
-    a0, a1 = through(matrix, s0), through(matrix, plus(scaled(g1, variances), shear, s0))
-    position = _position_gradient(a0, a1, g_column, g_row, free_x, free_y, inverse_z, v)
+    a0, a1 = through(matrix, s0), through(matrix, s1)
+    position = position_gradient(a0, a1, g_column, g_row, free_x, free_y, inverse_z, v)
     tangent = stretched(plus(turned, -dot(turned, to), to), inverse_distance)
-    scatter_vectors(gradients.means, indices, plus(position, ONE, tangent))
+    scatter_vectors(gradients.means, own, plus(position, ONE, tangent))
 
     # d log(alpha) / d logit = 1 - opacity
     growth = exponential(gather(gaussians.logits, indices, 1, 0)) + ONE
-    scatter(gradients.logits, indices, 1, 0, h / growth)
+    scatter(gradients.logits, own, 1, 0, h / growth)
 
 
 @inlined
-def _position_gradient(a0, a1, g_column, g_row, free_x, free_y, inverse_z, v):
-    """The gradient by the mean, in world axes, through the covariance and the place on the image.
-
-    ``a0`` and ``a1`` are the gradients by the rows of A = J W. From them follow those by the
-    entries of J, then by the position in view space, then by the position in the world.
-    """
-    right, down, ahead = view_axes(v)
-    slope_x, slope_y = clamped_slopes(free_x, free_y, v)
-    j00, j02, j11, j12 = dot(a0, right), dot(a0, ahead), dot(a1, down), dot(a1, ahead)
-    fx_z, fy_z = inverse_z * v.fx, inverse_z * v.fy
-    # The clamp of a slope passes the gradient only within the limits.
-    g_slope_x = select((free_x >= v.slope_x_min) & (free_x <= v.slope_x_max), -fx_z * j02, ZERO)
-    g_slope_y = select((free_y >= v.slope_y_min) & (free_y <= v.slope_y_max), -fy_z * j12, ZERO)
-    view_x = g_column * fx_z + g_slope_x * inverse_z
-    view_y = g_row * fy_z + g_slope_y * inverse_z
-    by_focal = fx_z * (j00 - slope_x * j02) + fy_z * (j11 - slope_y * j12)
-    view_z = -(by_focal * inverse_z + view_x * free_x + view_y * free_y)
-    return times((view_x, view_y, view_z), (right, down, ahead))
-
-
-@inlined
-def _backproject_harmonics(degree, to, indices, sh_rest, g_sh_rest, memory):
-    """Write the gradients by ``sh_rest``; return the gradient by the direction ``to``.
+def _backproject_harmonics(degree, to, indices, own, sh_rest, g_sh_rest, memory):
+    """Write the gradients by ``sh_rest`` to the rows ``own``; return that by the direction ``to``.
 
     ``memory`` has two 16x16 matrices for scratch, then the gradients by red, green and blue.
     """
@@ -473,21 +462,15 @@ def _backproject_harmonics(degree, to, indices, sh_rest, g_sh_rest, memory):
     if degree > 0:
         fill_basis(degree, to, basis)
     for lane in range(LANES):
-        own, place = indices[lane] * REST, lane * LANES
+        source, target, place = indices[lane] * REST, own[lane] * REST, lane * LANES
         if degree > 0:
             r, g, b = colors[lane], colors[LANES + lane], colors[2 * LANES + lane]
-            by_red, by_green, by_blue = by_channel(load_rest(sh_rest, own))
+            by_red, by_green, by_blue = by_channel(load_rest(sh_rest, source))
             store(pulled, place, by_red * r + by_green * g + by_blue * b)
-            store_rest(g_sh_rest, own, outer_rest(load(basis, place), r, g, b))
+            store_rest(g_sh_rest, target, outer_rest(load(basis, place), r, g, b))
         else:
-            store_rest(g_sh_rest, own, (splat(ZERO), splat(ZERO), splat(ZERO)))
+            store_rest(g_sh_rest, target, (splat(ZERO), splat(ZERO), splat(ZERO)))
     return direction_gradient(degree, to, pulled)
-
-
-@inlined
-def _difference(a, b):
-    """a^2 - b^2 without cancellation, and without overflow of the squares."""
-    return (a - b) * (a + b)
 
 
 @inlined

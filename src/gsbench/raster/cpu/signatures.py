@@ -9,6 +9,7 @@ from numba import types
 
 from gsbench.raster.base import CameraNumbers
 from gsbench.raster.cpu import layout as at
+from gsbench.raster.cpu.adam import adam_rows
 from gsbench.raster.cpu.binning import (
     balance_tiles,
     fill_shards,
@@ -35,6 +36,7 @@ FRAME = types.NamedTuple(
 MEMORY = types.Tuple((FLOATS, INTS))
 SHARDS = INT, INT  # first and past the last
 GRADIENTS = types.Tuple((PARAMETERS, FLOAT_ROWS, FLOAT_ROWS, FLOAT_ROWS))
+ADAM = types.NamedTuple([PARAMETERS, PARAMETERS, FLOAT_ROWS, INT], at.AdamStep)
 
 KERNELS: tuple[tuple[Any, tuple[Any, ...]], ...] = (
     (
@@ -56,6 +58,7 @@ KERNELS: tuple[tuple[Any, tuple[Any, ...]], ...] = (
     ),
     (
         backproject_shards,
-        (MEMORY, *SHARDS, INTS, INTS, PARAMETERS, INT, FRAME, FLOATS, GRADIENTS),
+        (MEMORY, *SHARDS, INTS, INTS, PARAMETERS, INT, FRAME, FLOATS, GRADIENTS, ADAM),
     ),
+    (adam_rows, (FLOATS, *SHARDS, *[FLOAT_ROWS] * 4, INT, FLOAT, FLOAT)),
 )

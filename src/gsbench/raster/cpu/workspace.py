@@ -7,6 +7,7 @@ import threading
 import weakref
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
+from itertools import pairwise
 from math import prod
 from typing import Any
 
@@ -16,6 +17,7 @@ from numpy.typing import DTypeLike, NDArray
 from torch import Tensor
 
 CACHE_LINE = 64  # bytes
+RANGES_PER_THREAD = 2  # so that a thread that is done early takes another
 HEADROOM = 1.25  # times the requested size, so that a growing scene does not allocate at every step
 
 
@@ -106,8 +108,8 @@ class TensorPool:
 class ShardRunner:
     """Runs the shards of a stage on ``threads`` threads.
 
-    The result of a shard must not depend on the thread. A single thread runs all shards in one
-    call, because each call of a kernel costs up to 40 microseconds.
+    The result of a shard must not depend on the thread. Shards are run in few ranges, because each
+    call of a kernel costs up to 40 microseconds, in which no other thread runs Python.
     """
 
     def __init__(self, threads: int) -> None:
@@ -126,7 +128,9 @@ class ShardRunner:
         if self._executor is None:
             work(0, shards)
             return
-        futures = [self._executor.submit(work, shard, shard + 1) for shard in range(shards)]
+        parts = min(shards, RANGES_PER_THREAD * self.threads)
+        edges = [shards * part // parts for part in range(parts + 1)]
+        futures = [self._executor.submit(work, *span) for span in pairwise(edges)]
         try:
             for future in futures:
                 future.result()

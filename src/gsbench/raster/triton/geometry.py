@@ -1,9 +1,4 @@
-"""Projection geometry and spherical harmonics for both passes, float32, one lane per Gaussian.
-
-Matrices are tuples of rows, and vectors are tuples. No formula subtracts large numbers (see
-``spread``). Some functions repeat those of `raster.cpu.geometry`, because Triton's interpreter
-takes no function of a module that does not import Triton.
-"""
+"""Access to Gaussians, their spherical harmonics, and the formulas, one lane per Gaussian."""
 
 from __future__ import annotations
 
@@ -11,9 +6,9 @@ import triton
 import triton.language as tl
 
 from gsbench.gaussians.model import C0, C1, C2, C3, NUM_SH_REST
+from gsbench.raster import formulas
 from gsbench.raster.base import CONSTANTS, CameraNumbers
 
-BLUR = tl.constexpr(CONSTANTS.blur)
 F0, F1 = tl.constexpr(C0), tl.constexpr(C1)
 D0, D1, D2, D3, D4 = (tl.constexpr(value) for value in C2)
 T0, T1, T2, T3, T4, T5, T6 = (tl.constexpr(value) for value in C3)
@@ -72,117 +67,36 @@ def load_quaternion(quaternions, index, mask):
 
 
 @triton.jit
-def rotation_matrix(q):
-    """The rows of the rotation matrix of a unit quaternion."""
-    w, x, y, z = q
-    return (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
+def select(condition, a, b):
+    return tl.where(condition, a, b)
 
 
 @triton.jit
-def dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+def minimum(a, b):
+    return tl.minimum(a, b)
 
 
 @triton.jit
-def times(row, matrix):
-    """``row`` [3] times ``matrix`` [3, 3]."""
-    return (
-        row[0] * matrix[0][0] + row[1] * matrix[1][0] + row[2] * matrix[2][0],
-        row[0] * matrix[0][1] + row[1] * matrix[1][1] + row[2] * matrix[2][1],
-        row[0] * matrix[0][2] + row[1] * matrix[1][2] + row[2] * matrix[2][2],
-    )
+def maximum(a, b):
+    return tl.maximum(a, b)
 
 
 @triton.jit
-def through(matrix, column):
-    """``matrix`` [3, 3] times ``column`` [3]."""
-    return dot(column, matrix[0]), dot(column, matrix[1]), dot(column, matrix[2])
+def square_root(a):
+    return tl.sqrt(a)
 
 
-@triton.jit
-def scaled(row, scales):
-    return row[0] * scales[0], row[1] * scales[1], row[2] * scales[2]
-
-
-@triton.jit
-def stretched(row, factor):
-    return row[0] * factor, row[1] * factor, row[2] * factor
-
-
-@triton.jit
-def plus(a, factor, b):
-    """``a + factor * b`` of two vectors [3]."""
-    return a[0] + b[0] * factor, a[1] + b[1] * factor, a[2] + b[2] * factor
-
-
-@triton.jit
-def minus(a, factor, b):
-    """``a - factor * b``: for Triton, ``-factor`` would be an instruction of its own."""
-    return a[0] - factor * b[0], a[1] - factor * b[1], a[2] - factor * b[2]
-
-
-@triton.jit
-def mixed(p, a, q, b):
-    """``p * a + q * b`` of two vectors [3]."""
-    return p * a[0] + q * b[0], p * a[1] + q * b[1], p * a[2] + q * b[2]
-
-
-@triton.jit
-def view_axes(v):
-    """The rows of the camera's rotation W, from world to view."""
-    return (v.r00, v.r01, v.r02), (v.r10, v.r11, v.r12), (v.r20, v.r21, v.r22)
-
-
-@triton.jit
-def from_camera(mean, v):
-    """The vector from the camera centre to the mean, in world axes.
-
-    The difference is computed before the rotation, so no digits are lost even if the scene is far
-    from the origin.
-    """
-    return mean[0] - v.center_x, mean[1] - v.center_y, mean[2] - v.center_z
-
-
-@triton.jit
-def clamped_slopes(slope_x, slope_y, v):
-    """x/z and y/z within the limits of the Jacobian (`raster.base.slope_limits`)."""
-    slope_x = tl.minimum(tl.maximum(slope_x, v.slope_x_min), v.slope_x_max)
-    return slope_x, tl.minimum(tl.maximum(slope_y, v.slope_y_min), v.slope_y_max)
-
-
-@triton.jit
-def image_rows(slope_x, slope_y, inverse_z, v):
-    """A = J W, the derivative of the pixel by the world position, as two rows.
-
-    J is the derivative of x fx / z and y fy / z by the position in view space, at the slopes x/z
-    and y/z (EWA splatting, Zwicker et al. 2001; computeCov2D in 3DGS).
-    """
-    right, down, ahead = view_axes(v)
-    first = stretched(minus(right, slope_x, ahead), inverse_z * v.fx)
-    return first, stretched(minus(down, slope_y, ahead), inverse_z * v.fy)
-
-
-@triton.jit
-def spread(m0, m1):
-    """xx, xy, yy of the covariance C = M M^T + BLUR I, for the rows of M; and a = yy / det C.
-
-    1/a is the variance of x given y. det(M M^T) is the squared cross product of the rows. Dividing
-    one row by sqrt(yy) first gives 1/a without cancellation and overflow.
-    """
-    xx, xy, yy = dot(m0, m0), dot(m0, m1), dot(m1, m1) + BLUR
-    inverse = 1.0 / tl.sqrt(yy)
-    n1 = stretched(m1, inverse)
-    cross = (
-        m0[1] * n1[2] - m0[2] * n1[1],
-        m0[2] * n1[0] - m0[0] * n1[2],
-        m0[0] * n1[1] - m0[1] * n1[0],
-    )
-    given = dot(cross, cross) + BLUR * (xx + yy) / yy
-    return xx + BLUR, xy, yy, 1.0 / given
+# ``tl`` is among the names because Triton's interpreter takes only functions that can see it.
+OF_LANES = formulas.compiled(
+    triton.jit,
+    tl=tl,
+    BLUR=tl.constexpr(CONSTANTS.blur),
+    select=select,
+    minimum=minimum,
+    maximum=maximum,
+    square_root=square_root,
+)
+dot, plus, stretched = OF_LANES.dot, OF_LANES.plus, OF_LANES.stretched
 
 
 @triton.jit

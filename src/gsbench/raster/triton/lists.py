@@ -15,6 +15,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from gsbench.raster.base import CONSTANTS
 from gsbench.raster.triton.launch import Workspace, launch, launch_grid
 from gsbench.raster.triton.layout import (
     BLOCK_HEIGHT,
@@ -33,8 +34,8 @@ from gsbench.raster.triton.layout import (
 )
 
 # Margins for float32 rounding: it must not lose a pixel of the contour.
-REACH_MARGIN = tl.constexpr(1e-3)  # in log2(alpha)
-PIXEL_MARGIN = tl.constexpr(0.02)  # px
+REACH_MARGIN = tl.constexpr(CONSTANTS.log2_alpha_margin)
+PIXEL_MARGIN = tl.constexpr(CONSTANTS.pixel_margin)
 FLOAT_MARGIN = tl.constexpr(1e-6)  # of a coordinate: several roundings of float32
 MAX_COLUMN = tl.constexpr(1e6)  # px; beyond every image, but within int32
 

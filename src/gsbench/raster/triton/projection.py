@@ -12,28 +12,15 @@ from gsbench.raster.base import CONSTANTS
 from gsbench.raster.staged import MIN_QUATERNION_NORM
 from gsbench.raster.triton.geometry import (
     F0,
-    clamped_slopes,
+    OF_LANES,
     colors,
-    dot,
-    from_camera,
-    image_rows,
     load_camera,
     load_quaternion,
     load_vector,
-    minus,
-    mixed,
     normalized,
-    plus,
-    rotation_matrix,
-    scaled,
-    spread,
     store_gradients,
     store_or_zero,
     store_vector,
-    stretched,
-    through,
-    times,
-    view_axes,
 )
 from gsbench.raster.triton.layout import (
     ALPHA_MIN,
@@ -61,16 +48,26 @@ from gsbench.raster.triton.layout import (
 )
 from gsbench.raster.triton.lists import lists_fit, units_that_fit
 
+clamped_slopes, image_rows, view_axes = (
+    OF_LANES.clamped_slopes,
+    OF_LANES.image_rows,
+    OF_LANES.view_axes,
+)
+dot, minus, plus, scaled = OF_LANES.dot, OF_LANES.minus, OF_LANES.plus, OF_LANES.scaled
+stretched, through, times = OF_LANES.stretched, OF_LANES.through, OF_LANES.times
+from_camera, rotation_matrix = OF_LANES.from_camera, OF_LANES.rotation_matrix
+covariance_gradients, spread = OF_LANES.covariance_gradients, OF_LANES.spread
+position_gradient = OF_LANES.position_gradient
+quaternion_gradient = OF_LANES.quaternion_gradient
+
 NEAR = tl.constexpr(CONSTANTS.near)
 SIGMA_EXTENT = tl.constexpr(CONSTANTS.sigma_extent)
 EIGENVALUE_FLOOR = tl.constexpr(CONSTANTS.eigenvalue_floor)
-MAX_RADIUS = tl.constexpr(2.0**24)  # px; keeps the radius of a huge Gaussian within int32
-MAX_CENTER = tl.constexpr(1e9)  # px; so far outside the image, float32 cannot resolve a pixel
-# px^2; the same for standard deviations; also keeps squares finite
-MAX_VARIANCE = tl.constexpr(1e18)
+MAX_RADIUS = tl.constexpr(CONSTANTS.max_radius)
+MAX_CENTER = tl.constexpr(CONSTANTS.max_center)
+MAX_VARIANCE = tl.constexpr(CONSTANTS.max_variance)
 MIN_SQUARED_NORM = tl.constexpr(MIN_QUATERNION_NORM**2)
-# px, and relative: rounding must not lose a pixel of the contour alpha = 1/255
-CONTOUR_MARGIN = tl.constexpr(0.01)
+CONTOUR_MARGIN = tl.constexpr(CONSTANTS.contour_margin)
 LAST_KEY = tl.constexpr(2**31 - 1)  # sorts behind every depth
 INVISIBLE = tl.constexpr(-1e9)  # log2(opacity) of the invisible record
 
@@ -277,42 +274,6 @@ def _turned(to, inverse_distance, g_rgb, color_slopes, index, mask, DEGREE: tl.c
     return stretched(minus(turned, dot(turned, to), to), inverse_distance)
 
 
-@triton.jit
-def _store_turn(place, quaternion, turn, twice, mask):
-    """Write the gradient by the stored quaternion q, which changes by q (0, w) / 2.
-
-    ``turn`` is the gradient by w, ``twice`` is two over the norm of the stored quaternion.
-    """
-    qw, qx, qy, qz = quaternion
-    w_x, w_y, w_z = turn
-    tl.store(place, -(qx * w_x + qy * w_y + qz * w_z) * twice, mask=mask)
-    tl.store(place + 1, (qw * w_x + qy * w_z - qz * w_y) * twice, mask=mask)
-    tl.store(place + 2, (qw * w_y + qz * w_x - qx * w_z) * twice, mask=mask)
-    tl.store(place + 3, (qw * w_z + qx * w_y - qy * w_x) * twice, mask=mask)
-
-
-@triton.jit
-def _position_gradient(a0, a1, g_column, g_row, x, y, inverse_z, v):
-    """The gradient by the mean, in world axes, through the covariance and the place on the image.
-
-    ``a0`` and ``a1`` are the gradients by the rows of A = J W. From them follow those by the
-    entries of J, then by the position in view space, then by the position in the world.
-    """
-    right, down, ahead = view_axes(v)
-    free_x, free_y = x * inverse_z, y * inverse_z
-    slope_x, slope_y = clamped_slopes(free_x, free_y, v)
-    j00, j02, j11, j12 = dot(a0, right), dot(a0, ahead), dot(a1, down), dot(a1, ahead)
-    fx_z, fy_z = inverse_z * v.fx, inverse_z * v.fy
-    # The clamp of a slope passes the gradient only within the limits.
-    g_slope_x = tl.where((free_x >= v.slope_x_min) & (free_x <= v.slope_x_max), -fx_z * j02, 0.0)
-    g_slope_y = tl.where((free_y >= v.slope_y_min) & (free_y <= v.slope_y_max), -fy_z * j12, 0.0)
-    view_x = g_column * fx_z + g_slope_x * inverse_z
-    view_y = g_row * fy_z + g_slope_y * inverse_z
-    by_focal = fx_z * (j00 - slope_x * j02) + fy_z * (j11 - slope_y * j12)
-    view_z = -(by_focal * inverse_z + view_x * free_x + view_y * free_y)
-    return times((view_x, view_y, view_z), (right, down, ahead))
-
-
 @triton.jit(do_not_specialize=["count", "units", "pairs"])
 def backproject(
     means,
@@ -394,37 +355,20 @@ def backproject(
         store_or_zero(g_absolute + 2 * index, a * sums[9] * half_width, seen, inside)
         store_or_zero(g_absolute + 2 * index + 1, sums[10] * half_height, seen, inside)
 
-    # Covariance: M = N S and N = A R. d loss / d M = U^T Q U M with Q = D G D, D = diag(a, e), U =
-    # [[1, shear], [0, 1]] and G the second moments of h over (t, dy). For a needle the first row of
-    # U M is small, so U N is computed first, before large numbers can cancel.
     q00, q01, q11 = a * a * h_tt, a * e * h_ty, e * e * h_yy
     if EXTRA is not None:
         free = image_rows(free_x, free_y, inverse_z, v)
         EXTRA(g_extra, index, q00 - a * h, q01, q11 - e * h, shear, free, seen, inside)
-    u0 = plus(n0, shear, n1)
-    g0, g1 = mixed(q00, u0, q01, n1), mixed(q01, u0, q11, n1)
-    variances = scaled(scales, scales)
-    along = (
-        u0[0] * g0[0] + n1[0] * g1[0],
-        u0[1] * g0[1] + n1[1] * g1[1],
-        u0[2] * g0[2] + n1[2] * g1[2],
-    )
-    store_vector(g_log_scales, index, scaled(along, variances), seen)
-
-    # Rotation by small angles w about the Gaussian's own axes changes R S^2 R^T by a commutator, so
-    # the gradient by w has differences of variances as factors. Computing these differences first
-    # makes the gradient of a sphere exactly 0; otherwise rounding errors remain, which Adam scales
-    # to full steps.
-    w_x = (u0[1] * g0[2] + n1[1] * g1[2]) * (scales[1] - scales[2]) * (scales[1] + scales[2])
-    w_y = (u0[2] * g0[0] + n1[2] * g1[0]) * (scales[2] - scales[0]) * (scales[2] + scales[0])
-    w_z = (u0[0] * g0[1] + n1[0] * g1[1]) * (scales[0] - scales[1]) * (scales[0] + scales[1])
-    turn = (w_x, w_y, w_z)
-    _store_turn(g_quaternions + 4 * index, quaternion, turn, inverse_norm + inverse_norm, seen)
+    g_scales, turn, s0, s1 = covariance_gradients(q00, q01, q11, n0, n1, shear, scales)
+    store_vector(g_log_scales, index, g_scales, seen)
+    g_quaternion = quaternion_gradient(quaternion, turn, inverse_norm + inverse_norm)
+    place = g_quaternions + 4 * index
+    for k in tl.static_range(4):
+        tl.store(place + k, g_quaternion[k], mask=seen)
 
     # The mean: through A = J W and the position on the image, and through the colour.
-    s0 = scaled(g0, variances)
-    a0, a1 = through(matrix, s0), through(matrix, plus(scaled(g1, variances), shear, s0))
-    position = _position_gradient(a0, a1, g_column, g_row, x, y, inverse_z, v)
+    a0, a1 = through(matrix, s0), through(matrix, s1)
+    position = position_gradient(a0, a1, g_column, g_row, free_x, free_y, inverse_z, v)
     store_vector(g_means, index, plus(position, 1.0, tangent), seen)
 
     # d log(alpha) / d logit = 1 - opacity

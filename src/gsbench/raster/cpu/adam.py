@@ -1,0 +1,95 @@
+"""Adam (Kingma and Ba 2015, algorithm 1) for rows of parameters, 16 numbers at a time.
+
+The two factors of a step are those of `gsbench.gaussians.trainable.ParameterState.factors`.
+"""
+
+import numpy as np
+
+from gsbench.gaussians.paper_values import ADAM_BETAS, ADAM_EPSILON
+from gsbench.raster.cpu.simd import LANES, load, square_root, store
+from gsbench.system.jit import inlined, kernel
+
+BETA1, BETA2 = (np.float32(beta) for beta in ADAM_BETAS)
+REST1, REST2 = (np.float32(1 - beta) for beta in ADAM_BETAS)
+EPSILON = np.float32(ADAM_EPSILON)
+
+
+@inlined
+def _move(values, first, second, gradients, place, source, factor, root):
+    """Step the 16 numbers from ``place`` by the gradients from ``source``."""
+    gradient = load(gradients, source)
+    mean = load(first, place) * BETA1 + gradient * REST1
+    square = load(second, place) * BETA2 + gradient * gradient * REST2
+    store(first, place, mean)
+    store(second, place, square)
+    change = mean * factor / (square_root(square) * root + EPSILON)
+    store(values, place, load(values, place) - change)
+
+
+@inlined
+def step_rows(values, first, second, gradients, begin, end, own, active, factor, root, spare):
+    """Step the rows ``begin`` to before ``end`` of ``values`` [N, C]; ``first``, ``second`` alike.
+
+    Row ``begin`` has its gradient in row ``own`` of ``gradients``. Gradients are 0 from column
+    ``active`` on, where values and moments do not change: a vector may reach beyond it. ``spare``
+    [64] is scratch.
+    """
+    width = values.shape[1]
+    if active < width:
+        for row in range(begin, end):
+            source = (row - begin + own) * width
+            for column in range(0, active, LANES):
+                place = row * width + column
+                _move(values, first, second, gradients, place, source + column, factor, root)
+        return
+    place, past, shift = begin * width, end * width, (own - begin) * width
+    while place + LANES <= past:
+        _move(values, first, second, gradients, place, place + shift, factor, root)
+        place += LANES
+    if place < past:
+        # Fewer than 16 numbers: a vector would step those behind them, too.
+        a, b, c, d = spare[:LANES], spare[LANES:], spare[2 * LANES :], spare[3 * LANES :]
+        for k in range(past - place):
+            row, column = (place + k) // width, (place + k) % width
+            a[k], b[k], c[k] = values[row, column], first[row, column], second[row, column]
+            d[k] = gradients[row - begin + own, column]
+        _move(a, b, c, d, 0, 0, factor, root)
+        for k in range(past - place):
+            row, column = (place + k) // width, (place + k) % width
+            values[row, column], first[row, column], second[row, column] = a[k], b[k], c[k]
+
+
+@kernel
+def adam_rows(spare, begin, end, values, first, second, gradients, active, factor, root):
+    """`step_rows` for the rows ``begin`` to before ``end`` of arrays [N, C]."""
+    step_rows(values, first, second, gradients, begin, end, begin, active, factor, root, spare)
+
+
+@inlined
+def step_all(gaussians, adam, gradients, begin, end, spare):
+    """Step the Gaussians ``begin`` to before ``end``; row 0 of ``gradients`` is of ``begin``."""
+    first, second, factors, active = adam
+    step_rows(
+        gaussians.means, first.means, second.means, gradients.means,
+        begin, end, 0, 3, factors[0, 0], factors[0, 1], spare,
+    )  # fmt: skip
+    step_rows(
+        gaussians.log_scales, first.log_scales, second.log_scales, gradients.log_scales,
+        begin, end, 0, 3, factors[1, 0], factors[1, 1], spare,
+    )  # fmt: skip
+    step_rows(
+        gaussians.quaternions, first.quaternions, second.quaternions, gradients.quaternions,
+        begin, end, 0, 4, factors[2, 0], factors[2, 1], spare,
+    )  # fmt: skip
+    step_rows(
+        gaussians.logits, first.logits, second.logits, gradients.logits,
+        begin, end, 0, 1, factors[3, 0], factors[3, 1], spare,
+    )  # fmt: skip
+    step_rows(
+        gaussians.sh_dc, first.sh_dc, second.sh_dc, gradients.sh_dc,
+        begin, end, 0, 3, factors[4, 0], factors[4, 1], spare,
+    )  # fmt: skip
+    step_rows(
+        gaussians.sh_rest, first.sh_rest, second.sh_rest, gradients.sh_rest,
+        begin, end, 0, active, factors[5, 0], factors[5, 1], spare,
+    )  # fmt: skip
