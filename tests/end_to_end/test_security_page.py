@@ -23,7 +23,6 @@ from tests.end_to_end.test_hydra import TINY
 from tests.helpers import write
 
 PAGE = Path(__file__).parents[2] / "docs/security.md"
-CLAIMS = PAGE.parents[1] / "conf/claims/volumetric.yaml"
 pytestmark = pytest.mark.slow
 
 
@@ -77,7 +76,7 @@ RENDERS = "runs/finished/courtyard/random-adc/*/"
 # By the row's first cell: its commands, the programs that they start, and where its permissions
 # are tested.
 VERB_ROWS = {
-    "trials, `ablate`": (
+    "trials, `ablate`, `declare`": (
         [["-m", *TINY, "name=tiny", "seed=0,1"]],
         COMMIT,
         "config/test_trust.py::test_code_that_a_file_names_is_not_run",
@@ -88,7 +87,7 @@ VERB_ROWS = {
         "config/test_permissions.py::test_no_file_of_a_stranger_decides_what_runs_and_where_results_go",
     ),
     "`gate`": ([["export", "--results", "tiny"], GATE], COMMIT, ""),
-    "`tables`, `report`, `explain`, `plan`, `site`": (
+    "`tables`, `report`, `explain`, `plan`, `judge`, `site`": (
         [
             ["tables", FINISHED],
             ["report", FINISHED],
@@ -171,7 +170,7 @@ def test_a_verb_runs_and_writes_what_the_page_says(row, place, environment, tmp_
     (tmp_path / "scratch").mkdir()
     assert run(["export", "--results", FINISHED, "--out", "a.zip"]) == 0
     if row == "`gate`":
-        seen_of(VERB_ROWS["trials, `ablate`"][0][0], place, own)
+        seen_of(VERB_ROWS["trials, `ablate`, `declare`"][0][0], place, own)
     for words in commands:
         words = [str(next(tmp_path.glob(word))) if "*" in word else word for word in words]
         seen = seen_of(words, place, own)

@@ -177,7 +177,7 @@ def check_averageable(trials: Sequence[TrialResult], where: str) -> None:
 
 
 def swept_settings(trials: Iterable[Configured]) -> list[str]:
-    """The settings in which trials of one scene and arm differ, without `IGNORED_SETTINGS`."""
+    """The settings in which trials of one scene and arm differ, unless `is_ignored`."""
     groups = group_by(trials, lambda trial: (trial.scene, trial.init, trial.densify)).values()
     return sorted(set().union(*map(differing_settings, groups)))
 

@@ -73,7 +73,7 @@ class Comparison:
 
     @property
     def pairs(self) -> tuple[tuple[Arm, Arm], ...]:
-        return tuple((answer.baseline, answer.arm) for answer in self.answers)
+        return tuple(dict.fromkeys((answer.baseline, answer.arm) for answer in self.answers))
 
     @property
     def sentences(self) -> list[str]:
@@ -182,19 +182,21 @@ def _answers(
 ) -> list[Answer]:
     everything = [*trials, *experiment.older]
     arms = {(trial.scene, trial.digest): trial.arm for trial in trials}
-    verdicts: dict[tuple[Arm, Arm], list[Verdict]] = {}
+    # questions that an experiment's file names have an answer each
+    verdicts: dict[tuple[Arm, Arm, str], list[Verdict]] = {}
     for question in all_questions(experiment):
         question = _named(question, arms)
         verdict = judge(everything, question, experiment.unfinished)
-        verdicts.setdefault((question.baseline, question.idea), []).append(verdict)
-    ideas = {idea for _, idea in verdicts}
+        key = question.baseline, question.idea, question.name
+        verdicts.setdefault(key, []).append(verdict)
+    ideas = {idea for _, idea, _ in verdicts}
     unasked = [
         pair
         for pair in choose_pairs(rows, Asked(metric=DEFAULT_METRIC))
         if pair[1] not in ideas and {trial.arm for trial in trials}.issuperset(pair)
     ]
     answers = []
-    for pair, own in verdicts.items():
+    for (*pair, _), own in verdicts.items():
         newest = own[-1].question
         code = {code_in(second) for _, second in newest.digests.values()}
         current = [

@@ -18,10 +18,9 @@ from gsbench.analysis.results import Arm, TrialPair, TrialResult, group_by, seed
 from gsbench.analysis.trial_settings import Configured, canonical
 from gsbench.gaussians.paper_values import RATES
 from gsbench.runs.config_hash import (
-    IGNORED_SETTINGS,
-    NO_INGREDIENTS,
-    is_among,
+    is_ignored,
     is_ingredient,
+    is_of_scene,
 )
 from gsbench.runs.freshness import Change, Part, code_changes, present_version
 from gsbench.runs.nested import SHOWN
@@ -63,7 +62,6 @@ INGREDIENT_NAMES = {
 # Conditions and settings that each scene may have for itself. The settings of a budget are not
 # among them, so that a note says where it differs. Iterations are a condition already.
 OF_A_SCENE = ("resolution", "data", "budget")
-OWN_SETTINGS = (*NO_INGREDIENTS, "scene", "init.path", "train.iterations")
 
 # The ingredients in which each densifier class departs from ADC, beside its settings. They are not
 # attributes of the classes, since importing those loads torch. Another class is one ingredient.
@@ -109,7 +107,7 @@ def differing_conditions(trials: Sequence[TrialResult], code: bool = True) -> di
 
 
 def differing_settings(trials: Sequence[Configured]) -> dict[str, list[str]]:
-    """The settings in which trials differ, with their values, without `IGNORED_SETTINGS`.
+    """The settings in which trials differ, with their values, unless `is_ignored`.
 
     A missing key counts as unset (null): trials from before a setting existed equal later ones that
     leave it unset.
@@ -117,7 +115,7 @@ def differing_settings(trials: Sequence[Configured]) -> dict[str, list[str]]:
     if len({trial.config_hash for trial in trials}) == 1:
         return {}
     configs = {trial.key: trial.config for trial in trials}.values()
-    keys = {key for config in configs for key in config if not is_among(key, IGNORED_SETTINGS)}
+    keys = {key for config in configs for key in config if not is_ignored(key)}
     values_by_key = {key: {canonical(config.get(key)) for config in configs} for key in keys}
     return {key: sorted(values) for key, values in sorted(values_by_key.items()) if len(values) > 1}
 
@@ -141,7 +139,7 @@ def settings_between_scenes(trials: Sequence[TrialResult]) -> dict[str, ScenesBy
     keys = {
         key for other in others for key in first.keys() | other if first.get(key) != other.get(key)
     }
-    keys = {key for key in keys if not is_among(key, OWN_SETTINGS)}
+    keys = {key for key in keys if is_ingredient(key) and not is_of_scene(key)}
     return _between_scenes(
         by_scene, sorted(keys), lambda trial, key: canonical(trial.config.get(key))
     )
@@ -290,7 +288,7 @@ def ingredients(one: Mapping[str, Any], other: Mapping[str, Any]) -> tuple[str, 
 
 
 def differing_keys(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
-    """The settings in which two configurations differ, without those in `NO_INGREDIENTS`."""
+    """The settings in which two configurations differ, that are ingredients."""
     keys = [key for key in {**one, **other} if one.get(key) != other.get(key)]
     return [key for key in keys if is_ingredient(key)]
 

@@ -27,22 +27,12 @@ from gsbench.analysis.statistics import ALPHA, MIN_SCENES, sign_test_needs
 from gsbench.analysis.trial_settings import canonical
 from gsbench.errors import InputError
 from gsbench.runs.commands import Digest, History, Place, Question, code_in
-from gsbench.runs.config_hash import is_among, is_hashed
+from gsbench.runs.config_hash import is_ignored, is_of_scene
 from gsbench.runs.experiments import Arm
 from gsbench.words import counted, least_text, some_of
 
 ORDINALS = ("first", "second", "third", "fourth", "fifth")
 LAST_LOOK = 0.6  # of a question's level
-# settings that each scene may have for itself, and those that only say how results are read
-OF_A_SCENE = (
-    "scene",
-    "init.path",
-    "train.iterations",
-    "eval.primary",
-    "eval.baseline",
-    "eval.controls",
-    "densify.switches",
-)
 
 
 # ---- levels and looks
@@ -164,7 +154,7 @@ class Row:
         kept = {
             key: value
             for key, value in self.config.items()
-            if value is not None and is_hashed(key) and not is_among(key, OF_A_SCENE)
+            if value is not None and not is_ignored(key) and not is_of_scene(key)
         }
         return f"{self.init}-{self.densify} {code_in(self.digest)} {canonical(kept)}"
 

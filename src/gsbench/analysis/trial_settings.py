@@ -7,20 +7,11 @@ from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
 from gsbench.parsing import DamagedError, lines_in
-from gsbench.runs.config_hash import is_hashed
+from gsbench.runs.config_hash import is_hashed, is_ignored
 from gsbench.runs.layout import CONFIG
 from gsbench.runs.nested import flatten
 from gsbench.runs.trial_folder import TrialFolder
 
-# settings in which repetitions of a trial may differ
-UNCOUNTED = (
-    "eval.primary",
-    "eval.baseline",
-    "eval.controls",
-    "densify.switches",
-    "scene.path",
-    "hydra.",
-)
 GROUPS = ("scene", "init", "densify")  # groups that every trial's configuration has
 ENCODER = json.JSONEncoder(sort_keys=True, separators=(",", ":"))
 
@@ -94,11 +85,7 @@ def settings_text(config: Mapping[str, Any]) -> str:
     """The settings that determine a result, as text that is equal for equal settings."""
     # A missing key counts as unset: trials from before a setting existed equal later ones.
     return canonical(
-        {
-            key: value
-            for key, value in config.items()
-            if value is not None and is_hashed(key) and not key.startswith(UNCOUNTED)
-        }
+        {key: value for key, value in config.items() if value is not None and not is_ignored(key)}
     )
 
 

@@ -13,7 +13,7 @@ from gsbench.config.overrides import bare_key, is_sweep, key_of, parse_word
 from gsbench.config.programs import reading
 from gsbench.config.search_path import search_path, searched_folders
 from gsbench.errors import InputError
-from gsbench.runs.config_hash import DECLARED, NOT_HASHED, WITHOUT_EFFECT
+from gsbench.runs.config_hash import READING, WITHOUT_EFFECT, is_hashed, purpose
 from gsbench.runs.user_code import PERMISSIONS
 from gsbench.words import did_you_mean
 
@@ -237,8 +237,8 @@ def check_makes_trials(override: Override) -> None:
 def makes_other_trials(key: str) -> bool:
     """Return whether each value of a setting gives a different trial."""
     first, _, last = key.partition(".")
-    without_effect = last in (*WITHOUT_EFFECT, *DECLARED.get(first, ()))
-    return not without_effect and (first not in NOT_HASHED or first in IN_TRIAL_PATH)
+    without_effect = last in WITHOUT_EFFECT or purpose(key) == READING
+    return not without_effect and (is_hashed(first) or first in IN_TRIAL_PATH)
 
 
 def _check_experiment_word(word: str, override: Override, folders: Sequence[Path]) -> None:

@@ -1,62 +1,45 @@
-"""The settings that determine a result, and their hash, which names a trial's folder."""
+"""What each setting is for, in one table, and the hash of those that determine a result.
 
-from collections.abc import Mapping, Sequence
+The hash names a trial's folder.
+"""
+
+from collections.abc import Mapping
+from functools import cache
 from typing import Any
 
 from gsbench.runs.nested import GSBENCH, TARGET, flatten, sha256_of
 from gsbench.runs.user_code import PERMISSIONS, user_modules
 
-# Options that cannot change a result. This holds for gsbench's own classes; a user's class may use
-# the names otherwise.
-WITHOUT_EFFECT = ("threads", "weights", "download", "time_limit_minutes")
-# Settings that only declare what is accepted, how results are read or what may be turned off.
-# train.steps_scaler has been applied to the steps.
-DECLARED = {
-    "scene": ("accept",),
-    "eval": ("primary", "baseline", "controls"),
-    "densify": ("switches",),
-    "train": ("steps_scaler",),
+# What a setting is for, if it does not simply determine the trained model.
+BOOKKEEPING = "names, machines and folders: in no hash"
+READING = "what is accepted, how results are read, what may be turned off: in no hash"
+PLACE = "where files lie: in the hash, but two trials that differ in it are not unlike"
+APART = "it determines a result, but not the trained model"
+# A setting stands for itself and all below it; the longest name counts.
+PURPOSES = {
+    **dict.fromkeys(("name", "seed", "device", "threads", "runs", PERMISSIONS), BOOKKEEPING),
+    **dict.fromkeys(("questions", "error_rate", "tracking", "launch"), BOOKKEEPING),
+    **dict.fromkeys(("scene.accept", "densify.switches"), READING),
+    **dict.fromkeys(("eval.primary", "eval.baseline", "eval.controls"), READING),
+    "train.steps_scaler": READING,  # it has been applied to the steps
+    **dict.fromkeys(("scene.path", "hydra", "experiment"), PLACE),
+    **dict.fromkeys(("eval", "scene.name", "raster.name", "densify.name", "train.name"), APART),
+    **dict.fromkeys(("init.name", "init.device", "init.weights", "init.download"), APART),
+    **dict.fromkeys(("init.threads", "densify.time_limit_minutes", "train.log_every"), APART),
+    **dict.fromkeys(("train.checkpoint_every", "train.checkpoint_minutes"), APART),
+    "train.volume_histogram": APART,
 }
-NOT_HASHED = (
-    "name",
-    "questions",
-    "error_rate",
-    "seed",
-    "device",
-    "threads",
-    "runs",
-    PERMISSIONS,
-    "tracking",
-    "launch",
-)
-# Settings in which trials of one cell may differ: they do not change what is computed.
-# "x" stands for x and all below it (x.y).
-IGNORED_SETTINGS = (
-    *NOT_HASHED,
-    *(f"{group}.{name}" for group, names in DECLARED.items() for name in names),
-    "hydra",
-    "experiment",
-    "scene.path",
-)
-# Settings that do not change the trained model.
-NO_INGREDIENTS = (
-    *IGNORED_SETTINGS,
-    "eval",
-    "scene.name",
-    "raster.name",
-    "init.name",
-    "init.device",
-    "init.weights",
-    "init.download",
-    "init.threads",
-    "densify.name",
-    "densify.time_limit_minutes",
-    "train.name",
-    "train.log_every",
-    "train.checkpoint_every",
-    "train.checkpoint_minutes",
-    "train.volume_histogram",
-)
+# Options that cannot change a result, and are in no hash. This holds for gsbench's own classes; a
+# user's class may use the names otherwise.
+WITHOUT_EFFECT = ("threads", "weights", "download", "time_limit_minutes")
+# settings that each scene of an arm may have for itself
+OF_A_SCENE = ("scene", "init.path", "train.iterations")
+
+
+@cache
+def purpose(key: str) -> str:
+    """The purpose of the setting of a dotted key (`PURPOSES`); "" if it determines the model."""
+    return PURPOSES.get(key) or (purpose(key.rpartition(".")[0]) if "." in key else "")
 
 
 def is_hashed(key: str) -> bool:
@@ -64,7 +47,23 @@ def is_hashed(key: str) -> bool:
 
     `determining_settings` then leaves out some settings within groups.
     """
-    return key.partition(".")[0] not in NOT_HASHED
+    return purpose(key) != BOOKKEEPING
+
+
+def is_ignored(key: str) -> bool:
+    """Return whether trials of one cell may differ in a setting."""
+    return purpose(key) in (BOOKKEEPING, READING, PLACE)
+
+
+def is_ingredient(key: str) -> bool:
+    """Return whether a setting may change the trained model."""
+    return not purpose(key)
+
+
+@cache
+def is_of_scene(key: str) -> bool:
+    """Return whether each scene of an arm may have its own value."""
+    return key in OF_A_SCENE or ("." in key and is_of_scene(key.rpartition(".")[0]))
 
 
 def config_hash(values: Mapping[str, Any]) -> str:
@@ -81,10 +80,12 @@ def determining_settings(values: Mapping[str, Any]) -> dict[str, Any]:
     kept = {key: value for key, value in values.items() if is_hashed(key)}
     for key, group in kept.items():
         if isinstance(group, dict):
-            dropped = set(DECLARED.get(key, ()))
-            if str(group.get(TARGET) or GSBENCH).startswith(GSBENCH):
-                dropped |= set(WITHOUT_EFFECT)
-            kept[key] = {name: value for name, value in group.items() if name not in dropped}
+            is_own = str(group.get(TARGET) or GSBENCH).startswith(GSBENCH)
+            kept[key] = {
+                name: value
+                for name, value in group.items()
+                if purpose(f"{key}.{name}") != READING and not (is_own and name in WITHOUT_EFFECT)
+            }
     return kept
 
 
@@ -100,18 +101,3 @@ def arm_hash(values: Mapping[str, Any]) -> str:
             if value is not None and is_ingredient(key)
         }
     )
-
-
-def is_ingredient(key: str) -> bool:
-    """Return whether a setting may change the trained model."""
-    return not is_among(key, NO_INGREDIENTS)
-
-
-def is_among(key: str, settings: Sequence[str]) -> bool:
-    """Return whether a dotted key is one of ``settings`` or below one of them.
-
-    A key that only begins with the same letters is another setting: a user's class may have the
-    option ``densify.name_noise``.
-    """
-    parts = key.split(".")
-    return any(".".join(parts[:count]) in settings for count in range(1, len(parts) + 1))

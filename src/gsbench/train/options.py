@@ -10,14 +10,6 @@ from gsbench.gaussians.paper_values import LearningRates
 from gsbench.settings import MISSING, Fraction, check_settings
 
 IDEAS = ("loss", "terms", "schedule", "optimizer")  # settings that name classes of the user's
-WITHOUT_EFFECT_ON_MODEL = (
-    "name",
-    "log_every",
-    "checkpoint_every",
-    "checkpoint_minutes",
-    "volume_histogram",
-    "steps_scaler",
-)
 # the steps that ``steps_scaler`` multiplies; densifiers have theirs from these
 STEPS = (
     "iterations",

@@ -22,6 +22,7 @@ from gsbench.init import read_cloud
 from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER
 from gsbench.logs import progress
 from gsbench.pipeline.steps.scene import Views
+from gsbench.runs.config_hash import is_ingredient
 from gsbench.runs.keys import TRAIN, Step, options_of, rasterizer_inputs, step_of
 from gsbench.runs.layout import LINEAGE, POINT_CLOUD, TRAINING
 from gsbench.runs.trial_record import InitialCloud, Oddity
@@ -30,7 +31,7 @@ from gsbench.system.compile_clock import CLOCK
 from gsbench.system.install import own_checkout
 from gsbench.system.machine import describe_machine
 from gsbench.system.resources import peak_memory_mb, reset_peak_memory
-from gsbench.train.options import IDEAS, WITHOUT_EFFECT_ON_MODEL
+from gsbench.train.options import IDEAS
 from gsbench.train.start import check_start
 from gsbench.train.trainer import Status, Trainer
 
@@ -49,9 +50,11 @@ def train_step(views: Views, parts: Parts) -> Step:
     densifier, rasterizer, options, seed = parts.trainer, parts.rasterizer, parts.train, parts.seed
     assert isinstance(densifier, Densifier)
     device, snapshot_at, user = parts.device, parts.measured_earlier, parts.user_code
-    effective = dataclasses.asdict(options)
-    for name in (*WITHOUT_EFFECT_ON_MODEL, *IDEAS):
-        del effective[name]
+    effective = {
+        name: value
+        for name, value in dataclasses.asdict(options).items()
+        if is_ingredient(f"train.{name}") and name not in IDEAS
+    }
     ideas = parts.ideas
     effective |= {
         name: options_of("train", part, user, f"train.{name}")
