@@ -38,7 +38,8 @@ def test_missing_trials_and_metrics_are_reported(tmp_path):
     text = explain_cell("exp:garden:psnr:adc", tmp_path)
     assert "over 2 of 3 trials" in text
     assert "Left out\n  exp/garden/sfm-adc/c0ffee00-seed0: unfinished" in text
-    assert "adc_2" not in text
+    assert "adc_2" not in text.partition("Conditions")[2]
+    assert "Verdicts\n  NOT ASKED: sfm-adc_2 against sfm-adc: not asked beforehand" in text
     assert "not available: weights file alexnet.pth not found" in explain_cell(
         "exp:garden:lpips_alex:adc", tmp_path
     )
