@@ -3,7 +3,7 @@
 
     python findings/scripts/tables.py
 
-Verdicts are those of ``gsbench check findings/claims/NAME.yaml --from findings/archives/NAME.zip``.
+Verdicts are those of the questions that the archives declare, as ``gsbench site`` shows them.
 All other tables describe the same trials by pandas and SciPy alone, without gsbench's own
 statistics. Nobody declared those: an interval is Student's of 95 % for one mean, and is not
 adjusted for the number of intervals beside it.
@@ -23,11 +23,11 @@ import pandas as pd
 from scipy import stats
 
 from gsbench.analysis.ledger_table import describe_ledger, ledger_tables
+from gsbench.analysis.old_declarations import all_questions
+from gsbench.analysis.sentences import p_text
 from gsbench.analysis.table_formats import to_markdown
-from gsbench.analysis.verdict_words import p_text
+from gsbench.analysis.verdicts import Verdict, judge
 from gsbench.claims.archive import unpack_archive
-from gsbench.claims.check import ClaimVerdict, recheck
-from gsbench.claims.file import read_claims
 from gsbench.runs.ledger import read_ledger
 from gsbench.words import counted, signed
 
@@ -166,25 +166,29 @@ def table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 @functools.cache
-def verdicts(name: str) -> dict[str, ClaimVerdict]:
-    """The verdicts on the claims ``NAME.yaml`` by the trials of ``NAME.zip``, by claim."""
+def verdicts(name: str) -> dict[str, Verdict]:
+    """The verdicts on the declared claims of ``NAME.zip``, by claim."""
     with tempfile.TemporaryDirectory() as folder:
-        file = read_claims(FINDINGS / "claims" / f"{name}.yaml")
-        found = recheck(file, ARCHIVES / f"{name}.zip", Path(folder)).verdicts
-    return {verdict.claim.id: verdict for verdict in found}
+        experiment = unpack_archive(ARCHIVES / f"{name}.zip", Path(folder))
+        trials = [*experiment.trials, *experiment.older]
+        return {
+            question.name: judge(trials, question, experiment.unfinished)
+            for question in all_questions(experiment)
+            if question.name
+        }
 
 
-def verdict_cells(one: ClaimVerdict) -> list[str]:
-    """The difference with the interval over all looks, the verdict, and what it rests on."""
-    verdict, answer = one.verdict, one.verdict.answer
-    if answer is None or answer.interval is None:
-        return ["", f"**{one.word}**", ""]
-    shown = f"{verdict.shown(answer.mean)} ({verdict.shown_interval(answer.interval)})"
-    level = f"{100 * (1 - answer.level):.3g} %"
+def verdict_cells(verdict: Verdict) -> list[str]:
+    """The difference with its interval, the verdict, and what it rests on."""
+    word = verdict.outcome if verdict.untestable is None else "not testable"
+    if verdict.mean is None or verdict.interval is None:
+        return ["", f"**{word}**", ""]
+    shown = f"{verdict.shown(verdict.mean)} ({verdict.shown_interval(verdict.interval)})"
+    level = f"{100 * (1 - verdict.level):.3g} %"
     on = f"{counted(len(verdict.scenes), 'scene')}, {counted(verdict.pairs.seeds, 'seed')}, {level}"
     if verdict.like_these is not None:
         on += f"; lower in {verdict.like_these.helped} of {verdict.like_these.scenes}"
-    return [shown, f"**{one.word}**", on]
+    return [shown, f"**{word}**", on]
 
 
 def answers() -> str:
@@ -198,7 +202,7 @@ def answers() -> str:
 def claims_table(name: str) -> str:
     """A claim a row."""
     rows = [
-        [f"`{v.claim.id}`: {v.claim.arm} − {v.claim.baseline}", *verdict_cells(v)]
+        [f"`{v.question.name}`: {v.question.idea} − {v.question.baseline}", *verdict_cells(v)]
         for v in verdicts(name).values()
     ]
     return table(["claim", "difference (interval)", "verdict", "on"], rows)

@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from gsbench.app.command import compose_trials
-from gsbench.claims.file import read_claims
 
 FINDINGS = Path(__file__).parents[1]
 sys.path.append(str(FINDINGS / "scripts"))
@@ -40,7 +39,6 @@ PAGE = tables.README.read_text(encoding="utf-8")
 
 def test_the_tables_follow_from_the_archives():
     assert tables.TABLES.read_text(encoding="utf-8") == tables.all_tables()
-    assert tables.with_answers(PAGE) == PAGE
     assert "nan" not in tables.all_tables()
 
 
@@ -73,8 +71,6 @@ def test_the_pages_statements_on_seeds_are_true():
     assert of("full", "volumetric_once", "bonsai", cap="soft")[1] < 0
     clouds = tables.differences(tables.read_trials("initialisers"), "sfm", "random", tables.LPIPS)
     assert (clouds < 0).all()
-    assert tables.verdicts("full_count")["once_at_as_many"].verdict.seen
-    assert not any(one.verdict.seen for one in tables.verdicts("volume").values())
 
 
 def test_files_that_the_page_names_exist():
@@ -84,11 +80,6 @@ def test_files_that_the_page_names_exist():
         assert (FINDINGS.parent / name).is_file(), name
     for name in re.findall(r"claims/\w+\.yaml", PAGE):
         assert (FINDINGS / name).is_file(), name
-
-
-@pytest.mark.parametrize("file", sorted(FINDINGS.glob("claims/*.yaml")), ids=lambda file: file.stem)
-def test_claims_can_be_read(file):
-    assert read_claims(file).claims
 
 
 @pytest.mark.parametrize(

@@ -262,11 +262,9 @@ def test_a_plan_gives_no_folder_for_packages_of_settings(place, monkeypatch):
     record(compose_trials(["name=x", "seed=0,1"], multirun=True), asks=False)
     plan = place / "runs/x/commands.jsonl"
     content = read_json(plan)
+    content["cwd"] = str(theirs)
     for planned in content["trials"].values():
-        planned |= {
-            "cwd": str(theirs),
-            "overrides": [*planned["overrides"], "hydra.searchpath=[pkg://conf_of_mine]"],
-        }
+        planned["words"] = [*planned["words"], "hydra.searchpath=[pkg://conf_of_mine]"]
     write(plan, content)
     assert cli.run(["retry", "x", "allow_targets=[conf_of_mine]", "--dry-run"]) == 0
     assert sys.modules.pop("conf_of_mine").__file__ == str(place / "conf_of_mine/__init__.py")

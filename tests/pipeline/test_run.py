@@ -318,7 +318,7 @@ def test_a_trial_builds_its_steps_and_writes_its_results(running, caplog):
     assert [building.stage for building in seen["building"]] == [*names]
     assert all(building.folder for building in seen["building"])
     assert seen["report"] == "{}"
-    values, _, scene, raster, entries, code = seen["given"]
+    values, _, scene, raster, entries, code, _ = seen["given"]
     assert (values, raster) == (one.values, "proven")
     assert len(scene.train) == 3
     assert [type(entry) for entry in entries.values()] == [StoredResult] * 5

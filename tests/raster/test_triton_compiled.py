@@ -12,7 +12,7 @@ pytest.importorskip("triton")
 
 from triton.runtime.jit import JITFunction
 
-from gsbench.gaussians.trainable import AdamState, Update
+from gsbench.gaussians.trainable import ParameterState, Update
 from gsbench.raster.contract import Case, render_with_gradients
 from gsbench.raster.triton import composite, executor, lists
 from gsbench.raster.triton.executor import TritonRasterizer
@@ -87,7 +87,9 @@ def adam_step(case):
     """Adam as in a direct step, and as in a step with autograd."""
     seen = torch.zeros(case.count, dtype=torch.int32)
     for tensor in case.gaussians().map(lambda tensor: tensor.float()).tensors().values():
-        state = AdamState(0.1, 1, torch.zeros_like(tensor), torch.zeros_like(tensor))
+        state = ParameterState(
+            0.1, 1, {name: torch.zeros_like(tensor) for name in ("first", "second")}
+        )
         gradient, active = torch.zeros_like(tensor), 24 if tensor.dim() == 3 else None
         TritonAdam()([Update(tensor, gradient, state, active)], seen)
         TritonAdam()([Update(tensor, gradient, state)])

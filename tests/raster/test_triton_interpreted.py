@@ -19,7 +19,7 @@ from triton.runtime.interpreter import interpreter_builder
 
 from gsbench.densify import ADC
 from gsbench.gaussians.initial import gaussians_from_cloud
-from gsbench.gaussians.trainable import AdamState, Update
+from gsbench.gaussians.trainable import ParameterState, Update
 from gsbench.raster import staged
 from gsbench.raster.contract import Case, render_with_gradients
 from gsbench.raster.reference import ReferenceRasterizer
@@ -520,7 +520,9 @@ def test_adam_matches_that_of_torch_and_reads_no_undefined_gradient(active):
     seen = (torch.rand(30, generator=generator) < 0.6).int()
     theirs = torch.nn.Parameter(values.double())
     optimizer = torch.optim.Adam([theirs], lr=0.01, eps=1e-15)
-    state = AdamState(0.01, 0, torch.zeros_like(values), torch.zeros_like(values))
+    state = ParameterState(
+        0.01, 0, {name: torch.zeros_like(values) for name in ("first", "second")}
+    )
     for _ in range(5):
         gradient = torch.randn(30, 15, 3, generator=generator)
         read = (seen > 0)[:, None] & (torch.arange(45) < (active or 45))

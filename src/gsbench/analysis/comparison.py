@@ -196,7 +196,7 @@ def _answers(
         if pair[1] not in ideas and {trial.arm for trial in trials}.issuperset(pair)
     ]
     answers = []
-    for (*pair, _), own in verdicts.items():
+    for (first, second, _), own in verdicts.items():
         newest = own[-1].question
         code = {code_in(second) for _, second in newest.digests.values()}
         current = [
@@ -207,7 +207,7 @@ def _answers(
         answered = [one for one in current if one.state == ANSWERED]
         shown = (answered or current)[-1]
         others = tuple(one for one in reversed(own) if one is not shown)
-        answers.append(_with_metrics(shown, trials, *pair, others))
+        answers.append(_with_metrics(shown, trials, first, second, others))
     for pair in unasked:
         answers.append(_with_metrics(_interval(trials, *pair, NOT_ASKED), trials, *pair))
     return answers

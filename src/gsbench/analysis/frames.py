@@ -25,6 +25,7 @@ from gsbench.files import write_text
 from gsbench.parsing import Count, Record, Text, read_typed
 from gsbench.runs.commands import Command, History, Question
 from gsbench.runs.experiments import Arm
+from gsbench.runs.layout import SEED as SEED_MARK
 from gsbench.runs.trial_record import MetricRecord, TrialRecord
 from gsbench.words import did_you_mean, listed
 
@@ -258,5 +259,6 @@ def _trial(
         evaluated_from="renders",
         metric_facts=dict(facts),
     )
-    path = Path(name, scene, method, f"seed{seed}")
+    # as the folder of a trial is called
+    path = Path(name) / scene.replace("/", "_") / method.replace("/", "_") / f"row{SEED_MARK}{seed}"
     return replace(TrialResult(path, "", record), alias=_digest(method))

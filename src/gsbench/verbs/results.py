@@ -302,6 +302,7 @@ def explain_cell(address: str, runs: Path) -> str:
     ]
     if cell.reason:
         lines.append(f"  not available: {cell.reason}")
+    lines += ["", "Verdicts", *(f"  {line}" for line in _verdicts_on(experiment, trials[0].arm))]
     conditions = trials[0].conditions.items()
     lines += ["", "Conditions", *(f"  {key}: {value}" for key, value in conditions)]
     lines += _trials_lines(trials, shown)
@@ -312,6 +313,14 @@ def explain_cell(address: str, runs: Path) -> str:
     if left_out := [*(line for line in experiment.faults if line.startswith(start)), *versions]:
         lines += ["", "Left out", *(f"  {line}" for line in left_out)]
     return "\n".join(lines)
+
+
+def _verdicts_on(experiment: Experiment, arm: Arm) -> list[str]:
+    """The badges and sentences of the questions about an arm, on either side."""
+    from gsbench.analysis.comparison import compare  # here, since SciPy is slow to import
+
+    answers = [one for one in compare(experiment).answers if arm in (one.arm, one.baseline)]
+    return [answer.line for answer in answers] or ["none: it is compared with no other arm"]
 
 
 def _trials_at(experiment: Experiment, scene: str, word: str) -> list[TrialResult]:
