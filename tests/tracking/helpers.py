@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[2]
 STATE = "mlflow.json"  # in the trial's folder
 
 
-def options(uri=None, patience=30.0):
+def options(uri=None, patience=200.0):
     return {
         "enabled": True,
         "uri": uri,
@@ -28,7 +28,7 @@ def options(uri=None, patience=30.0):
     }
 
 
-def begin_trial(values, uri=None, patience=30.0, **more):
+def begin_trial(values, uri=None, patience=200.0, **more):
     """The folder of a trial that has written its configuration, as the mirror finds it."""
     folder = TrialFolder.of(values).path
     write(folder / "config.yaml", values | {"tracking": options(uri, patience) | more})
@@ -72,7 +72,7 @@ def write_trial(folder, values, records=STEPS, psnr=20.0, **changes):
     write(folder / "results.json", results | changes)
 
 
-def begun_trial(runs, seed=0, name="tracked", uri=None, patience=30.0, **more):
+def begun_trial(runs, seed=0, name="tracked", uri=None, patience=200.0, **more):
     """A trial that has begun, as (folder, configuration)."""
     values = trial_values(runs, seed, name)
     return begin_trial(values, uri, patience, **more), values
@@ -107,7 +107,7 @@ with following(options(uri, patience), folder):
 """
 
 
-def mirror_command(runs, uri, seed, patience=30.0):
+def mirror_command(runs, uri, seed, patience=200.0):
     """The command of a process that writes and mirrors a trial."""
     return [sys.executable, "-c", MIRROR, str(runs), uri or "", str(seed), str(patience)]
 

@@ -66,10 +66,9 @@ def guess_training(values: Mapping[str, Any], parallel: int = 1) -> Guess | None
 
 def picture_size(scene: Mapping[str, Any]) -> tuple[int, int] | None:
     """The size, in px, to which the first picture of a scene is brought for the training."""
+    size = _first_size(scene.get("path") or "", scene.get("images") or "images")
     if scene.get("kind") == "courtyard":
         size = scene["width"], scene["height"]
-    else:
-        size = _first_size(scene.get("path") or "", scene.get("images") or "images")
     if size is None:
         return None
     return downscaled_size(*size, scene.get("downscale") or 1, scene.get("max_size"))
