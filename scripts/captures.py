@@ -23,7 +23,7 @@ def limits(values: tuple[float, float]) -> str:
 
 
 def sentence(rule: Rule) -> str:
-    """What a rule says, with an ellipsis for each fact."""
+    """A rule's sentence, with an ellipsis for each fact."""
     parts = [text + ("…" if name else "") for text, name, *_ in Formatter().parse(rule.say)]
     return textwrap.shorten("".join(parts), LONGEST, placeholder=" …")
 

@@ -104,7 +104,7 @@ def test_the_new_loss_is_trained_with_under_a_new_version_of_the_stage(walked):
         "one = torch.full((9, 9, 3), 0.5); print(float(PhotometricLoss(0.0)(one, one)[0]))"
     )
     assert float(walked("-c", loss).stdout) == pytest.approx(1e-3)
-    assert walked.results["code"]["stages"]["train"] == 4
+    assert walked.results["code"]["stages"]["train"] == 5
 
 
 @pytest.mark.slow

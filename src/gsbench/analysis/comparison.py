@@ -36,7 +36,7 @@ DEFAULT_METRIC = "psnr"
 
 @dataclass(frozen=True)
 class Answer:
-    """What is known of an idea against a baseline.
+    """Verdicts on an idea against a baseline.
 
     ``verdict`` is that of the last answered question about the present code; else of the last
     question, or an interval that nobody asked for. ``others`` are the verdicts on its other
@@ -92,7 +92,7 @@ class Comparison:
 
     @property
     def risk(self) -> str:
-        """What a page with these answers risks; "" if it states no verdict."""
+        """The risk of a page with these answers; "" if it states no verdict."""
         verdicts = itertools.chain(*((one.verdict, *one.others) for one in self.answers))
         return risk([one for one in verdicts if one.state == ANSWERED])
 

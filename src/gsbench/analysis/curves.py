@@ -109,7 +109,7 @@ class CountSaving:
 
     @property
     def words(self) -> str:
-        """Such as "27 % fewer Gaussians (12 to 38 %)"."""
+        """A phrase such as "27 % fewer Gaussians (12 to 38 %)"."""
         if self.bound is not None:
             return f"at least {_amount(self.bound)}"
         if self.change is None:

@@ -213,7 +213,7 @@ class NamedQuestion:
 
 @dataclass(frozen=True)
 class Asked:
-    """What a command asks, beside its trials.
+    """The settings of a command's questions, beside its trials.
 
     The error rate is that of each idea, or ``shared`` by all. ``named`` are the questions that the
     experiment's file names, each with sign and least difference, in place of the usual ones.

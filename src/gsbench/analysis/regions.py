@@ -1,4 +1,4 @@
-"""Where an arm's renders have less error than the baseline's, beyond the noise of training.
+"""Regions in which an arm's renders have less error than the baseline's, beyond training noise.
 
 A test view is cut into regions of 32 px. The observations of a region are the paired differences of
 its PSNR, one for each seed. With three seeds a variance has two degrees of freedom, so that of a
@@ -163,7 +163,7 @@ def _p_values(rows: Sequence[Array]) -> list[Array]:
 
 
 def discoveries(p: Sequence[Array], rate: float = FALSE_DISCOVERY_RATE) -> list[NDArray[np.bool_]]:
-    """Which p of a report are discoveries, by Benjamini and Hochberg (1995) in one family."""
+    """The p of a report that are discoveries, by Benjamini and Hochberg (1995) in one family."""
     flat = np.concatenate([each.ravel() for each in p])
     ordered = np.sort(flat)
     passes = np.flatnonzero(ordered <= rate * np.arange(1, len(flat) + 1) / len(flat))

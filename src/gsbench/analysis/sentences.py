@@ -202,7 +202,7 @@ def _level_words(verdict: Verdict) -> str:
 
 
 def asked_words(verdict: Verdict) -> str:
-    """What a question was about: metric, scenes, seeds and level."""
+    """The subject of a question: metric, scenes, seeds and level."""
     question = verdict.question
     is_tested = verdict.state not in (NOT_TESTED, NOT_ASKED)
     level = f", level {100 * question.level:.2g} %" if is_tested else ""
@@ -260,7 +260,7 @@ def scene_words(verdict: Verdict, scene: SceneEstimate) -> str:
 
 
 def risk(verdicts: Sequence[Verdict]) -> str:
-    """What a page with these verdicts risks: the sum of the levels of its statements."""
+    """The risk of a page with these verdicts: the sum of the levels of its statements."""
     asked = [one for one in verdicts if one.statements]
     if not asked:
         return ""

@@ -295,7 +295,7 @@ def words_without_sweeper(sweep: Sweep) -> tuple[list[str], bool]:
 
 @dataclass
 class Goal:
-    """What another sweeper searches, and the trials of its points, which lie in ``home``.
+    """The space that another sweeper searches, and the trials of its points, which lie in ``home``.
 
     A point's value is the mean of a metric over the ``seeds`` (words; none: the job's own seed) on
     validation views. ``sign`` says what the sweeper looks for: the largest value (1) or the least
@@ -348,7 +348,7 @@ class Goal:
 
 
 def goal_of(sweep: Sweep) -> Goal | None:
-    """What the chosen sweeper searches; None for Hydra's grid, which asks for no values."""
+    """The space that the chosen sweeper searches; None for Hydra's grid."""
     if sweep.other_sweeper == BASIC:
         return None
     node = sweep.config.hydra.sweeper

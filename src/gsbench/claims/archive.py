@@ -97,7 +97,7 @@ def _checked(home: Path) -> Experiment:
         read_typed(search, TuningRecord)
     experiment = read_experiment(home)
     for trial in experiment.trials:
-        # what was finished last counts, and unpacked files are new
+        # the trial finished last counts, and unpacked files are new
         os.utime(trial.path / RESULTS, (trial.measured, trial.measured))
     results = {file.parent for file in home.glob(f"*/*/*/{RESULTS}")}
     damaged = [one for one in experiment.unfinished if one.path in results]

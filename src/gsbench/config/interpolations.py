@@ -1,4 +1,4 @@
-"""What ``${…}`` may do in a configuration, by whomever it was written. Loads no Hydra."""
+"""Limits of ``${…}`` in a configuration, by whomever it was written. Loads no Hydra."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any

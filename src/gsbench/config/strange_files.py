@@ -36,7 +36,7 @@ class _TextLoader(SafeLoader):
     }
 
 
-# what the command line permits, for the files that Hydra reads within `permitted_to_files`
+# permissions of the command line, for the files that Hydra reads within `permitted_to_files`
 _allowed: ContextVar[tuple[str, ...]] = ContextVar("allowed", default=())
 
 

@@ -1,4 +1,4 @@
-"""How trials end, in words."""
+"""Ends of trials, in words."""
 
 from dataclasses import dataclass
 from pathlib import Path

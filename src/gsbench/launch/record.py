@@ -138,7 +138,7 @@ def planned_rows(trials: Sequence[Trial]) -> list[Row]:
 
 
 def asked_of(trials: Sequence[Trial], rows: Sequence[Row]) -> Asked | None:
-    """What trials of one experiment ask; None if their metric has no direction."""
+    """The questions of one experiment's trials; None if their metric has no direction."""
     values = trials[0].values
     options, launch = values["eval"], values["launch"]
     metric, about = metric_and_question(options.get("primary") or DEFAULT_METRIC)

@@ -1,4 +1,4 @@
-"""What the store holds, what trials refer to, and removing the rest (`gsbench clean`).
+"""Content of the store, references of trials to it, and removal of the rest (`gsbench clean`).
 
 A trial's ``results.json`` and ``building.json`` name the keys of its results in the store, and
 their manifests the keys of what they were made from. Keys are looked for as text, so that a damaged

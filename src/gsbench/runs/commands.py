@@ -287,7 +287,7 @@ class History:
 
 
 def read_history(home: Path) -> History:
-    """What was asked in the experiment in ``home``; nothing without a file."""
+    """Commands and questions of the experiment in ``home``; nothing without a file."""
     content = _content(home / COMMANDS)
     commands, results, faults = _of_old_plan(home), set[tuple[Digest, Place]](), list[str]()
     before = ""

@@ -1,4 +1,4 @@
-"""What each setting is for, in one table, and the hash of those that determine a result.
+"""Purpose of each setting, in one table, and the hash of those that determine a result.
 
 The hash names a trial's folder.
 """
@@ -10,7 +10,7 @@ from typing import Any
 from gsbench.runs.nested import GSBENCH, TARGET, flatten, sha256_of
 from gsbench.runs.user_code import PERMISSIONS, user_modules
 
-# What a setting is for, if it does not simply determine the trained model.
+# Purpose of a setting that does not simply determine the trained model.
 BOOKKEEPING = "names, machines and folders: in no hash"
 READING = "what is accepted, how results are read, what may be turned off: in no hash"
 PLACE = "where files lie: in the hash, but two trials that differ in it are not unlike"

@@ -97,7 +97,7 @@ class ExternalTrainer(Record):
 
 
 class Oddity(Record):
-    """What one rule of gsbench.scene.rules found odd about a capture, its model or its points.
+    """An oddity that one rule of gsbench.scene.rules found in a capture, its model or its points.
 
     ``refused`` says that the value is not usable, and that the rule was accepted.
     """

@@ -86,7 +86,7 @@ class PointsFile:
 
 @dataclass(frozen=True)
 class RawCapture:
-    """What a reader finds in a folder: photographs, and points if there are any.
+    """A reader's findings in a folder: photographs, and points if there are any.
 
     ``photographs`` are in the order of their names, by which test views are chosen. ``points`` are
     positions [P, 3] with colours [P, 3] uint8, or their file. ``files`` are the other files that

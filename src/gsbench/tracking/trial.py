@@ -143,7 +143,7 @@ class TrackedTrial:
         return None if results is None else sha256_of(results.to_json())
 
     def ending(self) -> str:
-        """How a trial without results has ended: when it failed, or where it was stopped."""
+        """The end of a trial without results: when it failed, or where it was stopped."""
         if self.folder.has_failed():
             return f"failed at {self.folder.failure().time}"
         return "stopped in {} at {}".format(*self.folder.stage_and_step())

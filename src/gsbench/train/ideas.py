@@ -42,7 +42,7 @@ class TrainedView(NamesAttributes):
 
 @dataclass(frozen=True)
 class Step(NamesAttributes):
-    """What a loss or a term may read of an iteration (1, 2, …).
+    """Facts that a loss or a term may read of an iteration (1, 2, …).
 
     ``render`` has ``image`` [H, W, 3], ``alpha`` [H, W] and, if the class asks for it
     (``needs_depth = True``), ``depth`` [H, W]; masked pixels of the image are those of the

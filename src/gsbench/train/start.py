@@ -26,7 +26,7 @@ MIN_COLOR_SPREAD = 1.0  # levels of 255; the colours of a cloud of one colour sa
 
 @dataclass(frozen=True)
 class Start:
-    """What the rules of the stage cloud measure; None is not measured."""
+    """Quantities that the rules of the stage cloud measure; None is not measured."""
 
     extent: float
     farthest: float

@@ -18,7 +18,7 @@ from gsbench.words import command, counted
 
 EXPERIMENT = """\
 # @package _global_
-# Which part of {densify} makes its gain: each combination of its parts against all of them.
+# A study of {densify}: each combination of its parts against all of them.
 # {summary}.
 # As conf/experiment/{name}.yaml: gsbench --config-dir conf +experiment={name}
 {content}"""

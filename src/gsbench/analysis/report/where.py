@@ -1,4 +1,4 @@
-"""Where an arm helps beyond noise, in the report: maps of regions (`analysis.regions`)."""
+"""Maps of regions in the report: an arm's gain beyond noise (`analysis.regions`)."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

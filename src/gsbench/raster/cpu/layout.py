@@ -71,7 +71,7 @@ def new_parameters(count: int) -> Parameters:
 
 
 class AdamStep(NamedTuple):
-    """What Adam needs besides parameters and gradients, which are those of one step."""
+    """State of Adam besides parameters and gradients, which are those of one step."""
 
     first: Parameters  # moments
     second: Parameters
