@@ -26,14 +26,13 @@ import matplotlib.pyplot as plt
 from IPython.display import HTML, Markdown
 
 from gsbench.analysis import load_experiment, to_frame
+from gsbench.analysis.comparison import compare
 from gsbench.analysis.designs import seeds_needed
 from gsbench.analysis.images import choose_views
-from gsbench.analysis.judgement import judge
-from gsbench.analysis.pairing import pair_trials
+from gsbench.analysis.pairs import pair_trials
 from gsbench.analysis.table_formats import to_markdown
 from gsbench.analysis.tables import build_table
 from gsbench.cli import run
-from gsbench.runs.experiments import Arm, Question, declared_now
 
 os.environ["GSBENCH_RUNS"] = tempfile.mkdtemp(prefix="gsbench-")
 runs = Path(os.environ["GSBENCH_RUNS"])
@@ -76,7 +75,7 @@ run(["-m", "scene=courtyard", "densify=adc,volumetric", "seed=0,1,2", "name=read
 # %% [markdown]
 # ## The table
 #
-# A cell is the mean over trials, with their deviation. Bold marks the best mean; it is not a test.
+# A cell is the mean over trials, with their deviation. Bold means: best, and shown to be.
 
 # %%
 experiment = load_experiment(runs, "reading")
@@ -108,15 +107,12 @@ frame.groupby("densify")[["psnr", "num_gaussians"]].agg(["mean", "std", "min", "
 # ## Seeds are paired
 #
 # The same seed means the same order of photographs in both arms, and every trial is measured on the same test views.
-# So we look at differences: volumetric minus baseline, for each seed. A question names the two arms and the metric,
-# and `judge` answers the questions of a declaration.
+# So we look at differences: volumetric minus baseline, for each seed. Before it trained anything, the command above
+# wrote its question: is volumetric's PSNR other than that of adc? `compare` answers the questions of an experiment.
 
 # %%
-adc, volumetric = Arm(init, "adc"), Arm(init, "volumetric")
-question = Question(
-    metric="psnr", sign=1, least=0.1, baseline=adc, arm=volumetric
-)  # 0.1 dB is what matters
-(verdict,) = judge(experiment.trials, declared_now(questions=(question,)))
+(answer,) = compare(experiment).answers
+adc, volumetric, verdict = answer.baseline, answer.arm, answer.verdict
 (differences,) = verdict.pairs.differences  # [seeds], one row a scene
 
 plt.figure(figsize=(7, 3))
@@ -135,15 +131,15 @@ plt.tight_layout()
 #
 # ## The verdict
 #
-# There are four outcomes. *Supported*: the interval of the mean difference lies on the claimed side of zero. *Refuted*:
-# on the other side. *Too small to matter*: within ± the least difference that matters. *Undecided*: these trials cannot
-# tell; that does not mean *no difference*.
+# *Better* or *worse*: the interval of the mean difference lies on one side of zero. *Undecided*: these trials cannot
+# tell; that does not mean *no difference*. A question that names the least difference that matters has one more
+# outcome, *too small*: the interval lies within ± that difference.
 
 # %%
 print(f"mean difference  {verdict.mean:+.3f} dB ({verdict.relative:+.2%})")
 print(f"interval         {verdict.interval.low:+.3f} to {verdict.interval.high:+.3f} dB")
-print(f"p                {verdict.p:.3f}")
-print(f"verdict          {verdict.outcome}, on {', '.join(verdict.pairs.scenes)}")
+print(f"p                {verdict.p:.3f}, at the level {verdict.level:.2g}")
+print(answer.line)
 
 # %% [markdown]
 # Few trials show only a large difference. How many seeds does a given difference need, to be seen in eight of ten such
