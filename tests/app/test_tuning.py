@@ -1,6 +1,7 @@
 """Tuning parity, with trials that take no time: what is declared, searched and chosen for arms."""
 
 import sys
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +15,13 @@ from gsbench.analysis.results import load_experiment
 from gsbench.analysis.tables import build_table
 from gsbench.errors import GsbenchError
 from gsbench.launch.outcomes import outcome_of_error, outcome_of_results
-from gsbench.launch.record import add_to_plan, declare
+from gsbench.launch.record import record
 from gsbench.parsing import read_typed
+from gsbench.runs.commands import digest_of, read_history
 from gsbench.runs.experiments import Arm, TuningRecord
+from gsbench.runs.keys import CODE_OF_STAGE
 from gsbench.runs.layout import RESULTS, TUNING
+from gsbench.runs.package_code import states_of
 from gsbench.runs.trial_record import record_from
 from tests.helpers import read_json, write
 from tests.launch.test_record import TINY
@@ -61,9 +65,8 @@ class Fake:
         self.trained = []
         self.batches = []
 
-    def __call__(self, trials):
-        add_to_plan(trials)
-        declare(trials)
+    def __call__(self, trials, asks=True):
+        record(trials, asks)
         self.batches.append(len(trials))
         return [self.run(trial) for trial in trials]
 
@@ -80,7 +83,11 @@ class Fake:
             views = {"psnr": 26.0 - error + 0.01 * values["seed"] + np.arange(3.0)}
             if self.own_metric:
                 views["mine"] = views["psnr"]
-            write_as(trial, **views)
+            history = read_history(trial.files.home)
+            place = values["scene"]["name"], values["seed"]
+            asked = history.covering(digest_of(values), *place)
+            code = {"packages": states_of(chain(*CODE_OF_STAGE.values()))}
+            write_as(trial, _questions=[one.id for one in asked], _code=code, **views)
         return outcome_of_results(trial.folder, record_from(results.read_bytes(), results))
 
     def tuning(self, arm):

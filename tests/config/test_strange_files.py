@@ -17,7 +17,7 @@ from tests.strange import place as place
 
 pytestmark = pytest.mark.usefixtures("place")
 READ = "${oc.env:KEY}"
-SECRET = "sesam-open"
+SECRET = "sesame-q7xk"
 OUTSIDE = "Parent traversal ('..')"
 PLACE = "must name a group or a file"
 

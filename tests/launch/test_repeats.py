@@ -12,7 +12,7 @@ from gsbench.runs.layout import BUILDING, CURVES, FAILED
 from tests.helpers import write, write_lines
 from tests.trials import bare_trial
 
-MIRROR = SimpleNamespace(follow=lambda *_: None)
+MIRROR = SimpleNamespace(follow=lambda *_: None, trial_ended=lambda: None)
 SERIAL = {"name": "serial", "parallel": 1, "wait": True}
 
 

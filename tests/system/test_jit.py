@@ -105,6 +105,7 @@ def test_sources_include_every_module_that_kernels_import():
         "system/resources.py",
         "scene/types.py",
         "scene/colmap.py",
+        "scene/rules.py",
         "raster/splitting.py",
     }
     around |= {"eval/images.py", "eval/protocol.py", "scene/options.py", "__init__.py"}

@@ -101,7 +101,7 @@ class Composer:
         single = [word for word in words if not is_sweep(word)]
         own = task_words(single)
         self.hydra_words = tuple(word for word in single if word not in own)
-        self._check_words(self.hydra_words)
+        self._check_words(single)  # before any of them is resolved
         self._chosen: dict[tuple[str, ...], DictConfig] = {}
         self._times: dict[str, Any] = {}  # what ${now:…} stands for, the same in all trials
         self._own_choices = _choices(own)

@@ -34,6 +34,7 @@ from gsbench.runs.user_code import UserCode
 from gsbench.scene.colmap import model_points, read_model, write_model
 from gsbench.scene.types import Capture, Scene, View
 from gsbench.system.own_modules import SAFE_PATH
+from gsbench.train.ideas import NO_IDEAS
 from gsbench.train.options import TrainConfig
 from tests.gaussians.helpers import random_gaussians
 from tests.helpers import read_json, refusal
@@ -217,6 +218,7 @@ def test_a_training_writes_its_model_lineage_and_summary(views, tmp_path, monkey
         trainer=ADC(),
         rasterizer=ReferenceRasterizer(),
         train=TrainConfig(iterations=2),
+        ideas=NO_IDEAS,
         seed=5,
         device=cpu,
         measured_earlier=[1],
