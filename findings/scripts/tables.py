@@ -191,6 +191,13 @@ def verdict_cells(verdict: Verdict) -> list[str]:
     return [shown, f"**{word}**", on]
 
 
+def difference_of(verdict: Verdict) -> str:
+    """The idea minus the baseline, by that of densifier and initialiser in which they differ."""
+    arms = (verdict.question.idea, verdict.question.baseline)
+    differ = arms[0].densify != arms[1].densify
+    return " − ".join(arm.densify if differ else arm.init for arm in arms)
+
+
 def answers() -> str:
     """The README's table: a claim about the rule a row."""
     rows = [[asked, *verdict_cells(verdicts(name)[claim])] for name, claim, asked in ASKED]
@@ -202,7 +209,7 @@ def answers() -> str:
 def claims_table(name: str) -> str:
     """A claim a row."""
     rows = [
-        [f"`{v.question.name}`: {v.question.idea} − {v.question.baseline}", *verdict_cells(v)]
+        [f"`{v.question.name}`: {difference_of(v)}", *verdict_cells(v)]
         for v in verdicts(name).values()
     ]
     return table(["claim", "difference (interval)", "verdict", "on"], rows)

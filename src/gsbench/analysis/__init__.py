@@ -1,9 +1,12 @@
 """Tables, statistics and reports. They are made from result files alone, without torch."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from gsbench.analysis.cells import to_frame
 from gsbench.analysis.results import load_experiment
+
+if TYPE_CHECKING:
+    from gsbench.analysis.frames import judge
 
 __all__ = ["judge", "load_experiment", "to_frame"]
 
