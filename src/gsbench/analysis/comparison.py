@@ -73,7 +73,10 @@ class Comparison:
 
     @property
     def pairs(self) -> tuple[tuple[Arm, Arm], ...]:
-        return tuple(dict.fromkeys((answer.baseline, answer.arm) for answer in self.answers))
+        """The pairs of baseline and idea that both have trials; a baseline may be awaited."""
+        known = {trial.arm for trial in self.trials}
+        pairs = dict.fromkeys((answer.baseline, answer.arm) for answer in self.answers)
+        return tuple(pair for pair in pairs if known.issuperset(pair))
 
     @property
     def sentences(self) -> list[str]:
@@ -99,7 +102,7 @@ class Comparison:
     @cached_property
     def remarks(self) -> list[Note]:
         """Notes that belong to the sentences, wherever they stand."""
-        compared = set(itertools.chain(*self.pairs))
+        compared = {arm for one in self.answers for arm in (one.baseline, one.arm)}
         alone = [arm for arm in dict.fromkeys(t.arm for t in self.trials) if arm not in compared]
         notes = [Note.of("no partner", arm=arm) for arm in alone if self.answers or len(alone) > 1]
         for answer in self.answers:
