@@ -307,7 +307,7 @@ def test_unequal_tuning_is_stated_in_headline_and_tables(sweep, runs):
     assert f"Tuning. {SENTENCE}" in lines
     experiment = load_experiment(runs, "fair")
     page = build_report(experiment)
-    order = "<strong>random-volumetric against", SENTENCE, "<summary>Fairness"
+    order = '<span class="name">random-volumetric', SENTENCE, "<summary>Fairness"
     places = [page.index(part) for part in order]
     assert places == sorted(places)
     assert any(SENTENCE in note for note in build_table(experiment).notes)
