@@ -390,7 +390,9 @@ def test_report_and_archive_have_the_ledger(home, trainings, said):
     assert "no metric was declared" not in page
     assert "The ledger decides on its ideas" in page
     badges = re.findall(r'class="badge [^"]*">([^<]+)<', page)
-    assert set(badges) <= {"NOT ASKED", "NOT TESTED"}  # the ledger's verdict is no second one
+    assert set(badges) == {"NOT TESTED"}  # the ledger's verdict is no second one
+    assert "the ledger&#39;s tests decide (gsbench ledger show night)" in page
+    assert "since the ledger's tests decide (gsbench ledger show night)" in said("tables", "night")
 
 
 def test_a_kept_idea_with_more_gaussians_says_so(home, trainings, capsys, said):
@@ -425,7 +427,7 @@ def test_show_prints_the_rule_and_a_row_for_each_idea(home, said):
     attempt(f"{SPLIT}=0.04", "--as", "bad")
     lines = said("ledger show night").splitlines()
     good, bad = (line.strip("| ").split(" | ") for line in lines if line[:4] in ("| 1 ", "| 2 "))
-    # the first look of six seeds has a twentieth of the level, as the others have more
+    # of the three looks at four seeds, the first two have a fifth of the level each
     assert good[:4] == ["1 good", "baseline", "0.023", "3 new"]
     assert good[-3:] == ["×1.00", "kept", "better"]
     assert bad[:4] == ["2 bad", "baseline", "", "2"]

@@ -29,9 +29,11 @@ from gsbench.analysis.verdicts import (
     judge,
 )
 from gsbench.runs.commands import Question, code_in
-from gsbench.runs.layout import TUNING
+from gsbench.runs.layout import LEDGER, TUNING
+from gsbench.words import command
 
 DEFAULT_METRIC = "psnr"
+LEDGER_DECIDES = "the ledger's tests decide ({})"
 
 
 @dataclass(frozen=True)
@@ -172,7 +174,7 @@ def compare(experiment: Experiment, baseline: str | None = None) -> Comparison:
         pairs = choose_pairs(rows, Asked(metric=DEFAULT_METRIC, baseline=baseline))
         known = {trial.arm for trial in trials}
         answers = [
-            _with_metrics(_interval(trials, *pair, NOT_TESTED), trials, *pair)
+            _with_metrics(interval_of(trials, *pair, DEFAULT_METRIC), trials, *pair)
             for pair in pairs
             if known.issuperset(pair)
         ]
@@ -211,8 +213,12 @@ def _answers(
         shown = (answered or current)[-1]
         others = tuple(one for one in reversed(own) if one is not shown)
         answers.append(_with_metrics(shown, trials, first, second, others))
+    state, why = NOT_ASKED, ""
+    if (experiment.folder / LEDGER).exists():  # it has asked, and its levels follow its own order
+        state, why = NOT_TESTED, LEDGER_DECIDES.format(command("ledger", "show", experiment.name))
     for pair in unasked:
-        answers.append(_with_metrics(_interval(trials, *pair, NOT_ASKED), trials, *pair))
+        shown = interval_of(trials, *pair, DEFAULT_METRIC, state, why)
+        answers.append(_with_metrics(shown, trials, *pair))
     return answers
 
 
@@ -223,12 +229,6 @@ def _named(question: Question, arms: Mapping[tuple[str, str], Arm]) -> Question:
         found = (arms.get((scene, both[side])) for scene, both in question.digests.items())
         sides.append(next(filter(None, found), name))
     return replace(question, baseline=sides[0], idea=sides[1])
-
-
-def _interval(
-    trials: Sequence[TrialResult], baseline: Arm, arm: Arm, state: Any, metric: str = DEFAULT_METRIC
-) -> Verdict:
-    return interval_of(trials, baseline, arm, metric, state)
 
 
 def _with_metrics(
