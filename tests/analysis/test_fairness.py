@@ -189,13 +189,11 @@ def test_the_sheet_says_whether_a_search_ended_before_the_trials(searched, said,
 # --- where it is shown
 
 
-def test_the_report_shows_the_sheet_before_the_numbers_of_the_verdict(tmp_path, paths):
+def test_the_report_shows_the_sheet_beside_the_numbers_of_the_verdict(tmp_path, paths):
     page = page_of(tmp_path)
-    assert (
-        page.index('<h2 id="h-verdict"')
-        < page.index("Fairness sheet: sfm-longaxis")
-        < page.index("seeds to resolve")
-    )
+    order = '<h2 id="h-verdict"', "seeds to resolve", "Fairness sheet: sfm-longaxis", "By scene"
+    places = [page.index(part) for part in order]
+    assert places == sorted(places)
     assert page.count("<caption>Fairness sheet") == 1
 
 

@@ -159,7 +159,7 @@ def test_arms_without_a_common_scene_are_described_by_one_trial_each(tuned_on_ro
 
 
 def test_the_report_says_it_beside_the_verdict(tuned_on_room, tmp_path):
-    verdict = page_of(tmp_path).partition('<div class="verdict">')[2].partition("</div>")[0]
+    verdict = page_of(tmp_path).partition('<details class="idea"')[2].partition("<table")[0]
     assert (
         "Scenes of sfm-mcmc differ in more than the scene: densify.split_size (500 on " in verdict
     )

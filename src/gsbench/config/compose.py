@@ -101,7 +101,8 @@ class Composer:
         single = [word for word in words if not is_sweep(word)]
         own = task_words(single)
         self.hydra_words = tuple(word for word in single if word not in own)
-        self._check_words(single)  # before any of them is resolved
+        self._check_texts(single)  # before any of them is resolved
+        self._check_words(self.hydra_words)
         self._chosen: dict[tuple[str, ...], DictConfig] = {}
         self._times: dict[str, Any] = {}  # what ${now:…} stands for, the same in all trials
         self._own_choices = _choices(own)
@@ -249,12 +250,16 @@ class Composer:
 
     def _check_words(self, words: Sequence[str]) -> None:
         """Refuse words that would resolve what is not allowed, or leave the folder of a group."""
+        self._check_texts(words)
         for word in words:
-            override = parse_word(word)
-            if "${" in word:
-                check_texts({override.key_or_group: override.value()}, self.allowed)
             if not _is_value(word):
-                check_choice(word, str(override.value()))
+                check_choice(word, str(parse_word(word).value()))
+
+    def _check_texts(self, words: Sequence[str]) -> None:
+        for word in words:
+            if "${" in word:
+                override = parse_word(word)
+                check_texts({override.key_or_group: override.value()}, self.allowed)
 
     def _are_own(self, choices: Mapping[str, str]) -> bool:
         """Return whether ``choices`` give the files of the command's own composition."""

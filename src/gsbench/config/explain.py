@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from omegaconf.errors import (
 
 from gsbench.config.groups import EXTERNAL_FOLDER, GROUPS, options
 from gsbench.config.overrides import key_of
+from gsbench.config.schema import class_defaults
 from gsbench.config.search_path import searched_folders
 from gsbench.errors import GsbenchError, InputError
 from gsbench.system.install import conf_dir
@@ -132,10 +134,16 @@ def _groups_with(key: str, root: DictConfig) -> str:
 def _settings_of_choices(group: str) -> dict[str, list[str]]:
     """The settings that files of a group's choices have, each with the names of these choices."""
     found: dict[str, list[str]] = {}
+    of_classes = class_defaults().get(group, {})
     for name in options(group) if group in GROUPS else ():
         if "/" not in name:
             text = Path(conf_dir(), group, f"{name}.yaml").read_text(encoding="utf-8")
-            for key in re.findall(r"^(\w+):", text, re.M):
+            classes = re.findall(rf"/schema/{group}/(\w+)@", text)
+            keys = [
+                *re.findall(r"^(\w+):", text, re.M),
+                *chain(*(of_classes[one] for one in classes)),
+            ]
+            for key in keys:
                 found.setdefault(key, []).append(name)
     found.pop("defaults", None)
     return found

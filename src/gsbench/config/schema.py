@@ -200,6 +200,15 @@ ROOT_SETTINGS = frozenset(
 
 
 @cache
+def class_defaults() -> dict[str, dict[str, dict[str, Any]]]:
+    """The options that classes add to their base classes, by group and name of the class."""
+    found: dict[str, dict[str, dict[str, Any]]] = json.loads(
+        CLASS_DEFAULTS.read_text(encoding="utf-8")
+    )
+    return found
+
+
+@cache
 def register_schemas() -> None:
     """Register the schemas and gsbench's plug-ins with Hydra.
 
@@ -212,7 +221,7 @@ def register_schemas() -> None:
     store.store(name="config_schema", node=_names_and_defaults(Config))
     for group, schema in GROUP_SCHEMAS.items():
         store.store(group=f"schema/{group}", name="base", node=_names_and_defaults(schema))
-    for group, classes in json.loads(CLASS_DEFAULTS.read_text(encoding="utf-8")).items():
+    for group, classes in class_defaults().items():
         for name, defaults in classes.items():
             store.store(group=f"schema/{group}", name=name, node=defaults)
     settings = {"params": {}, "grids": [], "tune": dataclasses.asdict(TuneSettings())}
