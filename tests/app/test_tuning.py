@@ -275,8 +275,8 @@ def test_an_interval_searches_one_arm(runs, monkeypatch):
 def test_a_users_metric_is_optimised_in_the_direction_of_its_class(sweep, runs, monkeypatch):
     monkeypatch.setattr(sys, "path", list(sys.path))
     text = "class Mine:\n    direction = -1\n    def measure(self, *given): ...\n"
-    Path("own.py").write_text(text)
-    own = ["eval.extra.mine._target_=own.Mine", "allow_targets=[own]"]
+    Path("own_measure.py").write_text(text)
+    own = ["eval.extra.mine._target_=own_measure.Mine", "allow_targets=[own_measure]"]
     words = [*own, f"{TUNE}.metric=mine", f"{TUNE}.points=2"]
     assert sweep(Fake(own_metric=True), *words) == 0
     search = tuning(runs, "adc")

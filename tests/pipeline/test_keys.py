@@ -27,9 +27,9 @@ KEYS = [
     # of the reference cameras
     ("init", "991c126deb4c8459394f2310586bfbb26251e999e306344a946a5826c7fb07d9"),
     ("init", "be87afd1f24decd7478d620990cb56e1cc80f616bd5045809f5a0ed92ef3a68a"),
-    ("train", "097f112ce8266f6015db59464b6e89909976c37b5e5c21ebee455db9c73656ce"),
+    ("train", "faf230c48612eddd14d6476ed24f063202faa9d70628a6b4403336516d42a95d"),
     ("ground_truth", "3989bfa30383b1f506f4107150a86428b608f6e06dd12db46466e1d0d20cab1e"),
-    ("evaluate", "baf5f4b50ed8e8ce040b2b228a0c9549505c5def2e7061b822aff2e5290c3479"),
+    ("evaluate", "25bd0eccbb4e655e8384a52618a6e0624d3d0d977f8c3dc7fe234f4ed6fee1b8"),
 ]
 
 

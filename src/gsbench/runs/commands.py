@@ -41,6 +41,7 @@ from gsbench.runs.trial_record import FROM_RENDERS
 from gsbench.runs.user_code import user_modules
 from gsbench.settings import ARM_BYTES, is_folder_name
 from gsbench.system.locks import hold
+from gsbench.words import counted
 
 ERROR_RATE = 0.05
 BY_COMMAND = "command"  # the rule that gives a question its level
@@ -287,34 +288,53 @@ class History:
 
 
 def read_history(home: Path) -> History:
-    """Commands and questions of the experiment in ``home``; nothing without a file."""
-    content = _content(home / COMMANDS)
-    commands, results, faults = _of_old_plan(home), set[tuple[Digest, Place]](), list[str]()
-    before = ""
+    """Commands and questions of the experiment in ``home``; nothing without a file.
+
+    What cannot be read is named in ``faults`` and left out.
+    """
+    commands, results, before = list[Command](), set[tuple[Digest, Place]](), ""
+    unread, damaged, unlinked = list[str](), list[str](), list[str]()
+    try:
+        commands += _of_old_plan(home)
+    except DamagedError as error:
+        unread.append(f"{PLAN} {error.reason}")
+    try:
+        content = _content(home / COMMANDS)
+    except DamagedError as error:
+        content = b""
+        unread.append(f"{COMMANDS} {error.reason}")
     for number, text in enumerate(content.splitlines(), 1):
         try:
             line = _parsed(text, home / COMMANDS)
         except DamagedError as error:
-            faults.append(f"{home.name}: line {number} of {error.path.name} {error.reason}")
+            damaged.append(f"line {number} of {COMMANDS} {error.reason}")
         else:
             if line.previous != before:
-                faults.append(
-                    f"{home.name}: line {number} of {COMMANDS} does not follow the one before it: "
-                    "a line was changed, added or removed"
+                unlinked.append(
+                    f"line {number} of {COMMANDS} does not follow the one before it: a line was "
+                    "changed, added or removed"
                 )
             if isinstance(line, Command):
                 commands.append(line)
             else:
                 results.add((line.digest, line.place))
         before = _link(text)
-    return History(home, tuple(commands), frozenset(results), tuple(faults))
+    # a file of garbage has many lines, of which the first says enough
+    found = [*unread, *(_first_of(lines) for lines in (damaged, unlinked) if lines)]
+    faults = tuple(f"{home.name}: {fault}" for fault in found)
+    return History(home, tuple(commands), frozenset(results), faults)
+
+
+def _first_of(lines: Sequence[str]) -> str:
+    first, *others = lines
+    return f"{first} (and {counted(len(others), 'more line')})" if others else first
 
 
 def _of_old_plan(home: Path) -> list[Command]:
     """The trials in ``plan.json`` of an earlier gsbench, each as a command of its own."""
     try:
         planned = read_typed(home / PLAN, _OldPlan).trials
-    except (FileNotFoundError, DamagedError):
+    except FileNotFoundError:
         return []
     return [
         Command(

@@ -3,6 +3,7 @@
 import json
 import logging
 import os
+import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
@@ -29,7 +30,7 @@ from gsbench.launch.states import (
     states_now,
     states_of_experiment,
 )
-from gsbench.runs.commands import PlannedTrial, drop
+from gsbench.runs.commands import PlannedTrial, drop, read_history
 from gsbench.runs.experiments import experiment_home, list_experiments, trial_folders
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS
@@ -76,6 +77,7 @@ def status(argv: Sequence[str], runs: Path) -> int:
     home = experiment_home(runs, options.experiment)
     if options.watch:
         _watch(home)
+    _say_what_is_lost(home)
     trials = states_now(home)
     if options.verify:
         trials = [_verified(trial) for trial in trials]
@@ -99,6 +101,12 @@ def status(argv: Sequence[str], runs: Path) -> int:
     else:
         print("\n".join(lines_of(trials, options.all)))
     return int(any(trial.state in RETRIED for trial in trials))
+
+
+def _say_what_is_lost(home: Path) -> None:
+    """Print a line for each fault of the plan: what it lists may be missing from the states."""
+    for fault in read_history(home).faults:
+        print(f"left out: {fault}", file=sys.stderr)
 
 
 def _verified(trial: TrialState) -> TrialState:
@@ -170,6 +178,7 @@ def _overview(runs: Path) -> int:
     if not names:
         print(f"no experiment in {runs} yet")
     for name in names:
+        _say_what_is_lost(runs / name)
         print(f"{name:<20} {summary_of(states_now(runs / name))}")
     return 0
 
@@ -204,6 +213,7 @@ def retry(argv: Sequence[str], runs: Path) -> int:
             f"{refused[0]} would make other trials than those of the plan: give the sweep's own "
             "command"
         )
+    _say_what_is_lost(home)
     unfinished = [trial for trial in states_of_experiment(home) if trial.state in RETRIED]
     if not unfinished:
         print(f"nothing to retry: all trials of {options.experiment} are done, running or queued")
