@@ -225,7 +225,7 @@ print(float((output.image.double() - expected.image).abs().max()), worst)
     value_error, gradient_error = map(float, run.stdout.split())
     assert value_error < 1e-4
     assert gradient_error < 1e-3
-    assert "compiling for this processor" in run.stderr
+    assert "compiling kernels for this processor" in run.stderr
     assert any(tmp_path.rglob("*.nbc"))
 
 

@@ -183,7 +183,13 @@ def test_a_proof_is_kept_and_made_again_for_another_version(cache, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "source", ["raster/triton/composite.py", "raster/staged.py", "train/loss_triton.py"]
+    "source",
+    [
+        "raster/triton/composite.py",
+        "raster/formulas.py",
+        "raster/staged.py",
+        "train/loss_triton.py",
+    ],
 )
 def test_a_changed_source_file_of_the_kernels_changes_the_version(tmp_path, monkeypatch, source):
     before = module.versions_on(CPU)
@@ -409,6 +415,7 @@ def test_doctor_makes_a_proof_on_request_and_shows_the_last_one(monkeypatch, cap
 COMPOSITE, FOOTPRINT, PROJECTION, GEOMETRY = (
     f"raster/triton/{name}.py" for name in ("composite", "footprint", "projection", "geometry")
 )
+FORMULAS = "raster/formulas.py"
 FAULTS = {
     "none": ("raster/triton/layout.py", "SEGMENT = tl.constexpr(256)", "SEGMENT = tl.constexpr(8)"),
     "a sign": (COMPOSITE, "tl.fma(light, shine, -behind)", "tl.fma(light, shine, behind)"),
@@ -443,18 +450,18 @@ FAULTS = {
         "blended = power >= LOG2_ALPHA_MIN",
     ),
     "a missing term of the position's gradient": (
-        PROJECTION,
+        FORMULAS,
         "view_z = -(by_focal * inverse_z + ",
         "view_z = -(",
     ),
     "a sign of the quaternion's gradient": (
-        PROJECTION,
+        FORMULAS,
         "qz * w_x - qx * w_z",
         "qz * w_x + qx * w_z",
     ),
     "a missing term of the splitting matrix": (PROJECTION, "q11 - e * h", "q11"),
     "a factor in harmonics of degree 3": (GEOMETRY, "8 * T2 * yz", "4 * T2 * yz"),
-    "a swapped axis": (GEOMETRY, "(v.r10, v.r11, v.r12)", "(v.r11, v.r10, v.r12)"),
+    "a swapped axis": (FORMULAS, "(v.r10, v.r11, v.r12)", "(v.r11, v.r10, v.r12)"),
     "a weight of the loss": (
         "train/loss_triton.py",
         "(W0, W1, W2, W3, W4, W5)[k]",

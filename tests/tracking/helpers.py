@@ -90,9 +90,14 @@ def found_runs(client, name):
     return [] if experiment is None else client.search_runs([experiment.experiment_id])
 
 
+def trial_runs(client, name="tracked"):
+    """The runs of an experiment's trials, without the parent runs of its ideas."""
+    return [run for run in found_runs(client, name) if run.data.tags.get("kind") != "idea"]
+
+
 def run_of(client, seed):
     """The only run of the experiment ``tracked`` with this seed."""
-    (run,) = [run for run in found_runs(client, "tracked") if run.data.tags["seed"] == str(seed)]
+    (run,) = [run for run in trial_runs(client) if run.data.tags["seed"] == str(seed)]
     return run
 
 

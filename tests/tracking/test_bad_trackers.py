@@ -22,12 +22,12 @@ from tests.processes import completed, heed_interrupts
 from tests.tracking.helpers import (
     begin_trial,
     child_environment,
-    found_runs,
     free_port,
     history,
     mirror_command,
     mirror_trial,
     options,
+    trial_runs,
     write_trial,
 )
 from tests.tracking.servers import Gate, Listener
@@ -187,7 +187,7 @@ def test_sync_completes_runs_whose_tracker_was_lost_at_any_moment(tracker, tmp_p
         values = trial_values(tmp_path, seed)
         mirror_trial(options(uri), TrialFolder.of(values).path, values)
     client = connect(uri, tmp_path)
-    found = found_runs(client, "tracked")
+    found = trial_runs(client)
     assert sorted(run.data.tags["seed"] for run in found) == [str(seed) for seed in range(4)]
     for run in found:
         assert run.info.status == "FINISHED"

@@ -13,6 +13,7 @@ from tests.tracking.helpers import (
     mirror_command,
     mirror_trial,
     options,
+    trial_runs,
 )
 from tests.trials import STEPS, trial_values
 
@@ -43,7 +44,7 @@ def run_jobs(runs, uri):
 
 
 def check_jobs(client):
-    found = found_runs(client, "tracked")
+    found = trial_runs(client)
     assert sorted(run.data.tags["seed"] for run in found) == [str(seed) for seed in range(JOBS)]
     for run in found:
         seed = int(run.data.tags["seed"])
@@ -53,6 +54,8 @@ def check_jobs(client):
         ]
         assert {value for _, value in history(client, run.info.run_id, "train/l1")} == {float(seed)}
         assert run.data.metrics["eval/gaussians"] == 10 + seed
+    # and one parent run of their idea
+    assert len(found_runs(client, "tracked")) == JOBS + 1
     assert found_runs(client, "Default") == []
 
 
