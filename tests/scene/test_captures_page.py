@@ -1,6 +1,6 @@
 """docs/captures.md has the present table of rules."""
 
-from scripts import captures
+from scripts import captures_page as captures
 
 
 def test_the_table_of_rules_in_the_page_is_current():

@@ -8,7 +8,7 @@ from string import Formatter
 from gsbench.scene.rules import ABOVE_ZERO, RULES, Rule
 
 PAGE = Path(__file__).parents[1] / "docs" / "captures.md"
-BEGIN, END = "<!-- rules: made by scripts/captures.py -->", "<!-- end of rules -->"
+BEGIN, END = "<!-- rules: made by scripts/captures_page.py -->", "<!-- end of rules -->"
 LONGEST = 80  # characters of a sentence
 
 
