@@ -3,6 +3,7 @@
 import itertools
 import shutil
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -16,6 +17,7 @@ from gsbench.init.colmap.database import DatabaseTask, create_database, unknown_
 from gsbench.init.colmap.features import extract_sift
 from gsbench.init.colmap.matches import distribute_parts, divide_pairs, match_sift
 from gsbench.init.colmap.pairs import best_pairs
+from gsbench.init.sfm import match_by_sift
 from gsbench.logs import no_progress
 
 pairs_of_some_images = st.integers(2, 40).flatmap(
@@ -135,7 +137,8 @@ def test_auto_matches_only_the_pairs_that_a_preview_proposes(
     monkeypatch.setattr("gsbench.init.colmap.pairs.ALL_PAIRS_UP_TO", 5)
     monkeypatch.setattr("gsbench.init.colmap.pairs.best_pairs", partial(best_pairs, partners=2))
     monkeypatch.setattr("gsbench.init.colmap.features.extract_sift", lambda *_: None)
-    counts = Sfm(threads=1, pairs="auto").fill_database(task, no_progress, Timer())
+    job = SimpleNamespace(options=Sfm(threads=1, pairs="auto"))
+    counts = match_by_sift(task, job, no_progress, Timer())
     assert counts["pairs_selected"] + counts["pairs_left_out"] == len(pairs)
     assert counts["pairs_left_out"] > 10
     matched = read_matches(task.database)
