@@ -1,6 +1,7 @@
 """Another program as an arm: its inputs, the trials made of its results, and its failures."""
 
 import hashlib
+import html
 import os
 import re
 import signal
@@ -137,6 +138,8 @@ def test_two_programs_and_a_folder_of_renders_in_one_table(home, monkeypatch, ca
         for arm in split("adc cloud painter folder")
     }
     assert "2.0" in rows["cloud"]  # thousand Gaussians: one for each point
+    assert run(["tables", "three", "--format", "html"]) == 0  # with all notes
+    table = html.unescape(capsys.readouterr().out)
     # LPIPS; Gaussians of renders; their time
     assert [row.count("n/a") for row in rows.values()] == [1, 1, 2, 3]
     assert (
@@ -153,7 +156,7 @@ def test_two_programs_and_a_folder_of_renders_in_one_table(home, monkeypatch, ca
     report = (home / "runs/three/report.html").read_text()
     for arm in ("cloud", "painter", "folder"):
         assert re.search(
-            rf"random-{arm} against random-adc, on this scene: (better|worse)", report
+            rf"random-{arm} against random-adc: (better|worse|not asked beforehand)", report
         ), arm
     explain = "explain three:garden:psnr:"
     for words in ("status three", f"{explain}cloud", f"{explain}painter", "sync three"):

@@ -164,35 +164,32 @@ def test_the_recipe_of_the_readme_gives_a_declared_verdict_in_two_commands(gsben
 
 
 @pytest.mark.slow
-def test_a_claims_file_and_its_archive(gsbench, runs, tmp_path):
-    settings = {word.split("=", 1)[0]: yaml.safe_load(word.split("=", 1)[1]) for word in TINY[1:]}
-    claim = {
-        "id": "points",
-        "says": "More points help.",
-        "where": "Table 1",
-        "baseline": "few",
-        "arm": "many",
-    }
-    claim |= {"metric": "psnr", "direction": "higher", "least": 0.01, "refuted_if": "it is worse"}
+def test_questions_of_a_file_and_their_archive(gsbench, runs, tmp_path):
+    """A paper's claim is a question in an experiment's file, which an archive keeps."""
+    settings = {word.split("=", 1)[0]: word.split("=", 1)[1] for word in TINY[1:]}
+    question = {"idea": "none", "baseline": "adc", "metric": "psnr", "direction": "lower"}
+    question |= {"least": 0.01, "says": "Growing helps.", "where": "Table 1"}
     content = {
-        "name": "check_it",
-        "paper": "Made up, 2026",
-        "settings": settings,
-        "arms": {"few": {"init.count": 200}, "many": {"init.count": 2000}},
-        "scenes": {"courtyard": None},
-        "claims": [claim],
-        "seeds": 2,
+        "name": "asked",
+        "questions": [question],
+        "hydra": {
+            "mode": "MULTIRUN",
+            "sweeper": {"params": settings | {"densify": "adc,none", "seed": "0,1"}},
+        },
     }
-    (tmp_path / "claims.yaml").write_text(yaml.safe_dump(content))
-    assert " points: " in gsbench("check claims.yaml").stdout
-    page = (runs / "check_it/claims.html").read_text()
-    gsbench("export --results check_it --out published.zip")
-    gsbench("check claims.yaml --from published.zip --out again.html", GSBENCH_RUNS="elsewhere")
-    headlines = [
-        re.findall(r"<h2>.*?</h2>|<p>PSNR .*?</p>", text)
-        for text in (page, (tmp_path / "again.html").read_text())
-    ]
-    assert headlines[0] == headlines[1] != []
+    file = tmp_path / "my/experiment/asked.yaml"
+    file.parent.mkdir(parents=True)
+    file.write_text("# @package _global_\n" + yaml.safe_dump(content))
+    gsbench("--config-dir my +experiment=asked")
+    gsbench("report asked")
+    page = (runs / "asked/report.html").read_text()
+    assert "Growing helps." in page
+    assert "Table 1" in page
+    gsbench("export --results asked --out published.zip")
+    gsbench("site published.zip --out site", GSBENCH_RUNS="elsewhere")
+    (again,) = (tmp_path / "site").rglob("asked*.html")
+    sentence = re.search(r"<p>(random-none against random-adc: [^<]+)", page)[1]
+    assert sentence in again.read_text()
     assert not (tmp_path / "elsewhere").exists()
 
 
