@@ -417,7 +417,7 @@ def test_the_whole_day_in_the_interpreter(day):
     assert code == 0, said
     said = day.run("table", str(day.out), REAL="1")[1]
     assert "NO (" not in said
-    proof = r"^- proof-cpu: yes, \d+ s; device .+; versions \{.*'torch'.*; errors \{.*'image'"
+    proof = r"^- proof-triton: yes, \d+ s; device .+; versions \{.*'triton'.*; errors \{.*'image'"
     assert re.search(proof, said, re.MULTILINE)
     assert re.search(r"^- contract: yes, \d+ s; \d+ passed", said, re.MULTILINE)
     assert re.search(r"^- memcheck: yes, \d+ s; 1 passed", said, re.MULTILINE)

@@ -134,7 +134,8 @@ def results_of(runs, name):
     for path in sorted(runs.glob(f"{name}/*/*/*/results.json")):
         results = {key: value for key, value in read_json(path).items() if key not in CLOCKED}
         results["init_report"].pop("seconds", None)
-        results.pop("experiment")
+        for of_the_sweep in ("experiment", "questions"):
+            results.pop(of_the_sweep, None)
         files = [
             path.with_name(name) for name in split("point_cloud.ply per_view.csv events.jsonl")
         ]

@@ -35,6 +35,7 @@ IN_ASCII = {
     "view": "é",
     "fetch": "é",
     "bench": "--raster é",
+    "clean": "",
     "ui": "é",
     "doctor": "",
 }

@@ -21,6 +21,7 @@ from gsbench.view.trials import find_trial, model_file
 from tests.end_to_end.conftest import FINISHED
 from tests.end_to_end.test_hydra import TINY
 from tests.helpers import write
+from tests.trials import search_record
 
 PAGE = Path(__file__).parents[2] / "docs/security.md"
 pytestmark = pytest.mark.slow
@@ -108,7 +109,11 @@ VERB_ROWS = {
         ON_GPU,
         "",
     ),
-    "`export`": ([["export", TRIAL], ["export", TRIAL, "--out", "m.html"]], {"npx"}, ""),
+    "`export`, `clean`": (
+        [["export", TRIAL], ["export", TRIAL, "--out", "m.html"], ["clean", "--dry-run"]],
+        {"npx"},
+        "",
+    ),
     "`view`": ([["view", TRIAL, "--port", "0"]], ON_GPU, ""),
     "`sync`, `ui`": (
         [["sync", FINISHED]],
@@ -287,12 +292,25 @@ def store(trial, shown):
     assert not list(Path().glob("edited*"))
 
 
-def plans(trial, shown):
+def commands(trial, shown):
+    """Each trial that ends adds a line, so there are at least two."""
+    file = trial.parents[2] / "commands.jsonl"
+    assert "commands.jsonl" not in "".join(shown().values())
+    first, *others = file.read_text().splitlines()
+    file.write_text("\n".join([first.replace("cwd", "CWD"), *others, ""]))
+    texts = shown()
+    assert all("commands.jsonl" in texts[verb] for verb in ("tables", "report")), texts
+
+
+def search(trial, shown):
     home = trial.parents[2]
+    point = {"settings": {"densify.volume_threshold": 0.03}, "value": 20.0}
+    sweep = {"sweep": home.name, "ranges": {"densify.volume_threshold": "0.01,0.03"}}
+    file = write(home / "tuning.json", search_record([point]) | sweep)
     before = shown()
-    lines = (home / "commands.jsonl").read_text().splitlines()
-    (home / "commands.jsonl").write_text("\n".join([lines[0].replace("cwd", "CWD"), *lines[1:]]))
-    assert "commands.jsonl" in shown()["tables"] or shown() != before
+    file.write_text(file.read_text().replace("20.0", "21.0"))
+    assert shown().keys() == before.keys()
+    assert not any("tuning.json" in text for text in shown().values())
 
 
 # rows whose tests are where their files are made
@@ -305,7 +323,8 @@ HERE = {
     "`metrics.jsonl`, `events.jsonl`, `volume_histograms.jsonl`": curves,
     "pictures of a trial": pictures,
     "`store/`: results of stages and prepared views": store,
-    "`commands.jsonl`, `tuning.json`": plans,
+    "`commands.jsonl`": commands,
+    "`tuning.json`": search,
 }
 
 

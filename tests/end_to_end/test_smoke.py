@@ -1,7 +1,6 @@
 """One short test of the program for each of its uses; part of ``make test``."""
 
 import csv
-import html
 import os
 import re
 import shlex

@@ -35,7 +35,7 @@ from gsbench.errors import InputError
 from gsbench.eval.facts import find_metric
 from gsbench.parsing import read_if_sound
 from gsbench.runs import layout
-from gsbench.runs.experiments import TuningRecord
+from gsbench.runs.experiments import Arm, TuningRecord
 from gsbench.runs.ledger import read_ledger
 from gsbench.scene.images import read_image
 from gsbench.words import command, counted, signed
@@ -136,17 +136,34 @@ def compare_arms(
 ) -> dict[str, Any]:
     """Everything that the page shows of two arms; notes say what could not be compared or read.
 
-    ``older`` are the trials of earlier code.
+    ``older`` are the trials of earlier code. An arm whose trials are still awaited has no settings
+    to compare.
     """
     first, second = judged.baseline, judged.arm
     verdicts = [judged.verdict, *judged.metrics]
     baseline, other = trials_of(trials, first), trials_of(trials, second)
     views, faults = choose_views(pair_trials(trials, first, second))
+    settings: dict[str, Any] = {"caveats": "", "fairness": None, "facts": []}
+    if baseline and other:
+        settings = _settings_of_both(trials, first, second, older)
     return {
         "judged": judged,
         "title": f"{second} against {first}",
         "verdicts": verdicts,
         "has_like_these": judged.verdict.like_these is not None,
+        **settings,
+        "forests": [_forest(verdict) for verdict in verdicts],
+        "views": views,
+        "notes": texts([*judged.verdict.notes, *faults]),
+    }
+
+
+def _settings_of_both(
+    trials: Sequence[TrialResult], first: Arm, second: Arm, older: Sequence[TrialResult]
+) -> dict[str, Any]:
+    """What differs between the settings and the costs of two arms with trials."""
+    baseline, other = trials_of(trials, first), trials_of(trials, second)
+    return {
         "caveats": " ".join(
             texts(
                 [
@@ -158,9 +175,6 @@ def compare_arms(
         ),
         "fairness": fairness_table(trials, first, second, older),
         "facts": [*_costs(baseline, other), *between_scenes_notes(baseline, other)],
-        "forests": [_forest(verdict) for verdict in verdicts],
-        "views": views,
-        "notes": texts([*judged.verdict.notes, *faults]),
     }
 
 
