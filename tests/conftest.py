@@ -9,6 +9,7 @@ from pathlib import Path
 # before torch is imported, as the program itself does
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"
+os.environ.pop("GSBENCH_DATA", None)  # a user's own captures
 
 import pytest
 from filelock import FileLock

@@ -1,6 +1,7 @@
 """All answers of an experiment: badges, other questions, folded code, and what nobody asked."""
 
 import itertools
+import shutil
 
 import pytest
 
@@ -140,8 +141,26 @@ def test_after_an_edit_rows_that_were_not_trained_again_are_folded_as_earlier_co
     assert "9 trials of sfm-mine made by earlier versions of mine" in line
     shown = [trial for trial in experiment.trials if trial.densify == "mine"]
     assert {trial.record.code.sources["mine"][0] for trial in shown} == {"2"}
-    newest = [one for one in answers(tmp_path) if one.verdict.question.n == 2]
-    assert [one.badge for one in newest] == ["WORSE"]
+    newest, *earlier = answers(tmp_path)
+    assert (newest.badge, newest.verdict.question.n, newest.earlier) == ("WORSE", 2, False)
+    assert len(earlier) == 3
+    assert all(one.sentence.endswith(" (earlier code)") for one in earlier)
+
+
+@pytest.mark.parametrize("metric, named", [("psnr", True), ("ssim", False)])
+def test_another_experiment_that_asked_about_the_same_trials_is_named(tmp_path, metric, named):
+    """Its trainings were started there, so nobody asked beforehand here."""
+    write_runs(tmp_path, **CLEAR)
+    ask_about(tmp_path, metric=metric)
+    copy = shutil.copytree(tmp_path / "exp", tmp_path / "copy")
+    (copy / "commands.jsonl").unlink()
+    for path in copy.glob("*/*/*/results.json"):
+        change_json(path, questions=[], experiment="copy")
+    (answer,) = compare(load_experiment(tmp_path, "copy")).answers
+    assert answer.badge == "NOT ASKED"
+    assert ("here, but in experiment exp: gsbench tables exp" in answer.sentence) == named
+    (there,) = answers(tmp_path)
+    assert there.badge == "BETTER"
 
 
 def test_a_trial_of_no_question_is_named(tmp_path):

@@ -226,6 +226,10 @@ def test_results_that_are_worth_little_or_may_surprise_are_noted_once(tmp_path):
         "garden sfm, accepted by scene.accept=[panorama]: 3 photographs are panoramas.",
     ]
     assert doubt_notes(made) == []
+    both = [with_record(one, one_color_psnr=99.0) for one in made]
+    (line,) = texts(doubt_notes(both))
+    assert line.startswith(f"(!) {made[0].label} is not better than one colour: ")
+    assert line.endswith("; the same holds for 1 more trial.")
 
 
 @pytest.mark.parametrize("lost, rest", [(1, ""), (3, ""), (4, " and 1 more"), (5, " and 2 more")])

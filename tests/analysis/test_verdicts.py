@@ -142,7 +142,7 @@ def test_there_is_no_verdict_before_all_trials_are_done_or_have_failed(asked):
         verdict = judge(some, question, [lost(trials, place, **state)])
         assert (badge(verdict), verdict.outcome, verdict.final) == (name, "undecided", False)
         assert verdict.mean == pytest.approx(3, abs=0.5)
-    assert "`gsbench retry exp` goes on" in sentence(verdict)
+    assert "to go on: gsbench retry exp" in sentence(verdict)
     failed = judge(some, question, [lost(trials, place, failed=True)])
     assert (badge(failed), failed.outcome) == ("BETTER", "supported")
 

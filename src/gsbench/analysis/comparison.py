@@ -28,11 +28,13 @@ from gsbench.analysis.verdicts import (
     interval_of,
     judge,
 )
-from gsbench.runs.commands import Question, code_in
+from gsbench.runs.commands import Question, asked_elsewhere, code_in
 from gsbench.runs.layout import LEDGER, TUNING
 from gsbench.words import command
 
 DEFAULT_METRIC = "psnr"
+EARLIER = " (earlier code)"
+ASKED_ELSEWHERE = "in experiment {}: {}"
 LEDGER_DECIDES = "the ledger's tests decide ({})"
 
 
@@ -42,7 +44,8 @@ class Answer:
 
     ``verdict`` is that of the last answered question about the present code; else of the last
     question, or an interval that nobody asked for. ``others`` are the verdicts on its other
-    questions, the newest first; ``metrics`` the intervals of all other metrics.
+    questions, the newest first; ``metrics`` the intervals of all other metrics. ``earlier``: it is
+    about trials of code that was edited since.
     """
 
     baseline: Arm
@@ -50,6 +53,7 @@ class Answer:
     verdict: Verdict
     others: tuple[Verdict, ...] = ()
     metrics: tuple[Verdict, ...] = ()
+    earlier: bool = False
 
     @property
     def badge(self) -> str:
@@ -57,7 +61,12 @@ class Answer:
 
     @property
     def sentence(self) -> str:
-        return sentence(self.verdict)
+        return f"{sentence(self.verdict)}{EARLIER * self.earlier}"
+
+    @property
+    def headline(self) -> str:
+        """``random-mine against random-adc: BETTER, PSNR (dB) +0.50``"""
+        return f"{headline(self.verdict)}{EARLIER * self.earlier}"
 
     @property
     def line(self) -> str:
@@ -93,7 +102,7 @@ class Comparison:
     @property
     def headlines(self) -> list[str]:
         """One line for each idea."""
-        return [headline(answer.verdict) for answer in self.answers]
+        return [answer.headline for answer in self.answers]
 
     @property
     def risk(self) -> str:
@@ -160,7 +169,7 @@ def verdict_json(verdict: Verdict) -> dict[str, Any]:
 
 
 def compare(experiment: Experiment, baseline: str | None = None) -> Comparison:
-    """The answers of an experiment.
+    """The answers of an experiment, those about earlier code last.
 
     With ``baseline``, a densifier, each other arm is shown against it, with intervals alone: the
     baseline was chosen after the results.
@@ -201,6 +210,7 @@ def _answers(
         if pair[1] not in ideas and {trial.arm for trial in trials}.issuperset(pair)
     ]
     answers = []
+    folded = {trial.path for trial in experiment.older}
     for (first, second, _), own in verdicts.items():
         newest = own[-1].question
         code = {code_in(second) for _, second in newest.digests.values()}
@@ -212,14 +222,27 @@ def _answers(
         answered = [one for one in current if one.state == ANSWERED]
         shown = (answered or current)[-1]
         others = tuple(one for one in reversed(own) if one is not shown)
-        answers.append(_with_metrics(shown, trials, first, second, others))
+        earlier = any(trial.path in folded for trial in shown.pairs.trials)
+        answer = _with_metrics(_with_asker(experiment, shown), trials, first, second, others)
+        answers.append(replace(answer, earlier=earlier))
+    answers.sort(key=lambda answer: answer.earlier)
     state, why = NOT_ASKED, ""
     if (experiment.folder / LEDGER).exists():  # it has asked, and its levels follow its own order
         state, why = NOT_TESTED, LEDGER_DECIDES.format(command("ledger", "show", experiment.name))
     for pair in unasked:
         shown = interval_of(trials, *pair, DEFAULT_METRIC, state, why)
-        answers.append(_with_metrics(shown, trials, *pair))
+        answers.append(_with_metrics(_with_asker(experiment, shown), trials, *pair))
     return answers
+
+
+def _with_asker(experiment: Experiment, verdict: Verdict) -> Verdict:
+    """The verdict; it names another experiment that asked about its trials."""
+    if verdict.state != NOT_ASKED:
+        return verdict
+    keys = {(trial.digest, trial.scene, trial.seed) for trial in verdict.pairs.trials}
+    asker = asked_elsewhere(experiment.folder, verdict.quantity.key, keys)
+    why = ASKED_ELSEWHERE.format(asker, command("tables", asker)) if asker else ""
+    return replace(verdict, question=replace(verdict.question, untested=why))
 
 
 def _named(question: Question, arms: Mapping[tuple[str, str], Arm]) -> Question:

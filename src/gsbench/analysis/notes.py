@@ -122,7 +122,7 @@ SENTENCES: dict[str, str] = {
         "3DGS models was {metrics:list} in one study (arXiv 2511.06830, table 3)."
     ),
     # ---- trials: who made them, on what, and doubts
-    "worthless": "{mark} {trial} is {what}.",
+    "worthless": "{mark} {trial} is {what}{others}.",
     "passed over": "{text}.",
     "filters": (
         "Pictures of scene.images and of scene.downscale were made by different filters: results "

@@ -117,7 +117,8 @@ def reason(verdict: Verdict) -> str:
         why = verdict.question.untested
         return NOT_TESTED if why in (NOT_TESTED, NOT_ASKED) else f"{NOT_TESTED}, since {why}"
     if verdict.state == NOT_ASKED:
-        return NOT_ASKED
+        asker = verdict.question.untested
+        return f"{NOT_ASKED} here, but {asker}" if asker else NOT_ASKED
     if verdict.state in (RUNNING, STOPPED):
         return _waits(verdict)
     if verdict.outcome != UNDECIDED:
@@ -138,7 +139,7 @@ def _waits(verdict: Verdict) -> str:
         return f"no verdict without all its trials: the table has {count}"
     if verdict.missing:
         again = command("retry", verdict.missing[0].path.parts[-4])
-        return f"stopped at {count}: `{again}` goes on"
+        return f"stopped at {count}; to go on: {again}"
     return f"{count}: no command has planned the others yet, such as {verdict.question.baseline}"
 
 

@@ -85,9 +85,14 @@ def doubt_notes(trials: Sequence[TrialResult]) -> list[Note]:
     made by different filters, and what rules found odd (`gsbench.scene.rules`).
     """
     notes = []
+    if worthless := [trial for trial in trials if trial.record.learnt_nothing]:
+        first, *more = worthless
+        facts = {"trial": first.label, "what": first.record.learnt_nothing}
+        others = f"; the same holds for {counted(len(more), 'more trial')}"
+        notes.append(
+            Note.of("worthless", mark=LEARNT_NOTHING, others=others if more else "", **facts)
+        )
     for trial in trials:
-        if line := trial.record.learnt_nothing:
-            notes.append(Note.of("worthless", mark=LEARNT_NOTHING, trial=trial.label, what=line))
         notes += [Note.of("passed over", text=line) for line in trial.record.raster_passed_over]
     known = [trial.config for trial in trials if trial.config]
     folders = {config.get("scene.images") for config in known}

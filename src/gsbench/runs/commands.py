@@ -32,7 +32,7 @@ from gsbench.parsing import (
     read_typed,
 )
 from gsbench.runs.config_hash import config_hash
-from gsbench.runs.experiments import Arm, make_home
+from gsbench.runs.experiments import Arm, list_experiments, make_home
 from gsbench.runs.keys import CODE_OF_STAGE
 from gsbench.runs.layout import COMMANDS, PLAN, SEED
 from gsbench.runs.nested import SHOWN, sha256_of
@@ -285,6 +285,18 @@ class History:
     def covering(self, digest: Digest, scene: str, seed: int) -> list[Question]:
         """The questions about a trial."""
         return [one for one in self.questions if one.has(digest, scene, seed)]
+
+
+def asked_elsewhere(home: Path, metric: str, trials: Collection[tuple[Digest, str, int]]) -> str:
+    """Another experiment of the runs folder with a question about all these trials, or "".
+
+    A trial is a digest, a scene and a seed.
+    """
+    for name in list_experiments(home.parent) if trials else ():
+        questions = read_history(home.parent / name).questions if name != home.name else ()
+        if any(one.metric == metric and all(one.has(*key) for key in trials) for one in questions):
+            return name
+    return ""
 
 
 def read_history(home: Path) -> History:
