@@ -44,9 +44,9 @@ def test_optunas_sweeper_looks_for_the_best_mean_over_seeds(gsbench, tmp_path, d
     assert not (tmp_path / "runs").exists()
 
     done = gsbench(*words)
-    assert f"psnr of test views, {direction}d" in done.stderr
+    assert f"psnr of validation views, {direction}d" in done.stderr
     psnr = defaultdict(list)
-    for result in results_below(tmp_path / "runs/x"):
+    for result in results_below(tmp_path / "runs/x-tune"):
         psnr[result["num_init_points"]].append(result["metrics"]["psnr"])
     assert all(len(values) == 2 for values in psnr.values())
     best = max(psnr, key=lambda count: statistics.fmean(psnr[count]))
