@@ -26,7 +26,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.plugins import Plugins
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.types import HydraContext
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, read_write
 
 from gsbench.analysis.advice import GRIDS
 from gsbench.app.grids import run_sweep
@@ -172,9 +172,15 @@ class HydraApp:
     ) -> list[Outcome]:
         own = self.sweep.config.hydra
         is_typed = own.runtime.choices["hydra/launcher"] == name
-        config.hydra.launcher = (
-            own.launcher if is_typed else installed_nodes((f"hydra/launcher={name}",))["launcher"]
-        )
+        files = own if is_typed else installed_nodes((f"hydra/launcher={name}",))
+        # A sweeper of others was started with gsbench's launcher. The launcher composes each job by
+        # these words, and Hydra 1.4 compares their launcher with its own.
+        words = [word for word in config.hydra.overrides.hydra if not _is_of_launcher(word)]
+        typed = [word for word in self.sweep.words if _is_of_launcher(word)]
+        with read_write(config.hydra):  # Hydra 1.4 forbids changes
+            config.hydra.launcher = files["launcher"]
+            config.hydra.runtime.choices["hydra/launcher"] = name
+            config.hydra.overrides.hydra = [*words, *(typed or [f"hydra/launcher={name}"])]
         config.allow_targets = list(self.sweep.composer.allowed)
         self.sweep.composer.keep_times(config)  # the launcher composes its jobs from it
         launcher = Plugins.instance().instantiate_launcher(
@@ -234,12 +240,16 @@ def run_by_hydra(sweep: Sweep, run: RunBatch) -> Ended | None:
         words += ["~hydra.sweeper.params.seed"] * (
             "seed" in (config.hydra.sweeper.get("params") or {})
         )
-    kept = [word for word in words if not key_of(word).startswith(LAUNCHER)]
+    kept = [word for word in words if not _is_of_launcher(word)]
     _search(app, [*kept, f"hydra/launcher={OWN}"])
     return app.ended
 
 
 LAUNCHER = ("hydra/launcher", "hydra.launcher.")
+
+
+def _is_of_launcher(word: str) -> bool:
+    return key_of(word).startswith(LAUNCHER)
 
 
 def _search(app: HydraApp, words: Sequence[str]) -> None:
