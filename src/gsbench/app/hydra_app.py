@@ -175,7 +175,8 @@ class HydraApp:
         files = own if is_typed else installed_nodes((f"hydra/launcher={name}",))
         # A sweeper of others was started with gsbench's launcher. The launcher composes each job by
         # these words, and Hydra 1.4 compares their launcher with its own.
-        words = [word for word in config.hydra.overrides.hydra if not _is_of_launcher(word)]
+        given: Any = OmegaConf.to_container(config.hydra.overrides.hydra, resolve=False)
+        words = [word for word in given if not _is_of_launcher(word)]
         typed = [word for word in self.sweep.words if _is_of_launcher(word)]
         with read_write(config.hydra):  # Hydra 1.4 forbids changes
             config.hydra.launcher = files["launcher"]
