@@ -123,6 +123,7 @@ def test_the_metric_of_its_document_is_measured_and_shown(folder, capsys):
             ]
             assert value == pytest.approx(np.mean(sides), rel=1e-5)
     assert "gradient error (levels) ↓" in shown.out
+    assert "**" not in shown.out.split("gradient error")[1]  # nobody asked, so no best is shown
     assert run(["report", "gradients"]) == 0
     report = Path("runs/gradients/report.html").read_text()
     assert "gradient error: left of zero is better" in report.replace(

@@ -136,7 +136,9 @@ def test_folders_of_renders_are_compared_without_any_trial(runs, tmp_path, monke
         )
     capsys.readouterr()
     assert run(["tables", "new"]) == 0
-    assert "| toy | renders | theirs | " in capsys.readouterr().out
+    table = capsys.readouterr().out
+    assert "| toy | renders | theirs | " in table
+    assert "**" not in table  # nobody asked beforehand, so no best is shown
 
 
 def test_a_model_from_a_ply_is_measured_like_a_trained_one(gsbench, runs, tmp_path):

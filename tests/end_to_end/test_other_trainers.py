@@ -154,10 +154,13 @@ def test_two_programs_and_a_folder_of_renders_in_one_table(home, monkeypatch, ca
     )
     assert run(["report", "three"]) == 0
     report = (home / "runs/three/report.html").read_text()
-    for arm in ("cloud", "painter", "folder"):
-        assert re.search(
-            rf"random-{arm} against random-adc: (better|worse|not asked beforehand)", report
-        ), arm
+    # nobody asked about the folder of renders before it was measured
+    for arm, verdict in {
+        "cloud": "(better|worse)",
+        "painter": "(better|worse)",
+        "folder": "not asked beforehand",
+    }.items():
+        assert re.search(f"random-{arm} against random-adc: {verdict}", report), arm
     explain = "explain three:garden:psnr:"
     for words in ("status three", f"{explain}cloud", f"{explain}painter", "sync three"):
         assert run(words.split()) == 0, words

@@ -28,13 +28,11 @@ from gsbench.analysis.verdicts import (
     interval_of,
     judge,
 )
-from gsbench.runs.commands import Question, asked_elsewhere, code_in
+from gsbench.runs.commands import Question, code_in, questions_elsewhere
 from gsbench.runs.layout import LEDGER, TUNING
 from gsbench.words import command
 
 DEFAULT_METRIC = "psnr"
-EARLIER = " (earlier code)"
-ASKED_ELSEWHERE = "in experiment {}: {}"
 LEDGER_DECIDES = "the ledger's tests decide ({})"
 
 
@@ -61,12 +59,16 @@ class Answer:
 
     @property
     def sentence(self) -> str:
-        return f"{sentence(self.verdict)}{EARLIER * self.earlier}"
+        return sentence(self.verdict) + self._remark
 
     @property
     def headline(self) -> str:
         """``random-mine against random-adc: BETTER, PSNR (dB) +0.50``"""
-        return f"{headline(self.verdict)}{EARLIER * self.earlier}"
+        return headline(self.verdict) + self._remark
+
+    @property
+    def _remark(self) -> str:
+        return " (earlier code)" if self.earlier else ""
 
     @property
     def line(self) -> str:
@@ -223,7 +225,7 @@ def _answers(
         shown = (answered or current)[-1]
         others = tuple(one for one in reversed(own) if one is not shown)
         earlier = any(trial.path in folded for trial in shown.pairs.trials)
-        answer = _with_metrics(_with_asker(experiment, shown), trials, first, second, others)
+        answer = _with_metrics(shown, trials, first, second, others)
         answers.append(replace(answer, earlier=earlier))
     answers.sort(key=lambda answer: answer.earlier)
     state, why = NOT_ASKED, ""
@@ -231,18 +233,36 @@ def _answers(
         state, why = NOT_TESTED, LEDGER_DECIDES.format(command("ledger", "show", experiment.name))
     for pair in unasked:
         shown = interval_of(trials, *pair, DEFAULT_METRIC, state, why)
-        answers.append(_with_metrics(_with_asker(experiment, shown), trials, *pair))
-    return answers
+        answers.append(_with_metrics(shown, trials, *pair))
+    return _with_askers(experiment, answers)
 
 
-def _with_asker(experiment: Experiment, verdict: Verdict) -> Verdict:
-    """The verdict; it names another experiment that asked about its trials."""
-    if verdict.state != NOT_ASKED:
-        return verdict
-    keys = {(trial.digest, trial.scene, trial.seed) for trial in verdict.pairs.trials}
-    asker = asked_elsewhere(experiment.folder, verdict.quantity.key, keys)
-    why = ASKED_ELSEWHERE.format(asker, command("tables", asker)) if asker else ""
-    return replace(verdict, question=replace(verdict.question, untested=why))
+def _with_askers(experiment: Experiment, answers: Sequence[Answer]) -> list[Answer]:
+    """The answers; one that nobody asked here names another experiment that asked it.
+
+    The other experiments are read once, and only if there is such an answer.
+    """
+    if all(answer.verdict.state != NOT_ASKED for answer in answers):
+        return [*answers]
+    elsewhere = questions_elsewhere(experiment.folder)
+    return [
+        replace(answer, verdict=replace(answer.verdict, asker=_asker(answer.verdict, elsewhere)))
+        for answer in answers
+    ]
+
+
+def _asker(verdict: Verdict, elsewhere: Mapping[str, Sequence[Question]]) -> str:
+    """The experiment with a question about all trials of a verdict that nobody asked, or ""."""
+    trials = verdict.pairs.trials
+    if verdict.state != NOT_ASKED or not trials:
+        return ""
+
+    def asks(question: Question) -> bool:
+        return question.metric == verdict.quantity.key and all(
+            question.has(trial.digest, trial.scene, trial.seed) for trial in trials
+        )
+
+    return next((name for name, asked in elsewhere.items() if any(map(asks, asked))), "")
 
 
 def _named(question: Question, arms: Mapping[tuple[str, str], Arm]) -> Question:

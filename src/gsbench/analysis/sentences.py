@@ -117,8 +117,10 @@ def reason(verdict: Verdict) -> str:
         why = verdict.question.untested
         return NOT_TESTED if why in (NOT_TESTED, NOT_ASKED) else f"{NOT_TESTED}, since {why}"
     if verdict.state == NOT_ASKED:
-        asker = verdict.question.untested
-        return f"{NOT_ASKED} here, but {asker}" if asker else NOT_ASKED
+        if not verdict.asker:
+            return NOT_ASKED
+        shown = command("tables", verdict.asker)
+        return f"{NOT_ASKED} here, but in experiment {verdict.asker}: {shown}"
     if verdict.state in (RUNNING, STOPPED):
         return _waits(verdict)
     if verdict.outcome != UNDECIDED:

@@ -70,7 +70,8 @@ class Verdict:
     ``untestable`` says why such trials can never answer it. ``final`` is False while trials to come
     may decide. ``lacking`` are trials of one arm without a result where the other arm has one; if
     the outcome favoured that arm, the verdict ``favours_lacking`` and is undecided. ``outlying``
-    trials lie far outside the others of their scene and arm; they change nothing.
+    trials lie far outside the others of their scene and arm; they change nothing. ``asker`` is
+    another experiment that asked about the trials, if nobody did so beforehand in this one.
     """
 
     question: Question
@@ -90,6 +91,7 @@ class Verdict:
     lacking: tuple[Unfinished, ...] = ()
     favours_lacking: bool = False
     notes: tuple[Note, ...] = ()
+    asker: str = ""
 
     @property
     def wanted(self) -> int:

@@ -287,16 +287,10 @@ class History:
         return [one for one in self.questions if one.has(digest, scene, seed)]
 
 
-def asked_elsewhere(home: Path, metric: str, trials: Collection[tuple[Digest, str, int]]) -> str:
-    """Another experiment of the runs folder with a question about all these trials, or "".
-
-    A trial is a digest, a scene and a seed.
-    """
-    for name in list_experiments(home.parent) if trials else ():
-        questions = read_history(home.parent / name).questions if name != home.name else ()
-        if any(one.metric == metric and all(one.has(*key) for key in trials) for one in questions):
-            return name
-    return ""
+def questions_elsewhere(home: Path) -> dict[str, tuple[Question, ...]]:
+    """The questions of the other experiments of the runs folder, by their names."""
+    others = [name for name in list_experiments(home.parent) if name != home.name]
+    return {name: read_history(home.parent / name).questions for name in others}
 
 
 def read_history(home: Path) -> History:

@@ -219,11 +219,13 @@ def change_of_files(
         if recorded is None or not path.is_file():
             continue
         stamp = stamp_of(path)
-        known = stamps.get(name, stamp)
-        if known[0] != stamp[0]:  # of another size, which may be too large to read
+        known = stamps.get(name)
+        if (
+            known is not None and known[0] != stamp[0]
+        ):  # of another size, which may be too large to read
             return Change("written", name)
         is_large = stamp[0] > MAX_HASHED_BYTES
-        if is_large and not thorough and name in stamps and known == stamp:
+        if is_large and not thorough and known == stamp:
             continue
         if (file_sha256(path) if is_large else digest_of(path)) != recorded:
             return Change("written", name)

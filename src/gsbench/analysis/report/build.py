@@ -136,22 +136,17 @@ def compare_arms(
 ) -> dict[str, Any]:
     """Everything that the page shows of two arms; notes say what could not be compared or read.
 
-    ``older`` are the trials of earlier code. An arm whose trials are still awaited has no settings
-    to compare.
+    ``older`` are the trials of earlier code.
     """
     first, second = judged.baseline, judged.arm
     verdicts = [judged.verdict, *judged.metrics]
-    baseline, other = trials_of(trials, first), trials_of(trials, second)
     views, faults = choose_views(pair_trials(trials, first, second))
-    settings: dict[str, Any] = {"caveats": "", "fairness": None, "facts": []}
-    if baseline and other:
-        settings = _settings_of_both(trials, first, second, older)
     return {
         "judged": judged,
         "title": f"{second} against {first}",
         "verdicts": verdicts,
         "has_like_these": judged.verdict.like_these is not None,
-        **settings,
+        **_settings_of_both(trials, first, second, older),
         "forests": [_forest(verdict) for verdict in verdicts],
         "views": views,
         "notes": texts([*judged.verdict.notes, *faults]),
@@ -161,8 +156,10 @@ def compare_arms(
 def _settings_of_both(
     trials: Sequence[TrialResult], first: Arm, second: Arm, older: Sequence[TrialResult]
 ) -> dict[str, Any]:
-    """What differs between the settings and the costs of two arms with trials."""
+    """Differences between the settings and the costs of two arms; none while one is awaited."""
     baseline, other = trials_of(trials, first), trials_of(trials, second)
+    if not (baseline and other):
+        return {"caveats": "", "fairness": None, "facts": []}
     return {
         "caveats": " ".join(
             texts(
