@@ -1,11 +1,13 @@
 """All answers of an experiment: badges, other questions, folded code, and what nobody asked."""
 
 import itertools
+import re
 import shutil
 
 import pytest
 
 from gsbench.analysis.comparison import compare
+from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import load_experiment
 from gsbench.runs.commands import read_history
 from tests.helpers import change_json, write_lines
@@ -161,6 +163,15 @@ def test_another_experiment_that_asked_about_the_same_trials_is_named(tmp_path, 
     assert ("here, but in experiment exp: gsbench tables exp" in answer.sentence) == named
     (there,) = answers(tmp_path)
     assert there.badge == "BETTER"
+
+
+def test_the_page_of_an_idea_waits_for_the_trials_of_its_baseline(tmp_path):
+    write_runs(tmp_path, densifiers=("volumetric",))
+    ask_about(tmp_path)
+    page = build_report(load_experiment(tmp_path, "exp"))
+    assert "no command has planned the others yet, such as sfm-adc" in page
+    assert "nan" not in re.findall(r"\w+", page)
+    assert "nothing to compare" not in page
 
 
 def test_a_trial_of_no_question_is_named(tmp_path):
