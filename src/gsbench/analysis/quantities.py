@@ -11,8 +11,9 @@ from statistics import fmean
 
 from gsbench.analysis.results import TrialResult, group_by
 from gsbench.errors import InputError
-from gsbench.eval.facts import LPIPS, find_metric, from_record, known_keys
+from gsbench.eval.facts import LPIPS, find_metric, from_record, in_region, known_keys
 from gsbench.eval.protocol import PAPER, protocol_of
+from gsbench.runs.experiments import AT
 from gsbench.words import signed
 
 MILLION, THOUSAND, MINUTE = 1e6, 1e3, 60.0
@@ -81,7 +82,6 @@ FIXED_UNITS = {
 }
 ALIASES = {"num_gaussians": "gaussians", "seconds": "train_time", "train": "train_time"}
 TEXTURED = Quantity("error_textured", "error in textured parts (levels)", -1, 2, _textured)
-AT = "@"  # psnr@7000 is the PSNR at iteration 7000 (eval.at)
 
 
 @dataclass(frozen=True)
@@ -120,12 +120,21 @@ def _means(trials: Iterable[TrialResult], read: Reader) -> dict[str, float]:
 def choose_quantities(
     trials: Iterable[TrialResult], names: Iterable[str] | None = None
 ) -> list[Quantity]:
-    """The named quantities; by default all metrics, the LPIPS asked for, and the main costs."""
+    """The named quantities; by default all metrics, the LPIPS asked for, and the main costs.
+
+    Of metrics in regions, the default has PSNR and the metric of the verdict.
+    """
     trials = list(trials)
     if names is None:
         wanted = {key for trial in trials for key in _lpips_asked_for(trial)}
         costs = [key for key in ("gaussians", "train_time") if any(map(COSTS[key][1], trials))]
-        names = [*metric_keys(trials, wanted), *costs]
+        primary = {str(trial.config.get("eval.primary")).partition(AT)[0] for trial in trials}
+        metrics = [
+            key
+            for key in metric_keys(trials, wanted)
+            if AT not in key or key.partition(AT)[0] in primary | {"psnr"}
+        ]
+        names = [*metrics, *costs]
     return [quantity(name, trials) for name in names]
 
 
@@ -137,11 +146,13 @@ def quantity(name: str, trials: Iterable[TrialResult]) -> Quantity:
     """
     trials = list(trials)
     key = ALIASES.get(name, name)
-    metric, _, step = key.partition(AT)
+    metric, _, step = key.rpartition(AT)
+    if not step.isdigit():  # psnr, or psnr@far
+        metric, step = key, ""
     if metric == "lpips":
         metric = _protocol_lpips(trials[0]) if trials else f"{LPIPS}{PAPER.lpips}"
     # gsbench's or a user's
-    if find_metric(metric) is not None or any(metric in trial.metrics for trial in trials):
+    if metric in known_keys() or any(metric in trial.metrics for trial in trials):
         return _metric(metric, step, trials)
     if key in FIXED_UNITS:
         return _scaled(key, *FIXED_UNITS[key])
@@ -185,9 +196,12 @@ def value_of(asked: Quantity, trial: TrialResult) -> float:
 
 
 def metric_keys(trials: Iterable[TrialResult], wanted: Container[str] = ()) -> list[str]:
-    """The metrics of any trial and those ``wanted``, in order; a user's own come last."""
+    """The metrics of any trial and those ``wanted``, in order.
+
+    Metrics in regions and a user's own come last.
+    """
     present = {key for trial in trials for key in trial.metrics}
-    own = sorted(key for key in present if find_metric(key) is None)
+    own = sorted(present.difference(known_keys()))
     return [key for key in known_keys() if key in present or key in wanted] + own
 
 
@@ -196,8 +210,10 @@ def _metric(key: str, step: str, trials: Sequence[TrialResult]) -> Quantity:
 
     Trials record the facts of a user's metric.
     """
-    records = [trial.record.metric_facts.get(key) for trial in trials if key in trial.metrics]
-    facts = find_metric(key) or from_record(key, records[0] if records else None)
+    base, _, region = key.partition(AT)
+    records = [trial.record.metric_facts.get(base) for trial in trials if key in trial.metrics]
+    facts = find_metric(base) or from_record(base, records[0] if records else None)
+    facts = in_region(facts, region) if region else facts
     name, read = facts.name, lambda trial: trial.metrics.get(key)
     if step:
         measured = sorted({int(at) for trial in trials for at in trial.record.metrics_at})

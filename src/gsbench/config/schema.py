@@ -328,8 +328,14 @@ def groups_keep_their_schemas(values: dict[str, Any]) -> None:
             given = {key: value for key, value in given.items() if key in known}
         settings = schema(**check_values(schema, given, group))
         values[group] |= plain({key: getattr(settings, key) for key in given})
-    # Settings that name a class stand only where one is named, as in configurations before them.
-    for group, names in (("scene", ("_target_",)), ("train", IDEAS)):
+    # A setting that came later than some results stands only where it is given, so that earlier
+    # configurations keep their hashes.
+    later = (
+        ("scene", ("_target_", "beside", "depth_scale")),
+        ("train", IDEAS),
+        ("eval", ("regions",)),
+    )
+    for group, names in later:
         for name in names:
             if not values[group].get(name):
                 values[group].pop(name, None)

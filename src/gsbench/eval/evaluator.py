@@ -32,8 +32,10 @@ from gsbench.eval.lpips import Lpips, load_lpips
 from gsbench.eval.metric import MaskedMetric, Metric, UnavailableError
 from gsbench.eval.metrics import psnr
 from gsbench.eval.protocol import Protocol
+from gsbench.eval.regions import LEAST_SHARE, Regions
 from gsbench.eval.ssim import ssim
 from gsbench.eval.structure import STRUCTURAL, load_structural
+from gsbench.runs.experiments import AT
 from gsbench.weights import MissingWeightsError
 
 
@@ -224,12 +226,17 @@ class Evaluator:
         render: NDArray[Any] | Tensor,
         ground_truth: NDArray[Any] | Tensor,
         mask: NDArray[np.bool_] | None = None,
+        regions: Regions = MappingProxyType({}),
     ) -> dict[str, float]:
         """The metrics of one view; images are [H, W, 3], uint8 or floating point in [0, 1].
 
         Where ``mask`` [H, W] is False, the render is ignored: its pixels are replaced by the
         photograph's before anything is measured, and metrics that average over pixels leave them
         out (see `MaskedMetric`).
+
+        Metrics that can leave out pixels are also measured in each of ``regions`` (masks [H, W])
+        that has at least 1 % of the view, as ``psnr@far``. LPIPS is not: its features reach far
+        beyond a region.
 
         A metric that cannot be computed is absent and listed in ``unavailable``. Raises
         ``TrainingError`` if the render holds a non-finite value.
@@ -238,11 +245,22 @@ class Evaluator:
         counted = None if mask is None else torch.as_tensor(mask, device=self.device)  # [H, W]
         image = replace_ignored(image, target, None if counted is None else counted[..., None])
         values = {}
-        for key, metric in self._metrics.items():
-            if key in self.unavailable:
+        measures: list[tuple[str, Metric, Tensor | None]]
+        measures = [(key, metric, counted) for key, metric in self._metrics.items()]
+        for name, pixels in regions.items():
+            inside = torch.as_tensor(pixels, device=self.device)  # [H, W]
+            inside = inside if counted is None else inside & counted
+            if float(inside.float().mean()) >= LEAST_SHARE:
+                measures += [
+                    (f"{key}{AT}{name}", metric, inside)
+                    for key, metric in self._metrics.items()
+                    if isinstance(metric, MaskedMetric) and not key.startswith(LPIPS)
+                ]
+        for key, metric, within in measures:
+            if not self.unavailable.keys().isdisjoint((key, key.partition(AT)[0])):
                 continue
             try:
-                value = self._measure(key, metric, image, target, counted)
+                value = self._measure(key.partition(AT)[0], metric, image, target, within)
                 if not math.isfinite(value):
                     raise UnavailableError(f"the value of a view is {value}")
                 values[key] = value
@@ -311,10 +329,15 @@ def quantize(image: Tensor) -> Tensor:
 def summarize(
     per_view: Mapping[str, Mapping[str, float]], unavailable: Mapping[str, str]
 ) -> dict[str, float]:
-    """The mean over views of every metric that all views have, without ``unavailable``."""
-    if not per_view:
-        return {}
+    """The mean over views of every metric that all views have, without ``unavailable``.
+
+    A metric of a region has the mean over the views that show the region.
+    """
     views = list(per_view.values())
-    everywhere = [key for key in views[0] if all(key in view for view in views)]
-    shared = [key for key in everywhere if key not in unavailable]
-    return {key: float(np.mean([view[key] for view in views])) for key in shared}
+    keys = dict.fromkeys(key for view in views for key in view)
+    shared = [key for key in keys if AT in key or all(key in view for view in views)]
+    return {
+        key: float(np.mean([view[key] for view in views if key in view]))
+        for key in shared
+        if unavailable.keys().isdisjoint((key, key.partition(AT)[0]))
+    }

@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 from annotated_types import Interval, Predicate
 from pydantic import PositiveFloat, StrictStr
 
+from gsbench.runs.experiments import AT
 from gsbench.runs.trial_record import MetricRecord
 from gsbench.settings import check_values
 
@@ -119,8 +120,15 @@ def further_keys() -> tuple[str, ...]:
 
 
 def find_metric(key: str) -> MetricFacts | None:
-    """The facts about gsbench's metric ``key``, or None."""
-    return next((facts for facts in ALL if facts.key == key), None)
+    """The facts about gsbench's metric ``key``, such as ``psnr`` or ``psnr@far``, or None."""
+    metric, _, region = key.partition(AT)
+    facts = next((facts for facts in ALL if facts.key == metric), None)
+    return facts if facts is None or not region else in_region(facts, region)
+
+
+def in_region(facts: MetricFacts, region: str) -> MetricFacts:
+    """The facts about a metric that is measured in one region of each view (``eval.regions``)."""
+    return replace(facts, key=f"{facts.key}{AT}{region}", label=f"{facts.label} {region}")
 
 
 def facts_of(key: str, metric: object) -> MetricFacts:

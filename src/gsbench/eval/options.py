@@ -3,7 +3,7 @@
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from annotated_types import Interval, Len, Predicate, doc
 from pydantic import PositiveInt
@@ -19,6 +19,7 @@ from gsbench.eval.facts import (
     lpips_variants,
 )
 from gsbench.eval.protocol import PROTOCOLS
+from gsbench.eval.regions import DISTANCE, DISTANCES
 from gsbench.runs.experiments import AT, QUESTIONS, metric_and_question
 from gsbench.settings import MISSING, FolderName, PathName, check_settings
 from gsbench.words import did_you_mean
@@ -44,6 +45,7 @@ LPIPS_RULE = f"a list of {', '.join(lpips_variants())}, each at most once"
 LpipsVariant = Annotated[str, Predicate(lambda name: name in lpips_variants())]
 FPS_RULE = "two sides in px, width and height, each from 16 to 16384"
 Side = Annotated[int, Interval(ge=16, le=16_384)]
+REGIONS_RULE = f"{DISTANCE} ({', '.join(DISTANCES)}), or a mapping {{NAME: FOLDER of masks}}"
 MORE_RULE = f"a list of {', '.join(further_keys())}, each at most once"
 FurtherMetric = Annotated[str, Predicate(lambda name: name in further_keys())]
 
@@ -64,7 +66,9 @@ class EvalConfig:
     at: Annotated[list[PositiveInt], Predicate(all_different), doc(AT_RULE)] = field(
         default_factory=list
     )
-    # the metric of the verdict (psnr@extrapolation: for one question of two splits)
+    # measure apart: distance (near, middle, far), or {NAME: folder of masks below scene.path}
+    regions: Annotated[dict[str, PathName] | Literal["distance"], doc(REGIONS_RULE)] | None = None
+    # the metric of the verdict; psnr@far: in a region; psnr@extrapolation: for one of two splits
     primary: str | None = "psnr"
     baseline: FolderName = "adc"  # the densifier that ideas are compared with
     # {longaxis: absgrad}
@@ -89,14 +93,25 @@ class EvalConfig:
                     f"eval.extra.{name}._target_=mine.MyMetric"
                 )
         if self.primary is not None:
-            metric, question = metric_and_question(self.primary)
-            if question not in QUESTIONS.values() and (question or AT in self.primary):
+            metric, _, region = metric_and_question(self.primary)[0].partition(AT)
+            if (region or AT in self.primary) and region not in ["", *self.region_names]:
+                names = [*self.region_names, *QUESTIONS.values()]
                 raise InputError(
-                    f"eval.primary={self.primary}: after {AT} comes "
-                    f"{' or '.join(QUESTIONS.values())}"
+                    f"eval.primary={self.primary}: after {AT} comes a region of eval.regions, "
+                    f"interpolation or extrapolation ({', '.join(names)})"
+                )
+            if region and metric.startswith(LPIPS):
+                raise InputError(
+                    f"eval.primary={self.primary}: LPIPS is not measured in regions, because its "
+                    "features reach beyond them: take psnr, ssim or flip"
                 )
             if metric not in self.extra:
                 self._check_primary(metric)
+
+    @property
+    def region_names(self) -> tuple[str, ...]:
+        """The names of the regions that are measured apart."""
+        return DISTANCES if self.regions == DISTANCE else tuple(self.regions or ())
 
     def _check_primary(self, key: str) -> None:
         """Raise InputError unless these settings ask for a metric of gsbench with this key."""

@@ -3,7 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
-from gsbench.eval.facts import MetricFacts, facts_of, find_metric
+from gsbench.eval.facts import MetricFacts, facts_of, find_metric, in_region
+from gsbench.runs.experiments import AT
 
 
 def facts_for(metric: str, values: Mapping[str, Any]) -> MetricFacts:
@@ -17,4 +18,6 @@ def facts_for(metric: str, values: Mapping[str, Any]) -> MetricFacts:
     # here, since only a user's own metric needs it
     from gsbench.pipeline.parts import build_metrics
 
-    return facts_of(metric, build_metrics(values["eval"], values["allow_targets"])[metric])
+    name, _, region = metric.partition(AT)
+    facts = facts_of(name, build_metrics(values["eval"], values["allow_targets"])[name])
+    return in_region(facts, region) if region else facts

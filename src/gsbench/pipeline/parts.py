@@ -22,7 +22,7 @@ from gsbench.external.settings import External
 from gsbench.init.base import Initializer
 from gsbench.raster import EXECUTORS, Rasterizer
 from gsbench.raster.executors import AUTO, lacks, resolve
-from gsbench.runs.experiments import metric_and_question
+from gsbench.runs.experiments import AT, metric_and_question
 from gsbench.runs.nested import GSBENCH, TARGET, targets_in
 from gsbench.runs.user_code import UserCode, user_modules
 from gsbench.scene.options import SceneConfig
@@ -212,7 +212,8 @@ def build_metrics(values: dict[str, Any], allow_targets: list[str]) -> dict[str,
     for name, options in values.get("extra", {}).items():
         metrics[name] = build(f"eval.extra.{name}", options, allow_targets)
         primary = values.get("primary") or ""
-        if facts_of(name, metrics[name]).direction == 0 and metric_and_question(primary)[0] == name:
+        asked = metric_and_question(primary)[0].partition(AT)[0]
+        if facts_of(name, metrics[name]).direction == 0 and asked == name:
             raise InputError(
                 f"eval.primary={primary}: {options['_target_']} does not say whether more or less "
                 "is better (direction), so no verdict can be about it"

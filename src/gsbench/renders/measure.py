@@ -118,7 +118,7 @@ def _measure(
 
 
 # settings of an evaluation that renders of another program do not use
-WITHOUT_EFFECT = ("eval.at", "eval.maps", "eval.fps", "eval.controls")
+WITHOUT_EFFECT = ("eval.at", "eval.maps", "eval.fps", "eval.controls", "eval.regions")
 
 
 def _asked_metric(options: argparse.Namespace) -> str:

@@ -170,11 +170,11 @@ def metric_and_question(primary: str) -> tuple[str, str]:
     Examples:
         >>> metric_and_question("psnr@extrapolation")
         ('psnr', 'extrapolation')
-        >>> metric_and_question("psnr")
-        ('psnr', '')
+        >>> metric_and_question("psnr@far")
+        ('psnr@far', '')
     """
-    metric, _, question = primary.partition(AT)
-    return metric, question
+    metric, _, question = primary.rpartition(AT)
+    return (metric, question) if question in QUESTIONS.values() else (primary, "")
 
 
 def stamp_now() -> str:

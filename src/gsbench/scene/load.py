@@ -26,6 +26,7 @@ from types import MappingProxyType, SimpleNamespace
 from typing import Annotated, Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from gsbench.errors import InputError
@@ -34,6 +35,7 @@ from gsbench.logs import Progress, no_progress
 from gsbench.parsing import MAX_NUMBER, Count, Number, Record, read_typed
 from gsbench.runs.store import Output, is_sound, record_files
 from gsbench.runs.trial_record import Oddity
+from gsbench.scene.beside import DEPTH, files_beside, pixels_of_view, read_beside
 from gsbench.scene.colmap_files import model_files
 from gsbench.scene.images import (
     Resample,
@@ -121,6 +123,8 @@ def load_scene(
     principal_point: PrincipalPoint = "used",
     progress: Progress = no_progress,
     made_by: Mapping[str, str | None] = MappingProxyType({}),
+    beside: Sequence[str] = (),
+    depth_scale: float | None = None,
 ) -> Scene:
     """Load the views of a capture with the cameras of the COLMAP model in ``model_dir``.
 
@@ -128,7 +132,8 @@ def load_scene(
     a longest side of ``max_size`` px (see `downscaled_size`). ``principal_point="centred"`` moves
     principal points to the image centre, as 3DGS assumes. Views without a pose in the model are
     left out with a warning. ``made_by`` are the versions of code and packages that prepare images:
-    the cache does not return images that other versions made. ``progress`` counts images.
+    the cache does not return images that other versions made. ``beside`` are kinds of pictures
+    beside the photographs (`gsbench.scene.beside`). ``progress`` counts images.
 
     Raises `InputError` if fewer than three views or no training view have a pose, or an image does
     not fit its camera.
@@ -156,17 +161,32 @@ def load_scene(
         mask = read_mask(folder / mask_file(file) if file else capture.masks[name])
         return None if mask.all() else mask
 
+    files = files_beside(capture, beside)
+    lenses = lenses_of(Path(model_dir)) if files else {}
+    scale = capture.normalization.scale
+
+    def beside_of(name: str, camera: Camera) -> dict[str, NDArray[Any]]:
+        found = {}
+        for kind, own in files.items():
+            if name in own:
+                picture = read_beside(own[name], kind, depth_scale)
+                found[kind] = pixels_of_view(picture, lenses[name], camera)
+        if DEPTH in found:
+            found[DEPTH] *= np.float32(scale)
+        return found
+
     def view(name: str) -> View:
         entry = entries[name]
         image = read_image(folder / entry.file if entry.file else capture.images / name)
         camera = entry.camera
+        pictures = beside_of(name, camera)
         if image.shape[:2] != (camera.height, camera.width):
             raise InputError(
                 f"{folder}: {name} is not as it was prepared: delete this folder and run again"
             )
         if principal_point == "centred":
             camera = replace(camera, cx=camera.width / 2, cy=camera.height / 2)
-        return View(name, camera, image, mask_of(name))
+        return View(name, camera, image, mask_of(name), pictures)
 
     names = [name for name in capture.image_names if name in entries]
     views = list(in_threads(view, names))
@@ -268,6 +288,13 @@ def _model_cameras(
         )
     _inspect_views(capture, cameras)  # before hours of work
     return dict(sorted(cameras.items()))
+
+
+def lenses_of(model_dir: Path) -> dict[str, CameraModel]:
+    """The cameras of a model's posed images, before they are undistorted."""
+    from gsbench.scene.colmap import posed_by_name, read_model  # not needed without such pictures
+
+    return {name: lens for name, (lens, *_) in posed_by_name(read_model(model_dir)).items()}
 
 
 def _inspect_views(capture: Capture, placed: Collection[str]) -> tuple[Oddity, ...]:

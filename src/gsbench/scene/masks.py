@@ -30,17 +30,17 @@ IMAGES, MASKS = "images", "masks"  # in the folder of `prepare_photograph`
 NEARLY_ONE = 1 - 1e-6  # a mean of ones in float32 may round to less than 1
 
 
-def find_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
+def find_masks(folder: Path, names: Sequence[str], setting: str = "scene.masks") -> dict[str, Path]:
     """The mask file in ``folder`` of each image: ``b.jpg.png`` (COLMAP's) or ``b.png``.
 
-    Raises InputError naming the images without a mask.
+    Raises InputError naming the ``setting`` and the images without a mask.
     """
     found = {name: f"{name}{SUFFIX}" for name in names if (folder / f"{name}{SUFFIX}").is_file()}
     if missing := [name for name in names if name not in found]:
         found |= match(missing, list_images(folder))
     if missing := [name for name in names if name not in found]:
         raise InputError(
-            f"scene.masks: no mask of {some_of(missing)} in {folder}: add {missing[0]}{SUFFIX} "
+            f"{setting}: no mask of {some_of(missing)} in {folder}: add {missing[0]}{SUFFIX} "
             "(all white where every pixel counts)"
         )
     return {name: folder / found[name] for name in names}

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from annotated_types import Ge, Interval
-from pydantic import NonNegativeInt, PositiveInt
+from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 
 from gsbench.errors import InputError
 from gsbench.scene.rules import MIN_IMAGES, MIN_SIZE, check_accept, given
@@ -157,6 +157,10 @@ class SceneConfig:
     transparent: Backdrop = "black"  # colour under transparent pixels
     # folder below path with a mask for each image, black where ignored; null: no masks
     masks: PathName | None = None
+    # pictures beside the photographs that losses read: depth, or a folder's name (docs/ideas.md)
+    beside: list[FolderName] = field(default_factory=list)
+    # world units of one step of an integer depth map; null: 0.001
+    depth_scale: PositiveFloat | None = None
     downscale: PositiveInt = 1  # divides both sides
     max_size: Annotated[int, Ge(MIN_SIZE)] | None = None  # longest side, px; never enlarges
     resample: Literal["lanczos", "area", "bicubic"] = "lanczos"

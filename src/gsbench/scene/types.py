@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -172,13 +173,15 @@ class View:
     """One photograph with its camera; ``image`` is [H, W, 3] uint8, sRGB.
 
     ``mask`` [H, W] is True where a pixel counts, or None if all pixels count. Ignored pixels hold
-    the colours made by `gsbench.scene.masks.fill_ignored`.
+    the colours made by `gsbench.scene.masks.fill_ignored`. ``beside`` are the pictures that
+    ``scene.beside`` names, as `gsbench.scene.beside` reads them.
     """
 
     name: str
     camera: Camera
     image: NDArray[np.uint8]
     mask: NDArray[np.bool_] | None = None
+    beside: Mapping[str, NDArray[Any]] = field(default_factory=dict)
 
     @property
     def counted(self) -> float:

@@ -82,6 +82,18 @@ def _no_pinhole(camera: CameraModel) -> str:
     )
 
 
+def flat_camera(camera: CameraModel) -> Camera:
+    """The pinhole camera, at the origin, of what `undistort` makes of a photograph."""
+    if not camera.distorted:
+        return to_pinhole(camera)
+    import pycolmap
+
+    from gsbench.scene.colmap import plain_camera
+
+    options = pycolmap.UndistortCameraOptions()
+    return to_pinhole(plain_camera(pycolmap.undistort_camera(options, _colmap_camera(camera))))
+
+
 def undistort(image: NDArray[np.uint8], camera: CameraModel) -> tuple[NDArray[np.uint8], Camera]:
     """Undistort one image [H, W, 3] of any perspective COLMAP camera model; its size changes.
 

@@ -29,8 +29,9 @@ class TrainedView(NamesAttributes):
     """The training view of an iteration.
 
     ``photograph`` is [H, W, 3] in 0..1. ``mask`` is [H, W, 1], True where a pixel counts; None if
-    all do. ``depth`` is a sensor's depth along the camera's z, [H, W] in world units, 0 where it is
-    not known; None without one.
+    all do. ``depth`` is a sensor's depth along the camera's z, [H, W] in the training's units, 0
+    where it is not known; None without one. ``more`` are other pictures beside the photograph,
+    [H, W, C] uint8 by name. ``scene.beside`` asks for both.
     """
 
     name: str
@@ -38,6 +39,7 @@ class TrainedView(NamesAttributes):
     photograph: Tensor
     mask: Tensor | None = None
     depth: Tensor | None = None
+    more: Mapping[str, Tensor] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

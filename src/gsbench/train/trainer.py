@@ -25,6 +25,7 @@ from gsbench.raster.base import RenderOutput
 from gsbench.raster.depth import render_depth
 from gsbench.raster.executors import find_executor, lacks
 from gsbench.runs.layout import CURVES, EVENTS, HISTOGRAMS
+from gsbench.scene.beside import DEPTH, resized
 from gsbench.scene.types import Camera, Scene
 from gsbench.system.compile_clock import CLOCK
 from gsbench.system.device import free_bytes
@@ -329,12 +330,18 @@ class Trainer:
     def _view(self, index: int) -> TrainedView:
         """The training view ``index`` at the current size."""
         cameras, targets = self.scaled_views.at(self.scale)
-        view = self.scene.train[index]
+        view, camera = self.scene.train[index], cameras[index]
+        beside = {
+            name: torch.from_numpy(resized(pixels, camera.width, camera.height)).to(self.device)
+            for name, pixels in view.beside.items()
+        }
         return TrainedView(
             view.name,
-            cameras[index],
+            camera,
             as_unit_range(targets.get(index), torch.float32),
             targets.mask(index),
+            beside.pop(DEPTH, None),
+            beside,
         )
 
     def _schedule(self, schedule: Schedule) -> None:

@@ -30,6 +30,7 @@ from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
 from gsbench.gaussians.paper_values import VOLUME_THRESHOLD
 from gsbench.gaussians.ply import read_ply
 from gsbench.logs import progress
+from gsbench.pipeline.steps.regions import region_inputs, regions_of
 from gsbench.pipeline.steps.scene import Views
 from gsbench.raster import Rasterizer
 from gsbench.raster.reference import project
@@ -73,7 +74,13 @@ def evaluate_step(views: Views, trained: Step, parts: Parts) -> Step:
         name: options_of("eval", metric, user, f"{EXTRA}.{name}")
         for name, metric in evaluator.extra.items()
     }
-    further = {"extra": own, "more": list(evaluator.more), "fps": parts.eval.fps}
+    regions = region_inputs(views, parts)
+    further = {
+        "regions": regions,
+        "extra": own,
+        "more": list(evaluator.more),
+        "fps": parts.eval.fps,
+    }
     if parts.program is not None and not parts.program.leaves_model:
         inputs["renders"] = trained.key
         build = _build_from_renders(views, trained, parts)
@@ -100,6 +107,8 @@ def _build_from_model(views: Views, trained: Step, parts: Parts) -> Callable[[Pa
         color = torch.tensor(list(parts.train.background), device=device)  # [3]
         (folder / RENDERS).mkdir(exist_ok=True)
 
+        regions = regions_of(views, parts)
+
         def measure(
             model: Gaussians, phase: str, renders: Path | None
         ) -> dict[str, dict[str, float]]:
@@ -113,7 +122,9 @@ def _build_from_model(views: Views, trained: Step, parts: Parts) -> Callable[[Pa
                     if renders is not None:
                         path = renders / png_name(view.name)
                         written.append(beside.submit(Image.fromarray(image).save, path))
-                    per_view[view.name] = evaluator.evaluate_view(image, view.image, view.mask)
+                    per_view[view.name] = evaluator.evaluate_view(
+                        image, view.image, view.mask, regions.get(view.name, {})
+                    )
                     report(phase, done, len(scene.test))
             for saved in written:
                 saved.result()  # raises what the thread raised
@@ -151,11 +162,14 @@ def _build_from_renders(views: Views, trained: Step, parts: Parts) -> Callable[[
 
     def build(folder: Path) -> None:
         scene, per_view = views.scene, {}
+        regions = regions_of(views, parts)
         shutil.copytree(views.store.path(trained) / RENDERS, folder / RENDERS)
         with progress("evaluate") as report:
             for done, view in enumerate(scene.test, 1):
                 image = read_image(folder / RENDERS / png_name(view.name))
-                per_view[view.name] = evaluator.evaluate_view(image, view.image, view.mask)
+                per_view[view.name] = evaluator.evaluate_view(
+                    image, view.image, view.mask, regions.get(view.name, {})
+                )
                 report("views", done, len(scene.test))
         unknown = {}
         if parts.eval.fps is not None:

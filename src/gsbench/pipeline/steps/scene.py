@@ -24,6 +24,7 @@ from gsbench.runs.nested import sha256_of
 from gsbench.runs.package_code import edited, states_of
 from gsbench.runs.store import Store
 from gsbench.runs.user_code import NO_USER_CODE, UserCode
+from gsbench.scene.beside import digests, files_beside
 from gsbench.scene.colmap import Cloud, normalize_capture, write_frames
 from gsbench.scene.colmap_files import SPARSE_FOLDERS
 from gsbench.scene.courtyard.render import render_courtyard
@@ -197,12 +198,19 @@ class Views:
         self.store, self.capture, self.init = store, capture, init
         names = ("downscale", "max_size", "resample", "principal_point")
         self.preparation: dict[str, Any] = {name: getattr(options, name) for name in names}
+        self._beside: dict[str, Any] = {}
+        if options.beside:
+            self._beside = {"beside": options.beside, "depth_scale": options.depth_scale}
 
     @property
     def inputs(self) -> dict[str, Any]:
         """The inputs on which the views depend, besides the cameras, which come from ``init``."""
         names = sha256_of(list(self.capture.test_names))
-        return {"capture": self.capture.fingerprint, "test": names, **self.preparation}
+        inputs = {"capture": self.capture.fingerprint, "test": names, **self.preparation}
+        if not self._beside:  # so that earlier keys stay
+            return inputs
+        files = files_beside(self.capture, self._beside["beside"])
+        return inputs | self._beside | {"beside": digests(files)}
 
     @cached_property
     def scene(self) -> Scene:
@@ -218,6 +226,7 @@ class Views:
                 progress=report,
                 made_by=view_versions(),
                 **self.preparation,
+                **self._beside,
             )
         scene = without_copies(scene)
         odd = inspect("scene", scene, f"scene {scene.name}", self.capture.accept)

@@ -1,0 +1,123 @@
+"""Pictures beside photographs, such as a sensor's depth, as pixels of the trained views.
+
+``scene.beside`` names them. Losses, terms and densifiers read them (docs/ideas.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from gsbench.errors import InputError
+from gsbench.files import file_sha256
+from gsbench.scene.images import open_image
+from gsbench.scene.types import Camera, CameraModel, Capture
+from gsbench.words import listed
+
+DEPTH = "depth"
+MILLIMETRE = 0.001  # of a world in metres: the step of most sensors
+Pixels = NDArray[Any]  # [H, W] or [H, W, C]
+
+
+def files_beside(capture: Capture, kinds: Sequence[str]) -> dict[str, dict[str, Path]]:
+    """The files of each kind by photograph; raises InputError for a kind that none has."""
+    found: dict[str, dict[str, Path]] = {}
+    for kind in kinds:
+        files = (
+            capture.depths
+            if kind == DEPTH
+            else {name: more[kind] for name, more in capture.more.items() if kind in more}
+        )
+        if not files:
+            present = {kind for more in capture.more.values() for kind in more}
+            present |= {DEPTH} if capture.depths else set()
+            raise InputError(
+                f"scene.beside={kind}: no photograph of {capture.images} has such a picture; there "
+                f"are: {listed(sorted(present)) or 'none'}; put them into a folder beside the "
+                "photographs', named like this and like a kind of picture (docs/captures.md)"
+            )
+        found[kind] = dict(files)
+    return found
+
+
+def read_beside(path: Path, kind: str, depth_scale: float | None = None) -> Pixels:
+    """The pixels of a file: depth in world units [H, W] float32, others uint8 [H, W, C].
+
+    Depth is ``.npy`` with float32 values, or a picture of one channel; integers are steps of
+    ``depth_scale`` world units (None: a thousandth). Values that are not finite and above 0 become 0, which means that
+    the depth is not known. Raises InputError for a file that cannot be read.
+    """
+    if kind != DEPTH:
+        with open_image(path) as image:
+            return np.atleast_3d(_decoded(path, image))
+    if path.suffix.lower() == ".npy":
+        try:
+            values: Pixels = np.load(path, allow_pickle=False)
+        except (OSError, ValueError, EOFError) as error:
+            raise InputError(f"{path}: is no array of numpy ({error}): save it again") from error
+    else:
+        with open_image(path) as image:
+            values = _decoded(path, image)
+    if values.ndim != 2 or values.dtype.kind not in "uif":
+        raise InputError(
+            f"{path}: a depth map has one number for each pixel, this has {values.dtype} "
+            f"{list(values.shape)}: save it as 16-bit grey, 32-bit float TIFF, or .npy"
+        )
+    step = 1.0 if values.dtype.kind == "f" else depth_scale or MILLIMETRE
+    depth = values.astype(np.float32) * np.float32(step)
+    known = np.isfinite(depth) & (depth > 0)
+    return np.where(known, depth, 0).astype(np.float32)
+
+
+def _decoded(path: Path, image: Image.Image) -> Pixels:
+    try:
+        return np.asarray(image)
+    except Exception as error:  # Pillow's readers may raise any exception on a damaged file
+        raise InputError(f"{path}: the picture is damaged ({error}): replace it") from error
+
+
+def resized(picture: Pixels, width: int, height: int) -> Pixels:
+    """The nearest pixels of a picture [h, w, …] at another size in px: [height, width, …].
+
+    Nothing is interpolated: a mean of two depths belongs to no surface.
+    """
+    rows = (np.arange(height) + 0.5) * picture.shape[0] / height
+    columns = (np.arange(width) + 0.5) * picture.shape[1] / width
+    return picture[np.ix_(rows.astype(int), columns.astype(int))]
+
+
+def pixels_of_view(picture: Pixels, lens: CameraModel, view: Camera) -> Pixels:
+    """The pixels of ``picture`` [h, w, …] nearest to those of an undistorted view: [H, W, …].
+
+    The picture covers the photograph of ``lens`` and may have another size. Pixels of the view that
+    lie outside the photograph are 0.
+    """
+    if not lens.distorted:
+        return resized(picture, view.width, view.height)
+    import pycolmap  # slow to load, and not needed for pinhole images
+
+    size = {"width": lens.width, "height": lens.height}
+    camera = pycolmap.Camera(model=lens.name, params=list(lens.params), **size)
+    columns, rows = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
+    x, y = (columns - view.cx) / view.fx, (rows - view.cy) / view.fy  # [H, W]
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
+    places = camera.img_from_cam(rays) / (lens.width, lens.height)  # [H W, 2], in 0..1
+    inside = ((places >= 0) & (places < 1)).all(axis=1)  # False for a ray without a place
+    pixels = np.where(inside[:, None], places, 0) * picture.shape[1::-1]
+    across, down = pixels.astype(int).T
+    chosen = picture[down, across]
+    chosen[~inside] = 0
+    return chosen.reshape(view.height, view.width, *picture.shape[2:])
+
+
+def digests(files: Mapping[str, Mapping[str, Path]]) -> dict[str, dict[str, str]]:
+    """sha256 of each file, by kind and photograph."""
+    return {
+        kind: {name: file_sha256(path) for name, path in sorted(own.items())}
+        for kind, own in files.items()
+    }
