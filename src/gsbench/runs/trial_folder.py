@@ -152,6 +152,10 @@ class TrialFolder:
         steps = re.findall(rb'"step": (\d{1,18})', tail)
         return building.stage, int(steps[-1]) if steps else 0
 
+    def share_done(self, iterations: int) -> float:
+        """The share of a training's ``iterations`` that are done."""
+        return min(1.0, self.stage_and_step()[1] / max(1, iterations))
+
     # ---- configuration
 
     def configuration(self) -> dict[str, Any]:
