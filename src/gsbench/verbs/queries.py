@@ -5,7 +5,9 @@ import re
 from contextlib import suppress
 from pathlib import Path
 
-from gsbench.app.hydra_app import run_main
+from omegaconf import OmegaConf
+
+from gsbench.app.hydra_main import run_main
 from gsbench.config.command_words import check_single, typed_permissions
 from gsbench.config.compose import Composer
 from gsbench.config.overrides import parse_word
@@ -47,10 +49,9 @@ def ask_hydra(argv: list[str]) -> int:
         folders = [options.config_dir] if options.config_dir else []
         check_single(options.overrides, "choose one whose configuration is shown")
         composer = Composer([*search_path(folders, options.overrides), *options.overrides])
-        if options.package is not None and not composer.has_key(options.package):
-            raise InputError(
-                f"--package {options.package}: there is no such part of the configuration"
-            )
+        package = options.package or ""
+        if package and OmegaConf.select(composer.config, package) is None:
+            raise InputError(f"--package {package}: there is no such part of the configuration")
 
     def task(config: object) -> None:
         raise AssertionError("Hydra was asked a question, and ran the task instead")
