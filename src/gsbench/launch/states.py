@@ -30,7 +30,7 @@ from gsbench.words import as_line, counted
 
 
 class Kind(NamedTuple):
-    """What a state means for the verbs that show and repeat trials."""
+    """The meaning of a state for the verbs that show and repeat trials."""
 
     column: str = "waiting"  # of `gsbench.launch.progress.progress_frame`
     retried: bool = False  # `gsbench retry` runs it again
