@@ -48,7 +48,9 @@ def ask_hydra(argv: list[str]) -> int:
         check_single(options.overrides, "choose one whose configuration is shown")
         composer = Composer([*search_path(folders, options.overrides), *options.overrides])
         if options.package is not None and not composer.has_key(options.package):
-            raise InputError(f"--package {options.package}: there is no such part of the configuration")
+            raise InputError(
+                f"--package {options.package}: there is no such part of the configuration"
+            )
 
     def task(config: object) -> None:
         raise AssertionError("Hydra was asked a question, and ran the task instead")
