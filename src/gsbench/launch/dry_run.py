@@ -13,17 +13,14 @@ from statistics import fmean
 from typing import Any
 
 from gsbench.config.compose import Trial
-from gsbench.errors import InputError
 from gsbench.eval.facts import LPIPS
 from gsbench.launch.guess import Guess, guess_training
 from gsbench.launch.states import arm_names, ask_queue, label_of, state_in_queue, summary_of
 from gsbench.parsing import DamagedError
-from gsbench.runs.config_hash import determining_settings
-from gsbench.runs.layout import RESULTS, SEED, TRIAL_GLOB
-from gsbench.runs.nested import SHOWN, flatten, sha256_of
+from gsbench.runs.layout import RESULTS, TRIAL_GLOB
+from gsbench.runs.nested import sha256_of
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.runs.user_code import user_modules
-from gsbench.words import counted, readable_time, some_of
+from gsbench.words import counted, readable_time
 
 
 class FinishedTrials:
@@ -103,8 +100,6 @@ def describe_plan(trials: Sequence[Trial], parallel: int = 1) -> list[str]:
             remaining += seconds * (1 - folder.share_done(trial.values["train"]["iterations"]))
             learned_from = max(learned_from, known_from)
             without_estimate += seconds == 0
-        if state == "missing" and (change := _change_since_last(trial, arms)):
-            note += f"  {change}"
         states.append(state)
         lines.append(f"{state:<8} {label_of(folder.path, arms)}{note}")
     lines.append(summary_of(states))
@@ -139,36 +134,6 @@ def _what_is_left(trial: Trial) -> str:
             return note if weights and asked["download"] else ""
         change = replace(change, name=", ".join(here))
     return "" if change is None else f"  will be checked: {change}"
-
-
-def _change_since_last(trial: Trial, planned: Collection[Path]) -> str:
-    """A line on what changed since the arm's last finished trial of this scene and seed.
-
-    It is "" if there is none. A trial that is ``planned`` too is another arm of this sweep, not an
-    earlier form of this one.
-    """
-    pattern = f"*{SEED}{trial.values['seed']}/{RESULTS}"
-    earlier = [
-        path.parent for path in trial.folder.parent.glob(pattern) if path.parent not in planned
-    ]
-    if not earlier:
-        return ""
-    last = TrialFolder(max(earlier, key=lambda folder: (folder / RESULTS).stat().st_mtime))
-    record = last.sound_record()
-    try:
-        before = _determining(last.configuration(), {} if record is None else record.code.sources)
-    except (InputError, OSError):
-        return ""
-    now, hash8 = _determining(trial.values, user_modules(trial.values)), last.path.name[:SHOWN]
-    keys = [key for key in {**now, **before} if now.get(key) != before.get(key)]
-    changes = [f"{key} {before.get(key, 'unset')} → {now.get(key, 'unset')}" for key in keys]
-    return f"since {hash8} changed: {some_of(changes)}" if changes else ""
-
-
-def _determining(values: Mapping[str, Any], modules: Mapping[str, str]) -> dict[str, Any]:
-    """The settings that determine a result, with dotted keys, and the user's code."""
-    code = {f"code of {module}": digest[:SHOWN] for module, digest in modules.items()}
-    return flatten(determining_settings(values)) | code
 
 
 def unavailable_now(options: Mapping[str, Any]) -> Collection[str]:
