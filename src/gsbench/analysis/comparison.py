@@ -30,10 +30,9 @@ from gsbench.analysis.verdicts import (
 )
 from gsbench.runs.commands import Question, code_in, questions_elsewhere
 from gsbench.runs.layout import LEDGER, TUNING
-from gsbench.words import command
 
 DEFAULT_METRIC = "psnr"
-LEDGER_DECIDES = "the ledger's tests decide ({})"
+OLD_LEDGER = f"the ledger of an earlier gsbench decided ({LEDGER})"
 
 
 @dataclass(frozen=True)
@@ -229,8 +228,8 @@ def _answers(
         answers.append(replace(answer, earlier=earlier))
     answers.sort(key=lambda answer: answer.earlier)
     state, why = NOT_ASKED, ""
-    if (experiment.folder / LEDGER).exists():  # it has asked, and its levels follow its own order
-        state, why = NOT_TESTED, LEDGER_DECIDES.format(command("ledger", "show", experiment.name))
+    if (experiment.folder / LEDGER).exists():
+        state, why = NOT_TESTED, OLD_LEDGER
     for pair in unasked:
         shown = interval_of(trials, *pair, DEFAULT_METRIC, state, why)
         answers.append(_with_metrics(shown, trials, *pair))

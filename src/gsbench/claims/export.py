@@ -47,13 +47,11 @@ from gsbench.runs.layout import (
     DECLARED,
     FAILED,
     FROM_PIXELS,
-    LEDGER,
     PER_VIEW,
     REGIONS,
     RESULTS,
     TUNING,
 )
-from gsbench.runs.ledger import as_json, chained, read_ledger
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.words import without_folders
 
@@ -155,7 +153,6 @@ def _of_experiment(home: Path) -> dict[str, bytes]:
     """The experiment's own records."""
     shared: dict[str, Callable[[Path], bytes]] = {
         COMMANDS: _shared_commands,
-        LEDGER: _shared_ledger,
         DECLARED: lambda home: read_bytes(home / DECLARED),
     }
     return {
@@ -180,16 +177,6 @@ def _searches(home: Path, trials: Sequence[TrialResult]) -> dict[str, bytes]:
     }
 
 
-def _shared_ledger(home: Path) -> bytes:
-    """The ledger for others, without folders and servers of this machine, and so chained anew."""
-    entries = []
-    for entry in map(as_json, read_ledger(home).entries):
-        if "words" in entry:
-            entry["words"] = without_private_words(entry["words"])
-        entries.append(without_paths(entry))
-    return chained(entries).encode()
-
-
 def _shared_commands(home: Path) -> bytes:
     """The commands for others, without folders and servers of this machine, and so linked anew."""
     lines = []
@@ -201,6 +188,9 @@ def _shared_commands(home: Path) -> bytes:
             }
             words = tuple(without_private_words(line.words))
             line = replace(line, words=words, cwd="", trials=trials)
+            if line.idea:
+                shared = tuple(without_private_words(line.idea.words))
+                line = replace(line, idea=replace(line.idea, words=shared))
         lines.append(line)
     return chained_commands(lines).encode()
 

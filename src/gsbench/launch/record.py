@@ -4,10 +4,7 @@ Loads no torch.
 """
 
 import logging
-import os
 import shutil
-import sys
-import time
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -33,9 +30,19 @@ from gsbench.config.compose import Trial
 from gsbench.errors import InputError
 from gsbench.files import require_no_links
 from gsbench.pipeline.metric_facts import facts_for
-from gsbench.runs.commands import Command, History, PlannedTrial, Question, append, digest_of, drop
+from gsbench.runs.commands import (
+    Command,
+    History,
+    PlannedTrial,
+    Question,
+    append,
+    command_now,
+    digest_of,
+    drop,
+    read_history,
+)
 from gsbench.runs.experiments import QUESTIONS, metric_and_question
-from gsbench.runs.layout import LEDGER, RESULTS, SEED, TUNING
+from gsbench.runs.layout import RESULTS, SEED, TUNING
 from gsbench.runs.nested import flatten
 from gsbench.settings import check_values
 from gsbench.words import did_you_mean
@@ -60,8 +67,9 @@ def record(trials: Sequence[Trial], asks: bool = True) -> list[Question]:
         if not typed:
             continue
         rows = planned_rows(typed)
-        questions = asks and not any((home / name).exists() for name in (TUNING, LEDGER))
-        asked = asked_of(typed, rows) if questions else None
+        asked = None
+        if asks and not (home / TUNING).exists() and read_history(home).ledger is None:
+            asked = asked_of(typed, rows)
         measured = rows_of(read_experiment(home).trials) if asked and home.is_dir() else []
 
         def make(
@@ -90,14 +98,7 @@ def record(trials: Sequence[Trial], asks: bool = True) -> list[Question]:
             }
             if not (found or shown or changed):
                 return None
-            return Command(
-                words=tuple(sys.argv[1:]),
-                cwd=os.getcwd(),
-                time=time.time(),
-                trials=planned,
-                questions=tuple(found),
-                shows=tuple(shown),
-            )
+            return command_now(trials=planned, questions=tuple(found), shows=tuple(shown))
 
         line = append(home, make)
         for question in () if line is None else line.questions:
