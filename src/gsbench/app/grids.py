@@ -13,7 +13,6 @@ from typing import Any
 from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, OmegaConf
 
-from gsbench.analysis.advice import GRIDS
 from gsbench.analysis.questions import plan_looks
 from gsbench.analysis.results import read_experiment
 from gsbench.app.sweep import Run, Sweep
@@ -29,6 +28,7 @@ from gsbench.launch.record import check_looks, planned_rows, record
 from gsbench.runs.layout import RESULTS
 from gsbench.words import listed
 
+GRIDS = "hydra.sweeper.grids"
 log = logging.getLogger(__name__)
 
 

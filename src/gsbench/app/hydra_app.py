@@ -28,8 +28,7 @@ from hydra.core.utils import JobReturn, JobStatus
 from hydra.types import HydraContext
 from omegaconf import DictConfig, OmegaConf, read_write
 
-from gsbench.analysis.advice import GRIDS
-from gsbench.app.grids import run_sweep
+from gsbench.app.grids import GRIDS, run_sweep
 from gsbench.app.sweep import DEFAULT_METRIC, HYDRA_ERRORS, OWN, Ended, Sweep, better_direction
 from gsbench.config.command_words import grid_points
 from gsbench.config.compose import Trial, check_permitted, trial_of_job

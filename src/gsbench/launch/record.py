@@ -23,9 +23,8 @@ from gsbench.analysis.questions import (
     ask,
     plan_looks,
     read_least,
-    rows_of,
 )
-from gsbench.analysis.results import group_by, read_experiment
+from gsbench.analysis.results import TrialResult, group_by, read_experiment
 from gsbench.config.compose import Trial
 from gsbench.errors import InputError
 from gsbench.files import require_no_links
@@ -70,7 +69,7 @@ def record(trials: Sequence[Trial], asks: bool = True) -> list[Question]:
         asked = None
         if asks and not (home / TUNING).exists() and read_history(home).ledger is None:
             asked = asked_of(typed, rows)
-        measured = rows_of(read_experiment(home).trials) if asked and home.is_dir() else []
+        measured = read_experiment(home).trials if asked and home.is_dir() else ()
 
         def make(
             history: History,
@@ -78,7 +77,7 @@ def record(trials: Sequence[Trial], asks: bool = True) -> list[Question]:
             typed: Sequence[Trial] = typed,
             rows: Sequence[Row] = rows,
             asked: Asked | None = asked,
-            measured: Sequence[Row] = measured,
+            measured: Sequence[TrialResult] = measured,
         ) -> Command | None:
             found, shown = ask(rows, asked, measured, history) if asked else ([], [])
             asked_now.extend([*found, *(one for one in history.questions if one.id in shown)])

@@ -18,7 +18,7 @@ from PIL import Image
 
 from gsbench.analysis.addresses import ArmName
 from gsbench.analysis.quantities import COSTS, asked_quantity
-from gsbench.analysis.questions import Asked, Row, announce, ask, rows_of
+from gsbench.analysis.questions import Asked, Row, announce, ask
 from gsbench.analysis.results import TrialResult, read_experiment
 from gsbench.analysis.trial_settings import config_if_readable
 from gsbench.config.overrides import parse_word
@@ -209,7 +209,7 @@ def ask_about(
     asked = Asked(metric=primary, sign=sign, least=least, baseline=baseline)
 
     def make(history: History) -> Command | None:
-        found, _ = ask(planned, asked, rows_of(trials), history)
+        found, _ = ask(planned, asked, trials, history)
         for question in found:
             log.info("%s: %s", home.name, announce(question))
         words, cwd = tuple(sys.argv[1:]), os.getcwd()

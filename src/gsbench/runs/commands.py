@@ -196,7 +196,7 @@ class Idea(Record):
 
 
 class Ledger(Record):
-    """What decides on the ideas of a ledger, on which seeds, and how many share the ``rate``.
+    """The terms of a ledger: the metric that decides, the seeds, how many ideas share the ``rate``.
 
     ``least`` is the least difference in ``metric`` that matters, a fraction of the baseline's value
     if ``relative``. ``rate`` is the false discovery rate.
@@ -278,7 +278,7 @@ class History:
 
     @property
     def ledger(self) -> Ledger | None:
-        """What the ledger of ideas was opened with; None if the experiment is none."""
+        """The terms of its ledger of ideas; None if it is none."""
         return next((one.ledger for one in self.commands if one.ledger), None)
 
     @cached_property
