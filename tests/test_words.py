@@ -264,7 +264,6 @@ def test_glob_lists_the_options_of_a_group():
     assert [trial.values["densify"]["name"] for trial in trials] == ["absgrad", "absgs", "adc"]
 
 
-
 # ---- property: any value of any setting is accepted and then stays, or is refused in one line
 
 SCHEMA_KEYS = [
