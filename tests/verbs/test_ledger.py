@@ -13,7 +13,7 @@ from gsbench.analysis.results import read_experiment
 from gsbench.claims.export import _shared_commands, without_private_words
 from gsbench.claims.ledger import read_ledger
 from gsbench.cli import run
-from gsbench.launch.record import record
+from gsbench.launch import record as writing
 from gsbench.runs import commands
 from gsbench.runs.keys import CODE_OF_STAGE
 from gsbench.runs.layout import COMMANDS
@@ -45,7 +45,7 @@ class Trainings:
 
     def __call__(self, trials, asks):
         assert not asks  # the questions are the ledger's, at its levels
-        record(trials, asks)
+        writing.record(trials, asks)
         code = 0
         for trial in trials:
             size, seed = trial.values["densify"]["split_size"], trial.values["seed"]
@@ -74,14 +74,22 @@ def write_made_up(trial, psnr, **facts):
     (trial.folder / "config.yaml").write_text(trial.yaml)
 
 
+def at(monkeypatch, moment):
+    """Let all commands be given then: the new seeds follow from all lines before."""
+
+    def now(words=None, **parts):
+        return commands.Command(words=(), cwd="", time=moment, **parts)
+
+    for module in (verb, writing):
+        monkeypatch.setattr(module, "command_now", now)
+
+
 @pytest.fixture
 def trainings(monkeypatch, runs):
     made = Trainings()
     monkeypatch.setattr("gsbench.app.ledger_trials.compose_trials", composed)
     monkeypatch.setattr(verb, "run_trials", made)
-    # the new seeds follow from all lines before, so from their times and words
-    monkeypatch.setattr(commands.time, "time", lambda: 1.0)
-    monkeypatch.setattr(commands.sys, "argv", ["gsbench"])
+    at(monkeypatch, 1.0)
     monkeypatch.setattr(verb, "finished_trials", finished)
     return made
 
@@ -169,7 +177,7 @@ def test_luck_on_the_seeds_of_all_ideas_keeps_nothing(home, trainings):
 
 def test_another_ledger_on_the_same_captures_has_other_seeds(home, monkeypatch):
     attempt(f"{SPLIT}=0.02")
-    monkeypatch.setattr(commands.time, "time", lambda: 2.0)
+    at(monkeypatch, 2.0)
     run(["ledger", *split("new other --metric psnr --least 0.5"), *NEW[6:]])
     run(["ledger", "try", "other", f"{SPLIT}=0.02"])
     (first,), (second,) = (seeds_of(one) for one in (home, home.parent / "other"))

@@ -13,7 +13,8 @@ from typing import Any
 
 from gsbench.analysis.notes import Note
 from gsbench.analysis.results import Arm, TrialPair, TrialResult, group_by, seeds_text
-from gsbench.analysis.trial_settings import Configured, canonical
+from gsbench.analysis.trial_result import Trained
+from gsbench.analysis.trial_settings import canonical
 from gsbench.gaussians.paper_values import RATES
 from gsbench.runs.config_hash import (
     is_ignored,
@@ -104,7 +105,7 @@ def differing_conditions(trials: Sequence[TrialResult], code: bool = True) -> di
     return {key: sorted(values) for key, values in values_by_condition.items() if len(values) > 1}
 
 
-def differing_settings(trials: Sequence[Configured]) -> dict[str, list[str]]:
+def differing_settings(trials: Sequence[Trained]) -> dict[str, list[str]]:
     """The settings in which trials differ, with their values, unless `is_ignored`.
 
     A missing key counts as unset (null): trials from before a setting existed equal later ones that

@@ -23,8 +23,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from gsbench.analysis.addresses import ArmName
-from gsbench.analysis.results import TrialResult
 from gsbench.analysis.statistics import ALPHA, MIN_SCENES, sign_test_needs
+from gsbench.analysis.trial_result import Trained
 from gsbench.analysis.trial_settings import canonical
 from gsbench.errors import InputError
 from gsbench.runs.commands import Digest, History, Place, Question, code_in
@@ -119,34 +119,6 @@ def read_least(value: float | str, where: str) -> LeastEffect:
 
 
 # ---- the trials of a command, and of earlier ones
-
-
-@dataclass(frozen=True)
-class Row:
-    """A planned trial as far as questions depend on it.
-
-    ``config`` has the settings with dotted keys, ``variant`` those that were swept.
-    """
-
-    scene: str
-    init: str
-    densify: str
-    config_hash: str
-    seed: int
-    config: Mapping[str, Any] = field(repr=False)
-    digest: Digest
-    variant: tuple[tuple[str, str], ...] = ()
-
-    @property
-    def key(self) -> str:
-        return f"{self.scene}/{self.init}-{self.densify}/{self.config_hash}"
-
-    @property
-    def arm(self) -> Arm:
-        return Arm(self.init, self.densify, self.variant)
-
-
-Trained = Row | TrialResult
 
 
 def place_of(row: Trained) -> Place:

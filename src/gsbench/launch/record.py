@@ -18,13 +18,13 @@ from gsbench.analysis.questions import (
     Asked,
     LeastEffect,
     NamedQuestion,
-    Row,
     announce,
     ask,
     plan_looks,
     read_least,
 )
 from gsbench.analysis.results import TrialResult, group_by, read_experiment
+from gsbench.analysis.trial_result import Planned
 from gsbench.config.compose import Trial
 from gsbench.errors import InputError
 from gsbench.files import require_no_links
@@ -75,7 +75,7 @@ def record(trials: Sequence[Trial], asks: bool = True) -> list[Question]:
             history: History,
             home: Path = home,
             typed: Sequence[Trial] = typed,
-            rows: Sequence[Row] = rows,
+            rows: Sequence[Planned] = rows,
             asked: Asked | None = asked,
             measured: Sequence[TrialResult] = measured,
         ) -> Command | None:
@@ -122,7 +122,7 @@ def asked_metrics(trials: Sequence[Trial]) -> dict[Path, str]:
     return metrics
 
 
-def planned_rows(trials: Sequence[Trial]) -> list[Row]:
+def planned_rows(trials: Sequence[Trial]) -> list[Planned]:
     """The trials, each with its variant, as far as questions depend on them."""
     configs: dict[Path, tuple[str, Mapping[str, Any]]] = {}
     rows = []
@@ -133,11 +133,11 @@ def planned_rows(trials: Sequence[Trial]) -> list[Row]:
             configs[key] = digest_of(values), flatten(yaml.safe_load(trial.yaml))
         digest, config = configs[key]
         scene, init, densify = (values[group]["name"] for group in ("scene", "init", "densify"))
-        rows.append(Row(scene, init, densify, key.name, values["seed"], config, digest))
+        rows.append(Planned(scene, init, densify, key.name, values["seed"], config, digest))
     return with_variants(rows)
 
 
-def asked_of(trials: Sequence[Trial], rows: Sequence[Row]) -> Asked | None:
+def asked_of(trials: Sequence[Trial], rows: Sequence[Planned]) -> Asked | None:
     """The questions of one experiment's trials; None if their metric has no direction."""
     values = trials[0].values
     options, launch = values["eval"], values["launch"]
@@ -164,7 +164,7 @@ def asked_of(trials: Sequence[Trial], rows: Sequence[Row]) -> Asked | None:
 
 
 def _named(
-    values: Mapping[str, Any], metric: str, rows: Sequence[Row]
+    values: Mapping[str, Any], metric: str, rows: Sequence[Planned]
 ) -> tuple[tuple[NamedQuestion, int, LeastEffect | None], ...]:
     """The questions that the experiment's file names; raises InputError for a wrong one."""
     found = []
@@ -190,7 +190,7 @@ def _named(
     return tuple(found)
 
 
-def check_looks(trials: Sequence[Trial], rows: Sequence[Row]) -> tuple[int, ...]:
+def check_looks(trials: Sequence[Trial], rows: Sequence[Planned]) -> tuple[int, ...]:
     """The seeds of a sweep in looks, in order; raises InputError if it cannot be run in looks."""
     what = "launch.stop_when_decided"
     if len({trial.files.home for trial in trials}) > 1:

@@ -18,8 +18,9 @@ from PIL import Image
 
 from gsbench.analysis.addresses import ArmName
 from gsbench.analysis.quantities import COSTS, asked_quantity
-from gsbench.analysis.questions import Asked, Row, announce, ask
+from gsbench.analysis.questions import Asked, announce, ask
 from gsbench.analysis.results import TrialResult, read_experiment
+from gsbench.analysis.trial_result import Planned
 from gsbench.analysis.trial_settings import config_if_readable
 from gsbench.config.overrides import parse_word
 from gsbench.errors import InputError
@@ -201,7 +202,7 @@ def ask_about(
     digest = make_digest(name, config_hash, {}, states_of(CODE_OF_STAGE[EVALUATE.name]))
     flat = flatten(config)
     planned = [
-        Row(scene, destination.init, destination.densify, config_hash, seed, flat, digest)
+        Planned(scene, destination.init, destination.densify, config_hash, seed, flat, digest)
         for scene, seed in places
     ]
     quantity = asked_quantity(primary, trials)

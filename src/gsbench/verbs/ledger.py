@@ -3,7 +3,7 @@
 import argparse
 import json
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -336,10 +336,11 @@ def _print_idea(book: Book, idea: str, as_json: bool, fails: str) -> None:
     print(book.lines()[1])
 
 
-def _facts(book: Book, idea: str) -> Mapping[str, Any]:
+def _facts(book: Book, idea: str) -> dict[str, Any]:
     """The known facts of an idea, for programs."""
-    verdict, facts = book.verdicts[idea], {"idea": idea, "against": book.ideas[idea].against}
-    interval, known = verdict.interval, dict[str, Any](facts)
+    verdict = book.verdicts[idea]
+    interval = verdict.interval
+    known: dict[str, Any] = {"idea": idea, "against": book.ideas[idea].against}
     if test := book.tests.get(idea):
         known |= {"level": test.level / 2, "test_seeds": next(iter(test.seeds.values()))}
     known |= {"result": book.result(idea), "reason": book.why(idea), "seeds": verdict.pairs.seeds}
