@@ -9,6 +9,7 @@ from PIL import Image
 
 from gsbench.config.compose import compose_one
 from gsbench.runs.config_hash import arm_hash, config_hash
+from gsbench.runs.store import Store
 from gsbench.scene import rules
 from gsbench.scene.load import load_scene
 from gsbench.scene.options import SceneConfig
@@ -253,12 +254,12 @@ def test_prepared_views_of_an_accepted_lens_are_judged_again(make_scene, tmp_pat
     plain, accepting = (
         read_colmap("toy", root, accept=accept) for accept in ([], ["lens-turns-back"])
     )
-    scene = load_scene(accepting, accepting.model, tmp_path / "cache")
-    again = load_scene(accepting, accepting.model, tmp_path / "cache")
+    scene = load_scene(accepting, accepting.model, Store(tmp_path / "cache"))
+    again = load_scene(accepting, accepting.model, Store(tmp_path / "cache"))
     assert [odd.refused for odd in again.oddities if odd.rule == "lens-turns-back"] == [True]
     assert again.oddities == scene.oddities
     with refusal("turns back inside the picture"):
-        load_scene(plain, plain.model, tmp_path / "cache")
+        load_scene(plain, plain.model, Store(tmp_path / "cache"))
 
 
 def test_what_is_accepted_changes_no_hash_of_a_trial():
