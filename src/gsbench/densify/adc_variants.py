@@ -144,7 +144,9 @@ class QuantileADC(ADC):
     def candidates(self, refinement: Refinement) -> tuple[Tensor, Tensor]:
         _, large = super().candidates(refinement)
         mean = self.mean_gradient()
-        count = int(self.growth_rate / refinement.strictness * len(mean)) // (self.split_children - 1)
+        count = int(self.growth_rate / refinement.strictness * len(mean)) // (
+            self.split_children - 1
+        )
         largest = torch.zeros_like(large)
         largest[mean.sort(descending=True, stable=True).indices[:count]] = True
         return largest & (mean > 0), large
