@@ -31,7 +31,8 @@ EXAMPLE = re.compile(r"^\[(examples/\w+\.py)\]\(\.\./\1\)$", re.MULTILINE)
 PICTURE = re.compile(r"(!\[[^\]]*\]\()docs/")  # the README's, from the root
 FENCE = re.compile(r"(^```.*?^```$)", re.DOTALL | re.MULTILINE)
 # page: the part that `reference.py` or `fidelity.py` adds to its end
-GENERATED = {"settings.md": "settings", "results.md": "results", "fidelity.md": "fidelity"}
+GENERATED = {f"{part}.md": part for part in ("settings", "results", "fidelity")}
+GENERATED["captures.md"] = "rules"
 
 
 def with_site_links(markdown: str, folder: Path, repository: str | None) -> str:

@@ -5,6 +5,7 @@ more.
 """
 
 import contextlib
+import itertools
 import json
 import lzma
 import os
@@ -30,15 +31,7 @@ SQUEEZED = [{"id": lzma.FILTER_X86}, {"id": lzma.FILTER_LZMA2, "preset": 6, "dic
 TINY = bool(os.environ.get("GPU_DAY_TINY"))
 COUNTS, PEER = (("3",), "cpu") if TINY else (("100000", "1000000", "3000000"), "gsplat")
 PEER_RASTER = PEER if TINY else "benchmarks.gsplat_raster.GsplatRasterizer"
-ARMS, SEEDS = ("adc", "volumetric", "volumetric_once"), range(20)
-READINGS = {  # of eq. 7, beside those in `ARMS`: which one gives the paper's counts and gains?
-    "volume_x8": "volumetric densify.volume_threshold=0.24",
-    "of_scales": "volumetric densify.condition_of=scales",
-    "of_nothing": "volumetric densify.condition_of=nothing",
-    "condition_8": "volumetric densify.max_condition=8",
-    "quantile": "volumetric densify.threshold_mode=quantile",
-    "quantile_once": "volumetric_once densify.threshold_mode=quantile",
-}
+ARMS = ("adc", "volumetric", "volumetric_once")
 # Of gsplat and Faster-GS, on idle cores; a trial run has nothing to compile.
 COMPILATION, OF_FASTER_GS = "compilation", "compilation-faster_gs"
 COMPILE = "0" if TINY else "from gsplat.cuda._backend import _C; assert _C"
@@ -66,7 +59,6 @@ class Row(NamedTuple):
     seconds: float  # of the plan; 0: in the background
     alone: bool = False  # for timing: compilations pause
     grace: float = 1.0  # seconds from SIGTERM, when a training writes its checkpoint, to SIGKILL
-    later: bool = False  # only by `rest`
 
 
 def gsbench(name: str, words: str, needs: str = "") -> Part:
@@ -89,19 +81,18 @@ def bench_of_lists(scene: str, *, split: bool) -> Part:
 
 
 def faster_gs(name: str, *words: str) -> Part:
-    script = ["-c", "0"] if TINY else [str(Path(__file__).with_name("faster_gs.py")), *words]
+    script = ["-c", "0"] if TINY else ["benchmarks/faster_gs.py", *words]
     needs = OF_FASTER_GS if words[1:] else ""
     return Part(name, ["env", f"FASTER_GS={STATE}/faster_gs", PYTHON, *script], needs)
 
 
-def training(arm: str, seed: int) -> Part:
+def training(arm: str) -> Part:
     words = f"scene=colmap scene.path={STATE}/bonsai init=dataset train=paper eval.at=[7000]"
     if TINY:
         words = "scene=courtyard scene.views=8 scene.width=32 scene.height=24 init=random"
         words += " init.count=6 train=7k train.iterations=2"
-    words += f" densify={READINGS.get(arm, arm)} seed={seed} raster=triton"
-    words += " tracking=none eval.download=false"
-    return gsbench(f"train-{arm}-{seed}", f"name=gpu_day-{arm}-{seed} {words}")
+    words += f" densify={arm} raster=triton tracking=none eval.download=false"
+    return gsbench(f"train-{arm}", f"name=gpu_day-{arm} {words}")
 
 
 def check(name: str, words: str, needs: str = "", tool: str = "") -> Part:
@@ -112,9 +103,8 @@ def check(name: str, words: str, needs: str = "", tool: str = "") -> Part:
     return Part(name, command, needs)
 
 
-def plan(seed: int = 0) -> list[Row]:
-    """All parts, the most telling first; the trainings with ``seed``."""
-    readings = list(READINGS)
+def plan() -> list[Row]:
+    """All parts, the most telling first."""
     contract, bits = "tests/raster/test_contract.py;-k;", "tests/raster/test_same_bits.py"
     some = " and without_visible" if TINY else ""  # part of the name of one quick test
     of_peer = f"{contract}{PEER}{some}" if TINY else "tests/bench/test_gsplat.py;-k;on_a_gpu"
@@ -132,27 +122,18 @@ def plan(seed: int = 0) -> list[Row]:
             for split in (True, False)
         ),
         Row([faster_gs("bench-faster_gs", "triton", *COUNTS)], 30, True),
-        Row([training(arm, seed) for arm in ARMS], 150, grace=8.0),
+        Row([training(arm) for arm in ARMS], 150, grace=8.0),
         Row([bench(PEER, PEER_RASTER, ",".join(COUNTS), COMPILATION)], 30),
         Row([check(f"contract-{PEER}", of_peer, COMPILATION)], 20),
         Row([check(tool, f"{bits};-k;tiny", tool=tool) for tool in ("memcheck", "racecheck")], 35),
-        *(
-            Row(
-                [training(reading, seed) for reading in readings[k : k + 3]],
-                270,
-                grace=8.0,
-                later=True,
-            )
-            for k in range(0, len(readings), 3)
-        ),
     ]
 
 
 class Runner:
     """Runs rows of parts in ``seconds``; a part's output and end are written to $OUT at once."""
 
-    def __init__(self, verb: str, seconds: float) -> None:
-        self.archive, self.records = OUT / f"gpu_day-{verb}.tar.gz", RESULTS / f"parts-{verb}.jsonl"
+    def __init__(self, seconds: float) -> None:
+        self.archive, self.records = OUT / "gpu_day.tar.gz", RESULTS / "parts.jsonl"
         self.begin, self.seconds, self.packed = time.monotonic(), seconds, 0.0
         self.running: dict[str, tuple[subprocess.Popen[bytes], float]] = {}  # with its begin
         self.ends: dict[str, int | str] = {}  # an exit code, minus a signal, or why there is none
@@ -251,27 +232,16 @@ def signal_session(session: int, *signals: int) -> None:
                     os.kill(int(stat.parent.name), number)
 
 
-def rest(names: tuple[str, ...]) -> list[Row]:
-    """Rows of the named parts; without names, of the first of these that are not done.
-
-    They are the parts of `all`, the readings of eq. 7, and the trainings with the next seed.
-    """
+def chosen(names: tuple[str, ...]) -> list[Row]:
+    """Rows of the named parts; without names, of those that did not end well yet."""
+    parts = {part.name: part for row in plan() for part in row.parts}
+    if unknown := set(names) - parts.keys():
+        sys.exit(f"there is no part {', '.join(sorted(unknown))}")
     done = {name for name, record in read_ends(RESULTS).items() if record["end"] == 0}
-    parts = [part for row in plan() for part in row.parts]
-    seed = sum(f"train-{ARMS[0]}-{seed}" in done for seed in SEEDS)
-    first = {part.name for row in plan() if not row.later for part in row.parts}
-    wanted = set(names) or first - done or {part.name for part in parts} - done
-    wanted = wanted or {f"train-{arm}-{seed}" for arm in ARMS}
-    wanted |= {part.needs for part in parts if part.name in wanted} - {""}
-    wanted |= set() if (STATE / "site").exists() else {"install"}
-    rows = []
-    for row in (row for seed in SEEDS for row in plan(seed)):
-        parts = [part for part in row.parts if part.name in wanted]
-        wanted -= {part.name for part in parts}
-        rows += [row._replace(parts=parts)] if parts else []
-    if wanted:
-        sys.exit(f"there is no part {', '.join(sorted(wanted))}")
-    return rows
+    wanted = set(names) or parts.keys() - done
+    wanted |= {parts[name].needs for name in wanted} | ({"install"} - done)
+    rows = [row._replace(parts=[x for x in row.parts if x.name in wanted]) for row in plan()]
+    return [row for row in rows if row.parts]
 
 
 def wheels() -> str:
@@ -323,9 +293,9 @@ def wheels() -> str:
 
 def read_ends(results: Path) -> dict[str, dict[str, Any]]:
     """The last record of each part."""
-    files = sorted(results.glob("parts-*.jsonl"))  # all, rest
-    records = (json.loads(line) for file in files for line in file.read_text().splitlines())
-    return {record["part"]: record for record in records}
+    file = results / "parts.jsonl"
+    lines = file.read_text().splitlines() if file.exists() else []
+    return {record["part"]: record for record in map(json.loads, lines)}
 
 
 def read(file: Path, kind: type) -> Any:
@@ -371,12 +341,12 @@ def table(results: Path) -> str:
     for folder in sorted(results.glob("train-*/")):
         record = read(folder / "results.json", dict) | {"training": folder.name}
         rows.append(record | record.get("metrics", {}) | record.get("seconds", {}))
-    for row in rows:
-        baseline = f"train-adc-{row['training'].rpartition('-')[2]}"
-        for adc in (other for other in rows if other["training"] == baseline):
-            with contextlib.suppress(KeyError):  # one of them has not ended
-                row["times_adc"] = row["num_gaussians"] / adc["num_gaussians"]
-                row["gain_db"] = row["psnr"] - adc["psnr"]
+    for row, adc in itertools.product(
+        rows, [one for one in rows if one["training"] == "train-adc"]
+    ):
+        with contextlib.suppress(KeyError):  # one of them has not ended
+            row["times_adc"] = row["num_gaussians"] / adc["num_gaussians"]
+            row["gain_db"] = row["psnr"] - adc["psnr"]
     return "\n".join([*lines, "", *markdown(TRAINED, rows)])
 
 
@@ -390,12 +360,11 @@ def markdown(names: str, rows: list[dict[str, Any]]) -> list[str]:
     return lines
 
 
-def tables(folder: Path) -> str:
-    """The tables of all archives in a folder; of a part that ran twice, the later run."""
+def tables(archive: str) -> str:
+    """The tables of an archive."""
     results = STATE / "tables" / "results"
     shutil.rmtree(results, ignore_errors=True)
-    for file in sorted(folder.glob("gpu_day-*.tar.gz")):  # all, rest
-        shutil.unpack_archive(file, results.parent, filter="data")
+    shutil.unpack_archive(archive, results.parent, filter="data")
     paper = Path("src/gsbench/analysis/published/volumetric.yaml").read_text().splitlines()
     (row, *_) = (line.strip() for line in paper if line.startswith("      bonsai:"))
     return f"{table(results)}\n\nThe paper: SSIM, PSNR, LPIPS, million Gaussians, minutes; {row}"
@@ -403,12 +372,10 @@ def tables(folder: Path) -> str:
 
 def main(verb: str, *words: str) -> int:
     if verb in ("wheels", "table"):
-        print(wheels() if verb == "wheels" else tables(Path(words[0])))
+        print(wheels() if verb == "wheels" else tables(words[0]))
         return 0
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
-    seconds = float(words[0]) if words else {"all": 540.0, "rest": 200.0}[verb]
-    rows = [row for row in plan() if not row.later] if verb == "all" else rest(words[1:])
-    return Runner(verb, seconds).run(rows)
+    return Runner(float(words[0]) if words else 540.0).run(chosen(words[1:]))
 
 
 if __name__ == "__main__":

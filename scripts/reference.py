@@ -1,8 +1,8 @@
 """Pages of the site that are generated from the code.
 
-They list all settings, the keys of ``results.json``, and the public names. ``python
-scripts/reference.py settings|results|api`` prints one of them as Markdown, ``schema`` the JSON
-Schema.
+They list all settings, the keys of ``results.json``, the rules of captures, and the public names.
+``python scripts/reference.py settings|results|rules|api`` prints one of them as Markdown,
+``schema`` the JSON Schema.
 """
 
 from __future__ import annotations
@@ -13,12 +13,15 @@ import importlib
 import inspect
 import io
 import json
+import math
 import re
 import sys
+import textwrap
 import tokenize
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
+from string import Formatter
 from typing import Any, get_type_hints
 
 import yaml
@@ -26,6 +29,7 @@ import yaml
 from gsbench.config.schema import GROUP_SCHEMAS, Config
 from gsbench.parsing import adapter
 from gsbench.runs.trial_record import TrialRecord
+from gsbench.scene.rules import ABOVE_ZERO, RULES
 from gsbench.settings import MISSING, describe, option_fields
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -223,6 +227,30 @@ def as_markdown(text: str) -> str:
     return text.replace("``", "`")
 
 
+# --- rules of captures ----------------------------------------------------------------------------
+
+
+def limits(values: tuple[float, float]) -> str:
+    """A range of values in words, to four digits."""
+    low, high = (f"{round(value, 9):.4g}" for value in values)
+    if values == ABOVE_ZERO:
+        return "above 0"
+    if math.isinf(values[0]):
+        return "" if math.isinf(values[1]) else f"at most {high}"
+    return f"at least {low}" if math.isinf(values[1]) else f"{low} to {high}"
+
+
+def rules_page() -> str:
+    """The rules of captures; a sentence has an ellipsis for each fact."""
+    lines = table("rule", "a line, unless", "refused, unless", "what it says")
+    for rule in RULES:
+        refused = limits(rule.usable) + " (always)" * rule.fixed or "never"
+        parts = [text + "…" * bool(name) for text, name, *_ in Formatter().parse(rule.say)]
+        said = textwrap.shorten("".join(parts), 80, placeholder=" …")
+        lines.append(row(f"`{rule.id}`", limits(rule.fine), refused, said))
+    return "\n".join(lines).replace("at most 1 (always)", "below 1 (always)") + "\n"
+
+
 # --- public names ---------------------------------------------------------------------------------
 
 
@@ -268,7 +296,12 @@ def api_page() -> str:
     return "\n".join(lines)
 
 
-PAGES = {"settings": settings_page, "results": results_page, "api": api_page}
+PAGES = {
+    "settings": settings_page,
+    "results": results_page,
+    "rules": rules_page,
+    "api": api_page,
+}
 
 if __name__ == "__main__":
     if sys.argv[1:2] == ["schema"]:

@@ -1,6 +1,5 @@
 """scripts/gpu_day.sh without a GPU: every line is tried before the short time on a GPU."""
 
-import importlib.util
 import json
 import os
 import re
@@ -16,9 +15,9 @@ from shlex import split
 import pytest
 
 from tests.composed import composed
+from tests.conftest import ROOT, script
 from tests.raster.conftest import interpreter_fault
 
-ROOT = Path(__file__).resolve().parents[1]
 SCRIPT = ROOT / "scripts/gpu_day.sh"
 # Stands in for Python: parts fail, hang or are killed as a test wants, and others print what real
 # ones print. Python runs everything else, such as the script itself.
@@ -81,7 +80,6 @@ class Absent:
 sys.meta_path.insert(0, Absent())
 """
 LISTS = "trained", "skewed", "crowded"  # the scenes in which long lists are split, and are not
-READINGS = "volume_x8", "of_scales", "of_nothing", "condition_8", "quantile", "quantile_once"
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs bash, /proc and Triton")
 
@@ -131,10 +129,10 @@ class Day:
             said, _ = process.communicate(timeout=1700)
         return process.returncode, said
 
-    def results(self, verb):
+    def results(self):
         """The end of each part in the archive in $OUT; "files" has the names of the files in it."""
-        with tarfile.open(self.out / f"gpu_day-{verb}.tar.gz") as archive:
-            file = archive.extractfile(f"results/parts-{verb}.jsonl")
+        with tarfile.open(self.out / "gpu_day.tar.gz") as archive:
+            file = archive.extractfile("results/parts.jsonl")
             records = [json.loads(line) for line in file.read().splitlines()]
             return {record["part"]: record["end"] for record in records} | {
                 "files": archive.getnames()
@@ -154,52 +152,47 @@ def test_parts_that_fail_hang_or_are_killed_do_not_harm_other_parts(day):
         "proof-triton": ("doctor --json --prove --raster triton", "hang"),
         "contract": ("test_contract.py -k triton", "kill"),
         "bench-triton-3": ("bench --raster triton --count", "fail"),
-        "train-volumetric-0": ("densify=volumetric ", "hang"),
+        "train-volumetric": ("densify=volumetric ", "hang"),
     }
     begin = time.monotonic()
-    code, said = day.run("all", "45", faults=faults)
+    code, said = day.run("run", "45", faults=faults)
     assert time.monotonic() - begin < 48
     assert code == 1, said
-    ends = day.results("all")
+    ends = day.results()
     files = ends.pop("files")
     assert {name: end for name, end in ends.items() if end != 0} == {
         "proof-triton": "out of time",
         "contract": -signal.SIGKILL,
         "bench-triton-3": 1,
-        "train-volumetric-0": "out of time",
+        "train-volumetric": "out of time",
     }
-    well = "install bits compilation compilation-faster_gs host bench-faster_gs train-adc-0 "
-    well = {*split(well + "train-volumetric_once-0 bench-cpu")}
+    well = "install bits compilation compilation-faster_gs host bench-faster_gs train-adc "
+    well = {*split(well + "train-volumetric_once bench-cpu")}
     well |= {f"bench-triton-{name}-{way}" for name in LISTS for way in ("split", "whole")}
     assert ends.keys() - faults.keys() == well | {"contract-cpu", "memcheck", "racecheck"}
     assert {
-        "results/train-adc-0/results.json",
+        "results/train-adc/results.json",
         "results/bench-cpu.out",
         "results/proof-triton.log",
     } <= set(files)
     assert "broken on purpose" in said  # the end of what it wrote
-    for name in ("proof-triton", "train-volumetric-0"):  # the child of a part has ended, too
+    for name in ("proof-triton", "train-volumetric"):  # the child of a part has ended, too
         child = Path("/proc") / (day.state / f"results/{name}.out").read_text().strip()
         assert not child.exists() or "\nState:\tZ" in (child / "status").read_text()
     table = (day.out / "table.md").read_text()
     assert "- proof-triton: NO (out of time), " in table
     assert "- contract: NO (-9), " in table
 
-    # The rest is what did not end well; then the readings of eq. 7; then another seed.
-    code, said = day.run("rest", "60")
+    # A second command runs what did not end well.
+    code, said = day.run("run", "60")
     assert code == 0, said
-    assert {name for name, end in day.results("rest").items() if end != 0} == {"files"}
-    assert "bits" not in said
-    for arms, seed in (READINGS, 0), (("adc", "volumetric", "volumetric_once"), 1):
-        code, said = day.run("rest", "60")
-        assert code == 0, said
-        trained = {f"train-{arm}-{seed}" for arm in arms}
-        assert set(re.findall(r"(\S+): 0 after", said)) == trained
+    assert {name for name, end in day.results().items() if end != 0} == {"files"}
+    assert set(re.findall(r"(\S+): 0 after", said)) == set(faults)
 
 
 def test_a_killed_command_leaves_the_results_so_far_and_no_process(day):
-    process = day.start("all", "300", faults={"train-adc-0": ("densify=adc ", "hang")})
-    marker = day.state / "results/train-adc-0.out"
+    process = day.start("run", "300", faults={"train-adc": ("densify=adc ", "hang")})
+    marker = day.state / "results/train-adc.out"
     until = time.monotonic() + 60
     while not (marker.exists() and marker.read_text()) and time.monotonic() < until:
         time.sleep(0.1)
@@ -207,22 +200,22 @@ def test_a_killed_command_leaves_the_results_so_far_and_no_process(day):
     assert child.exists()
     process.send_signal(signal.SIGTERM)
     process.communicate(timeout=60)
-    ends = day.results("all")
-    assert (ends["proof-triton"], ends["bits"], ends["train-adc-0"]) == (0, 0, "out of time")
+    ends = day.results()
+    assert (ends["proof-triton"], ends["bits"], ends["train-adc"]) == (0, 0, "out of time")
     assert "memcheck" not in ends
     assert not child.exists() or "\nState:\tZ" in (child / "status").read_text()
 
-    # The rest is what failed and what was never reached.
-    assert day.run("rest", "60")[0] == 0
-    rest = day.results("rest")
-    assert (rest["train-adc-0"], rest["memcheck"]) == (0, 0)
+    # The next command runs what failed and what was never reached.
+    assert day.run("run", "60")[0] == 0
+    ends = day.results()
+    assert (ends["train-adc"], ends["memcheck"]) == (0, 0)
 
 
 def test_named_parts_run_and_an_unknown_name_is_refused(day):
-    code, said = day.run("rest", "60", "bits", "train-adc-3")
+    code, said = day.run("run", "60", "bits", "train-adc")
     assert code == 0, said
-    assert day.results("rest").keys() == {"install", "bits", "train-adc-3", "files"}
-    assert day.run("rest", "60", "bites")[1].endswith("there is no part bites\n")
+    assert day.results().keys() == {"install", "bits", "train-adc", "files"}
+    assert day.run("run", "60", "bites")[1].endswith("there is no part bites\n")
 
 
 def test_the_commands_of_the_full_day_name_what_exists(tmp_path, monkeypatch):
@@ -235,11 +228,7 @@ def test_the_commands_of_the_full_day_name_what_exists(tmp_path, monkeypatch):
 
     for name in ("GPU_DAY_STATE", "GPU_DAY_BROUGHT", "OUT", "PYTHON", "GSBENCH_RUNS"):
         monkeypatch.setenv(name, str(tmp_path / name))
-    script = ROOT / "scripts" / "gpu_day.py"
-    spec = importlib.util.spec_from_file_location("gpu_day", script)
-    gpu_day = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, "gpu_day", gpu_day)
-    spec.loader.exec_module(gpu_day)
+    gpu_day = script("gpu_day")
     monkeypatch.chdir(ROOT)
     said, rasters = [], {one.name for one in EXECUTORS}
     monkeypatch.setattr(machine, "_prove", lambda raster, *_: said.append(raster) or 0)
@@ -270,9 +259,9 @@ def test_the_commands_of_the_full_day_name_what_exists(tmp_path, monkeypatch):
 
 
 def test_a_table_of_two_commands(day):
-    assert day.run("all", "45", faults={"bits": ("test_same_bits.py", "fail")})[0] == 1
-    assert day.run("rest", "60", "bits")[0] == 0
-    code, said = day.run("table", str(day.out))
+    assert day.run("run", "45", faults={"bits": ("test_same_bits.py", "fail")})[0] == 1
+    assert day.run("run", "60", "bits")[0] == 0
+    code, said = day.run("table", str(day.out / "gpu_day.tar.gz"))
     assert code == 0
     assert re.search(
         r"^- proof-triton: yes, \d+ s; device a GPU; versions .*3.6.0.*; errors .*image",
@@ -287,7 +276,7 @@ def test_a_table_of_two_commands(day):
         'triton-3, triton, 3: {"kernels_ms": {"_blend": 0.5}, "waits": {"cudaStreamSynchronize": 1.0}'
         in said
     )
-    trained = "| train-volumetric_once-0 | 30000 | 12345 | 1 | 99.5 | - | 31.543 | 0 | - | - | - |"
+    trained = "| train-volumetric_once | 30000 | 12345 | 1 | 99.5 | - | 31.543 | 0 | - | - | - |"
     assert trained in said
 
 
@@ -303,9 +292,9 @@ def test_the_whole_day_in_the_interpreter(day):
     triton = pytest.importorskip("triton")
     if fault := interpreter_fault(triton.__version__, version("numpy")):
         pytest.skip(fault)
-    code, said = day.run("all", "1600", REAL="1")
+    code, said = day.run("run", "1600", REAL="1")
     assert code == 0, said
-    said = day.run("table", str(day.out), REAL="1")[1]
+    said = day.run("table", str(day.out / "gpu_day.tar.gz"), REAL="1")[1]
     assert "NO (" not in said
     proof = r"^- proof-triton: yes, \d+ s; device .+; versions \{.*'triton'.*; errors \{.*'image'"
     assert re.search(proof, said, re.MULTILINE)
@@ -313,7 +302,7 @@ def test_the_whole_day_in_the_interpreter(day):
     assert re.search(r"^- memcheck: yes, \d+ s; 1 passed", said, re.MULTILINE)
     assert re.search(r"^\| triton-3 \| triton \| 3 \| 16x16 \| [\d.]+ \|", said, re.MULTILINE)
     assert re.search(
-        r"^\| train-volumetric-0 \| 2 \| \d+ \| [\d.]+ \| [\d.]+ \| [\d.]+ \| [\d.]+ \| -?[\d.]+ \|",
+        r"^\| train-volumetric \| 2 \| \d+ \| [\d.]+ \| [\d.]+ \| [\d.]+ \| [\d.]+ \| -?[\d.]+ \|",
         said,
         re.MULTILINE,
     )

@@ -150,6 +150,12 @@ def test_commands_settings_and_files_in_a_document_exist(document):
     assert faults_of(document.read_text(encoding="utf-8")) == []
 
 
+def test_links_between_documents_lead_to_existing_files():
+    for page in DOCUMENTS:
+        for target in re.findall(r"\]\(([^)#]+?)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
+            assert "://" in target or (page.parent / target).exists(), f"{page} links to {target}"
+
+
 def test_files_in_the_architecture_document_exist():
     """There, files may be named from ``src/gsbench``."""
     spans = SPAN.findall((ROOT / "docs/architecture.md").read_text(encoding="utf-8"))

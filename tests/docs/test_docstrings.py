@@ -132,6 +132,26 @@ def test_classes_that_users_extend_have_an_example(extended, word):
     assert word in (extended.__doc__ or "").partition("Examples:")[2]
 
 
+BREAK = re.compile(r"[a-z,] ?\n[a-z]")
+
+
+def broken_texts(source):
+    """The texts, without docstrings, that break a line within a sentence."""
+    tree = ast.parse(source)
+    statements = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    for node in ast.walk(tree):
+        text = getattr(node, "value", None)
+        if id(node) not in statements and isinstance(text, str) and BREAK.search(text):
+            yield text
+
+
+def test_no_message_is_printed_with_a_break_within_a_sentence():
+    assert list(broken_texts('x = "a word\\nand another"')) == ["a word\nand another"]
+    assert not list(broken_texts('"""A docstring\nof two lines."""\nx = "One.\\nTwo."'))
+    files = (ROOT / "src").rglob("*.py")
+    assert not [text for path in files for text in broken_texts(path.read_text())]
+
+
 def test_examples_are_sections_so_that_the_site_shows_them_as_code():
     for path in SOURCES.values():
         for before, line in re.findall(

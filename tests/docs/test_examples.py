@@ -259,13 +259,3 @@ def test_the_governed_densifier_of_the_document_ends_at_its_limit(folder):
         densifier.statistics["seen"][:] = True
         event = densifier.refine(step, trainable, rng)
     assert abs(event.after - 150) <= 3
-
-
-@pytest.mark.parametrize(
-    "document", ["README.md", *(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md"))]
-)
-def test_links_between_documents_lead_to_existing_files(document):
-    path = ROOT / document
-    for target in re.findall(r"\]\(([^)#]+?)(?:#[^)]*)?\)", path.read_text(encoding="utf-8")):
-        if "://" not in target:
-            assert (path.parent / target).exists(), f"{document} points to {target}"

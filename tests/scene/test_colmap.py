@@ -2,7 +2,6 @@
 
 import shutil
 import struct
-from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -11,14 +10,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
 from gsbench.scene.colmap import (
-    _normalize_quaternions,
     model_points,
     read_model,
     read_reference,
     write_model,
 )
-from gsbench.scene.colmap_checks import MODELS, ModelChecks
-from gsbench.scene.colmap_files import check_model
 from gsbench.scene.types import Camera
 from tests.helpers import refusal
 from tests.scene.cameras import cameras_of
@@ -137,80 +133,83 @@ def test_written_cameras_project_points_to_the_same_pixels(tmp_path):
         assert_allclose(back.center, image.projection_center(), atol=1e-12)
 
 
-def test_camera_models_are_those_of_colmap():
-    """Model numbers and parameter counts are COLMAP's, and focal lengths come first."""
-    known = {name: int(number) for name, number in pycolmap.CameraModelId.__members__.items()}
-    known.pop("INVALID")
-    assert {name: number for number, (name, _) in MODELS.items()} == known
-    for name, length in MODELS.values():
-        camera = pycolmap.Camera.create_from_model_name(1, name, 50.0, 40, 30)
-        assert len(camera.params) == length
-        focal = list(camera.focal_length_idxs()) or [0, 1]  # EQUIRECTANGULAR has its size
-        ModelChecks().camera(1, name, 40, 30, [float(place in focal) for place in range(length)])
-        for place in focal:
-            with refusal("is damaged"):
-                ModelChecks().camera(1, name, 40, 30, [float(at != place) for at in range(length)])
+PLAIN = {
+    "cameras": "1 PINHOLE 40 30 50 50 20 15",
+    "images": "1 1 0 0 0 0 0 5 1 a.png\n1 2 -1\n2 1 0 0 0 0 0 6 1 b c.png\n",
+    "points3D": "1 0 0 5 0 255 0 0.1 1 0",
+}
 
 
-POSE = (1.0, 0, 0, 0, 0, 0, 5)
-# one less than COLMAP's numbers for "none"
-LARGEST = {"camera": 2**32 - 2, "image": 2**32 - 2, "point": 2**64 - 2}
+def write_text_model(folder, **files):
+    """A small model as text, with ``files`` instead of some of its own."""
+    for stem, text in (PLAIN | files).items():
+        (folder / f"{stem}.txt").write_text(f"# a comment\n{text}\n\n")
+    return folder
 
 
-def sound_model():
-    """Calls of `ModelChecks` for a sound model with the smallest and largest ids."""
-    return [
-        ("camera", (0, "SIMPLE_PINHOLE", 1, 1, (0.5, 0, 0))),
-        ("camera", (LARGEST["camera"], "OPENCV", 40, 30, (50.0, 50, -20, 15, 0, -0.1, 0, 0))),
-        ("image", (0, POSE, 0, "a.png", 0)),
-        ("image", (LARGEST["image"], (1.5e-6, *POSE[1:]), LARGEST["camera"], "b.png", 3)),
-        ("point", (0, (0.0, 0, 0), [])),
-        ("point", (LARGEST["point"], (-1.0, 2, 3), [(LARGEST["image"], 0), (LARGEST["image"], 2)])),
-    ]
+def test_names_with_blanks_and_empty_second_lines_are_read(tmp_path):
+    model = read_model(write_text_model(tmp_path))
+    assert sorted(image.name for image in model.images.values()) == ["a.png", "b c.png"]
+    assert model.points3D[1].color.tolist() == [0, 255, 0]
+    numbers = (
+        "1 1 0 0 0 0 0 5 1 1\n1 2 -1 3 4 -1 5 6 -1 7 8 -1"  # a name and points that may be mixed up
+    )
+    assert read_model(write_text_model(tmp_path, images=numbers)).images[1].name == "1"
+
+
+POSED = "1 1 0 0 0 0 0 5 1"
 
 
 @pytest.mark.parametrize(
-    "call, argument, value, said",
+    "stem, text, said",
     [
-        (None, 0, None, ""),
-        *(
-            (place, 0, number, f"{kind} {number}{fault}")
-            for place, kind in ((1, "camera"), (3, "image"), (5, "point"))
-            for number, fault in (
-                (0, " appears twice"),
-                (LARGEST[kind] + 1, f": the number must be from 0 to {LARGEST[kind]}"),
-                (-1, ": the number must be from 0"),
-            )
-        ),
-        (0, 2, 0, "camera 0 is damaged"),
-        (0, 3, 0, "camera 0 is damaged"),
-        (0, 4, (0.0, 1, 1), "camera 0 is damaged"),
-        (1, 4, (50.0, 0, 20, 15, 0, 0, 0, 0), "is damaged"),
-        (1, 4, (50.0, 50, 20, 15, np.nan, 0, 0, 0), "is damaged"),
-        (2, 1, (0.0, 0, 0, 0, 0, 0, 5), "has no pose that can be used"),
-        (2, 1, (1.0, 0, 0, 0, 0, 0, np.inf), "has no pose that can be used"),
-        (2, 1, (1.0, 0, 0, 0, 0, 0), "has no pose that can be used"),
-        (2, 2, 7, "image 0 names camera 7, which the model lacks"),
-        (2, 3, "", "image 0 has no name of its own"),
-        (3, 3, "a.png", "has no name of its own"),
-        (4, 1, (0.0, np.nan, 0), "point 0 has no finite position"),
-        (5, 2, [(LARGEST["image"], 3)], "2D point 3 of image"),
-        (5, 2, [(LARGEST["image"], -1)], "2D point -1 of image"),
-        (5, 2, [(9, 0)], "2D point 0 of image 9"),
-        (4, 2, [(0, 0)], "2D point 0 of image 0"),
+        ("cameras", "1 PINHOLE 40 30 50 50 20", "VerifyParams"),
+        ("cameras", "1 OTHER 40 30 50 50 20 15", "model does not exist"),
+        ("cameras", "1 PINHOLE 0 30 50 50 20 15", "camera 1 is damaged"),
+        ("cameras", "1 PINHOLE 40 2000000 50 50 20 15", "camera 1 is damaged"),
+        ("cameras", "1 PINHOLE 40 30 50 0 20 15", "camera 1 is damaged"),
+        ("cameras", "1 PINHOLE 40.0 30 50 50 20 15", "whole px"),
+        ("cameras", "1 PINHOLE 40 30 50,5 50 20 15", "decimal points, not '1 PIN.*50,5"),
+        ("cameras", "1 PINHOLE 40 30 nan 50 20 15", "with decimal points"),
+        ("cameras", "\n".join(2 * [PLAIN["cameras"]]), "Check failed"),
+        ("images", "1 0 0 0 0 0 0 5 1 a.png\n1 2 -1", "frame 1 has no pose that can be used"),
+        ("images", "1 1 0 0 0 0 0 5 2 a.png\n1 2 -1", "does not exist"),
+        ("images", f"{POSED} a.png\n1 2", "in a second line of each image"),
+        ("images", f"{POSED} a.png\n1 nan -1", "in a second line of each image"),
+        ("images", f"{POSED}\n", "id of a camera, name"),
+        ("images", f"{POSED} a.png\n\n2 {POSED[2:]} a.png\n", "no names of their own"),
+        ("images", f"{POSED} a.png\n\n{POSED} b.png\n", "Check failed"),
+        ("images", f"{POSED} a.png\n2 {POSED[2:]} b.png", "in a second line of each image"),
+        ("images", f"{POSED} 1\n2 {POSED[2:]} 22", "in a second line of each image"),
+        ("images", f"4294967297 {POSED[2:]} a.png\n\n", "Check failed"),
+        ("points3D", "1 0 0 nan 0 0 0 0.1", "id, x, y, z"),
+        ("points3D", "1 0 0 5 0 0 0 0.1 1 1", "range"),
+        ("points3D", "1 0 0 5 0 0 0 0.1 9 0", "does not exist"),
+        ("points3D", "1 0 0 5 256 0 0 0.1", "a colour of whole numbers from 0 to 255"),
+        ("points3D", "1 0 0 5 -1 0 0 0.1", "a colour of whole numbers"),
+        ("points3D", "1 0 0 5 128.0 0 0 0.1", "a colour of whole numbers"),
+        ("points3D", "1 0 0 5 0 0 0", "error, pairs of ids"),
+        ("points3D", "1 0 0 5 0 0 0 x", "cannot be read"),
+        ("points3D", "1 0 0 5 0 255 0 0.1 1", "pairs of ids"),
     ],
 )
-def test_impossible_values_in_a_model_are_refused(call, argument, value, said):
-    checks = ModelChecks()
-    for place, (name, arguments) in enumerate(sound_model()):
-        if place != call:
-            getattr(checks, name)(*arguments)
-            continue
-        changed = [value if number == argument else given for number, given in enumerate(arguments)]
-        with refusal(said):
-            getattr(checks, name)(*changed)
-        return
-    assert call is None
+def test_a_bad_line_of_a_text_model_is_named(tmp_path, stem, text, said):
+    with refusal(rf"{tmp_path}.*{said}"):
+        read_model(write_text_model(tmp_path, **({"points3D": ""} | {stem: text})))
+
+
+@pytest.mark.parametrize("name", list(pycolmap.CameraModelId.__members__)[1:])
+def test_cameras_of_all_models_are_read_and_need_a_focal_length(tmp_path, name):
+    camera = pycolmap.Camera.create_from_model_name(1, name, 50.0, 40, 20)
+    for change in (None, *camera.focal_length_idxs()):
+        params = [0.0 if place == change else value for place, value in enumerate(camera.params)]
+        line = " ".join(["1", name, "40 20", *map(str, params)])
+        write_text_model(tmp_path, cameras=line)
+        if change is None:
+            assert read_model(tmp_path).cameras[1].model_name == name
+        else:
+            with refusal("camera 1 is damaged"):
+                read_model(tmp_path)
 
 
 @pytest.fixture(params=["bin", "txt"])
@@ -225,24 +224,19 @@ def rigs(request, tmp_path):
 
 
 @pytest.mark.parametrize("stem", ["cameras", "images", "points3D", "rigs", "frames"])
-def test_each_file_of_a_model_with_rigs_is_checked_to_its_end(rigs, stem):
-    check_model(rigs)
+def test_each_file_of_a_model_with_rigs_is_read_to_its_end(rigs, stem):
+    read_model(rigs)
     (file,) = rigs.glob(f"{stem}.*")
     whole = file.read_bytes()
     many = struct.pack("<Q", 2**60) + whole[8:]  # a count that the file cannot hold
     binary = file.suffix == ".bin"
-    for torn in (whole[:-1], whole + b"\0", many) if binary else (b"1 2", whole + b"\xff"):
-        file.write_bytes(torn)
-        with refusal(f"{file.name}: .*: copy or export it again"):
-            check_model(rigs)
-
-
-def test_a_rig_without_sensors_is_accepted(rigs):
-    if (rigs / "rigs.bin").is_file():
-        (rigs / "rigs.bin").write_bytes(struct.pack("<QIIII", 2, 1, 0, 2, 0))
-    else:
-        (rigs / "rigs.txt").write_text("1 0\n2 0\n")
-    check_model(rigs)
+    torn = (
+        (whole[:-1], whole[:-9], whole + b"\0", many, b"") if binary else (b"1 2", whole + b"\xff")
+    )
+    for content in torn:
+        file.write_bytes(content)
+        with refusal(f"{rigs}.*: (copy or export|wanted is|rename)"):
+            read_model(rigs)
 
 
 @pytest.mark.parametrize(
@@ -265,7 +259,7 @@ def test_a_zero_quaternion_of_a_rig_or_a_frame_is_refused(rigs, stem, start, at,
         words[at : at + 4] = ["0"] * 4
         file.write_text("\n".join([" ".join(words), *rest]))
     with refusal(f"{said} has no pose that can be used"):
-        check_model(rigs)
+        read_model(rigs)
 
 
 @pytest.mark.parametrize("text", [False, True])
@@ -274,97 +268,10 @@ def test_a_name_in_a_code_page_is_named(make_scene, text):
     file = root / "sparse/0" / ("images.txt" if text else "images.bin")
     file.write_bytes(file.read_bytes().replace(b"0003.png", "가나.png".encode("cp949")))
     with refusal(
-        r"image.*not UTF-8 .*\\xb0\\xa1\\xb3\\xaa.png.*: rename the photographs to ASCII"
+        r"not UTF-8 .*\\xb0\\xa1\\xb3\\xaa.png.*: rename the photographs to ASCII"
     ) as caught:
         read_colmap("toy", root)
     assert "export it again" not in str(caught.value)
-
-
-@pytest.mark.parametrize("names", [("a.png", "b c.png", "d.png"), ("1", "22", "333")])
-def test_an_image_without_its_line_of_points_is_named(make_scene, names):
-    root = make_scene(text=True)
-    file = root / "sparse/0/images.txt"
-    for stem in ("rigs", "frames"):
-        (root / f"sparse/0/{stem}.txt").unlink()
-    pose = "1 0 0 0 0 0 5 1"
-    lines = [f"{k} {pose} {name}" for k, name in enumerate(names, 1)]
-    file.write_text("\n".join(lines))
-    with refusal(r"images.txt: image 1 has no line of 2D points: each"):
-        check_model(root / "sparse/0")
-    file.write_text("\n\n".join(lines) + "\n1 2 -1 3 4 -1 5 6 -1 7 8 -1")
-    (root / "sparse/0/points3D.txt").write_text("")
-    check_model(root / "sparse/0")
-
-
-@pytest.mark.parametrize(
-    "stem, line, said",
-    [
-        ("cameras", "1 PINHOLE 40 30 50 50 20", "lacks parameters"),
-        ("cameras", "1 OTHER 40 30 50 50 20 15", "unknown model"),
-        ("cameras", "1 PINHOLE 0 30 50 50 20 15", "camera 1 is damaged"),
-        ("images", "1 0 0 0 0 0 0 5 1 a.png\n1 2 -1", "image 1 .* has no pose"),
-        ("images", "1 1 0 0 0 0 0 5 2 a.png\n1 2 -1", "names camera 2"),
-        ("points3D", "1 0 0 nan 0 0 0 0.1", "point 1 has no finite position"),
-        ("points3D", "1 0 0 5 0 0 0 x", "truncated or damaged"),
-        ("points3D", "1 0 0 5 0 0 0 0.1 1 1", "2D point 1 of image 1"),
-        ("points3D", "1 0 0 5 0 0 0 0.1 2 0", "2D point 0 of image 2"),
-        ("images", "1 1 0 0 0 0 0 5 1 a.png\n1 2", "image 1 lacks numbers"),
-        ("images", "1 1 0 0 0 0 0 5 1 a.png\n1 nan -1", "image 1 lacks numbers"),
-        ("images", "1 1 0 0 0 0 0 5 1\n", "image 1 lacks numbers"),
-        ("points3D", "1 0 0 5 256 0 0 0.1", "has no colour"),
-        ("points3D", "1 0 0 5 -1 0 0 0.1", "has no colour"),
-        ("points3D", "1 0 0 5 0 0 0", "point 1 lacks numbers"),
-        ("points3D", "1 0 0 5 0 255 0 0.1 1", "point 1 lacks numbers"),
-    ],
-)
-def test_a_bad_line_of_a_text_model_is_named(tmp_path, stem, line, said):
-    lines = {
-        "cameras": "# a comment\n1 PINHOLE 40 30 50 50 20 15",
-        "images": "1 1 0 0 0 0 0 5 1 a.png\n1 2 -1",
-        "points3D": "1 0 0 5 0 255 0 0.1 1 0",
-    }
-    for name, text in lines.items():
-        (tmp_path / f"{name}.txt").write_text(f"{text}\n\n")
-    check_model(tmp_path)
-    (tmp_path / f"{stem}.txt").write_text(line)
-    with refusal(rf"{stem}\.txt: .*{said}"):
-        check_model(tmp_path)
-
-
-def test_rotations_of_sensors_in_a_rig_get_unit_length():
-    """COLMAP normalises those of images only. A rotation of unit length keeps its bits."""
-    rig = pycolmap.Rig(rig_id=1)
-    rig.add_ref_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, 1))
-    unit = np.array([0.1, 0.5, 0.1, 0.7])
-    for sensor, length in ((2, 2.0), (3, 1.0)):
-        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(unit), np.array([1.0, 2, 3]))
-        pose.rotation.normalize()
-        kept = pose.rotation.quat.copy()
-        pose.rotation.quat = length * kept
-        rig.add_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, sensor), pose)
-    _normalize_quaternions(SimpleNamespace(rigs={1: rig}, frames={}))
-    long, exact = (pose for _, pose in sorted(rig.non_ref_sensors.items(), key=str))
-    assert_allclose(long.rotation.quat, kept, rtol=1e-15)
-    assert exact.rotation.quat.tolist() == kept.tolist()
-    assert long.translation.tolist() == [1, 2, 3]
-
-
-@pytest.mark.parametrize(
-    "file, change, said",
-    [
-        ("cameras", lambda w: [*w[:2], f"{w[2]}.0", *w[3:]], r"camera 1 has the size 40\.0: write"),
-        ("points3D", lambda w: [*w[:4], "128.0", *w[5:]], r"has the colour 128\.0: colours are"),
-        ("points3D", lambda w: [*w[:4], "0.502", *w[5:]], r"the colour 0\.502: .* 0 to 255$"),
-    ],
-)
-def test_numbers_that_are_not_whole_are_named(make_scene, file, change, said):
-    path = make_scene(text=True) / f"sparse/0/{file}.txt"
-    lines = path.read_text().splitlines()
-    path.write_text(
-        "\n".join(line if line[0] == "#" else " ".join(change(line.split())) for line in lines)
-    )
-    with refusal(said):
-        read_model(path.parent)
 
 
 @pytest.mark.parametrize("text", [False, True])

@@ -2,7 +2,6 @@
 
 import os
 import signal
-from itertools import chain
 
 import numpy as np
 import pycolmap
@@ -13,7 +12,6 @@ from PIL import Image
 from gsbench.gaussians.ply import check_ply, read_ply
 from gsbench.init.point_files import read_points
 from gsbench.scene.colmap import read_model
-from gsbench.scene.colmap_files import check_model
 from gsbench.scene.images import (
     IMAGE_SUFFIXES,
     check_picture_names,
@@ -213,27 +211,3 @@ def test_quaternions_of_any_length_are_normalised(kind, file, length, tmp_path):
     for image_id, image in model.images.items():
         found = read.images[image_id].cam_from_world().matrix()
         assert_allclose(found, image.cam_from_world().matrix(), atol=1e-9)
-
-
-def test_each_sensor_of_a_rig_is_checked(tmp_path):
-    """A sensor without a pose has three fields in ``rigs.txt``, one with a pose has ten."""
-    synthetic(4).write_text(tmp_path)
-    file = tmp_path / "rigs.txt"
-    lines = file.read_text().split("\n")
-    first = next(number for number, line in enumerate(lines) if line and not line.startswith("#"))
-    words = lines[first].split()
-    sensors = [words[4 + 10 * sensor : 14 + 10 * sensor] for sensor in range(3)]
-    assert all(sensor[2] == "1" for sensor in sensors)
-    sensors[0] = [*sensors[0][:2], "0"]
-
-    def write():
-        lines[first] = " ".join([*words[:4], *chain(*sensors)])
-        file.write_text("\n".join(lines))
-
-    write()
-    check_model(tmp_path)
-    sensors[2][3:7] = ["0"] * 4
-    write()
-    for read in (check_model, read_model):
-        with refusal(r"rigs\.txt: a sensor of rig 1 has no pose"):
-            read(tmp_path)

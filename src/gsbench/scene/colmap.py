@@ -1,8 +1,5 @@
-"""Reading COLMAP models safely, fitting them to image files, and writing models."""
+"""COLMAP models: fitting them to image files, and writing them."""
 
-import codecs
-import logging
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,88 +10,14 @@ from numpy.typing import NDArray
 
 from gsbench.errors import InputError
 from gsbench.normalization import IDENTITY, Normalization
-from gsbench.parsing import without_byte_order_mark
-from gsbench.scene.colmap_checks import PARAMETERS as PARAMETERS
-from gsbench.scene.colmap_files import (
-    check_model,
-    model_files,
-    text_names,
-    write_without_tracks,
-)
+from gsbench.scene.colmap_read import read_model as read_model
 from gsbench.scene.distortion import without_distortion
 from gsbench.scene.images import check_size, image_size
 from gsbench.scene.names import match_anywhere
 from gsbench.scene.types import Array, Camera, CameraModel, Capture, to_pinhole
 
-log = logging.getLogger(__name__)
-
 Cloud = tuple[Array, NDArray[np.uint8]]  # positions [P, 3] in world units, colours [P, 3]
-UNIT_TOLERANCE = 1e-9  # a quaternion whose length differs from 1 by no more is not normalised again
 MIN_TRACK = 2  # images that must see a 3D point, as in COLMAP
-
-
-def read_model(folder: Path) -> pycolmap.Reconstruction:
-    """Read a COLMAP model, binary or text, with rigs and frames or in the older three files.
-
-    Raises `InputError`, one line, if it is missing or damaged.
-    """
-    check_model(folder)
-    try:
-        try:
-            model = _read(folder)
-        except (ValueError, IndexError, RuntimeError) as error:
-            # COLMAP requires that images and points name each other; files of two models do not.
-            if "Check failed" not in str(error):
-                raise
-            with tempfile.TemporaryDirectory() as copy:
-                write_without_tracks(folder, Path(copy))
-                model = _read(Path(copy))
-            log.warning(
-                "%s: images and points3D name each other differently, as files of two models do: "
-                "points are read without the images that see them",
-                folder,
-            )
-        _normalize_quaternions(model)
-        for image in model.images.values():
-            if image.has_pose and not np.isfinite(image.cam_from_world().matrix()).all():
-                raise ValueError(f"image {image.name} has no finite pose")
-    # raised by pycolmap for files that passed the check and yet are damaged
-    except (ValueError, IndexError, RuntimeError, TypeError, MemoryError) as error:
-        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-        raise InputError(
-            f"{folder}: the COLMAP model cannot be read ({reason}): export it again"
-        ) from error
-    return model
-
-
-def _read(folder: Path) -> pycolmap.Reconstruction:
-    """Read a model that has been checked, and mend what pycolmap's reader of text gets wrong."""
-    files = model_files(folder)
-    if files[0].suffix == ".bin":
-        return pycolmap.Reconstruction(folder)
-    # pycolmap would read a byte order mark as a record
-    if any(file.read_bytes().startswith(codecs.BOM_UTF8) for file in files):
-        with tempfile.TemporaryDirectory() as copy:
-            for file in files:
-                (Path(copy) / file.name).write_bytes(without_byte_order_mark(file.read_bytes()))
-            return _read(Path(copy))
-    model = pycolmap.Reconstruction(folder)
-    for image_id, name in text_names(folder).items():
-        if image_id in model.images:
-            model.images[image_id].name = name  # pycolmap cuts names at a blank
-    return model
-
-
-def _normalize_quaternions(model: pycolmap.Reconstruction) -> None:
-    """Give quaternions of rigs and frames unit length; COLMAP normalises only those of images."""
-    for rig in model.rigs.values():
-        for sensor, pose in rig.non_ref_sensors.items():
-            if pose is not None and abs(pose.rotation.norm() - 1) > UNIT_TOLERANCE:
-                pose.rotation.normalize()
-                rig.set_sensor_from_rig(sensor, pose)
-    for frame in model.frames.values():
-        if frame.has_pose() and abs(frame.rig_from_world.rotation.norm() - 1) > UNIT_TOLERANCE:
-            frame.rig_from_world.rotation.normalize()
 
 
 def posed_by_name(

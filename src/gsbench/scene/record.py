@@ -166,7 +166,9 @@ def read_own(reader: SceneReader, folder: Path) -> RawCapture:
 
 def _checked(folder: Path, photograph: Photograph) -> Photograph:
     """The photograph with plain values; raises InputError or ValueError for unusable ones."""
-    from gsbench.scene.colmap import PARAMETERS, new_camera  # loads pycolmap
+    import pycolmap
+
+    from gsbench.scene.colmap import new_camera
 
     name = str(photograph.name)
     place = PurePath(name)
@@ -175,7 +177,7 @@ def _checked(folder: Path, photograph: Photograph) -> Photograph:
     camera = photograph.camera
     if camera is None or photograph.rotation is None or photograph.translation is None:
         raise InputError("it has no camera and pose")
-    if camera.name not in PARAMETERS:
+    if camera.name not in pycolmap.CameraModelId.__members__:
         raise InputError(f"{camera.name!r} is no camera model of COLMAP, such as PINHOLE")
     params = tuple(map(float, camera.params))
     if not np.isfinite(params).all():

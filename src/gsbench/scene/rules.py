@@ -2,7 +2,7 @@
 
 A rule measures something, and has two ranges of values: outside ``fine`` a line says so, outside
 ``usable`` the capture is refused, unless ``scene.accept`` has the rule's id. A new trouble is a row
-and its measure. docs/captures.md has the table (scripts/captures_page.py).
+and its measure. The site shows the table (scripts/reference.py).
 """
 
 import logging

@@ -1,7 +1,7 @@
 """Times training steps of Faster-GS (Hahlbohm et al., CVPR 2026) and of a rasterizer of gsbench.
 
-    python scripts/faster_gs.py compile           needs nvcc
-    python scripts/faster_gs.py RASTER COUNT…     rows like those of `gsbench bench --json`
+    python -m benchmarks.faster_gs compile           needs nvcc
+    python -m benchmarks.faster_gs RASTER COUNT…     rows like those of `gsbench bench --json`
 
 $FASTER_GS is the folder FasterGSCudaBackend/FasterGSCudaBackend of their repository
 (nerficg-project/faster-gaussian-splatting; Apache-2.0), commit 3cb0b755. The two take turns, with
