@@ -103,7 +103,7 @@ def lowering(gives, names: str, check: Callable[..., None] = lambda *kinds: None
             Parameter(name, Parameter.POSITIONAL_OR_KEYWORD)
             for name in ("typing_context", *names.split())
         ]
-        define.__signature__ = Signature(parameters)
+        define.__signature__ = Signature(parameters)  # type: ignore[attr-defined]
         return numba_extending.intrinsic(define)
 
     return decorate
