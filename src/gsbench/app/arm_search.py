@@ -71,19 +71,13 @@ class ArmSearch:
 
     def jobs_of(self, values: Mapping[str, Any]) -> list[list[str]]:
         """The words of a point's trials."""
-        of_point = [
-            f"name={self.home.name}",
-            "scene.validation=true",
-            "eval.primary=null",
-            *words_of_values(values),
-        ]
+        of_point = [*words_of_point(self.home.name), *words_of_values(values)]
         seeds = [f"{SEED}={seed}" for seed in self.record.seeds]
         return [[*job, *of_point, seed] for job, seed in itertools.product(self.jobs, seeds)]
 
     def value_of(self, trial: Trial) -> float | None:
         """The metric of a trial, read from its files; None if it has none."""
-        record = trial.files.sound_record()
-        return None if record is None else record.metrics.get(self.record.metric)
+        return measured(trial, self.record.metric)
 
     def judge(self, proposal: Proposal, trials: Sequence[Trial]) -> SearchPoint:
         """Judge a point by the mean of its trials; it failed if one of them lacks the metric."""
@@ -97,6 +91,17 @@ class ArmSearch:
         point = SearchPoint(settings=settings, value=mean)
         self.record.points.append(point)
         return point
+
+
+def words_of_point(experiment: str) -> list[str]:
+    """The words of a search's trials in their own ``experiment``, on validation views."""
+    return [f"name={experiment}", "scene.validation=true", "eval.primary=null"]
+
+
+def measured(trial: Trial, metric: str) -> float | None:
+    """The ``metric`` of a trial, read from its files; None if it has none."""
+    record = trial.files.sound_record()
+    return None if record is None else record.metrics.get(metric)
 
 
 def distribution(override: Override) -> BaseDistribution:

@@ -105,7 +105,6 @@ class Composer:
         self._check_words(self.hydra_words)
         self._chosen: dict[tuple[str, ...], DictConfig] = {}
         self._times: dict[str, Any] = {}  # what ${now:…} stands for, the same in all trials
-        self._own_choices = _choices(own)
         # The settings of a group whose choices are listed, here or in a file, are checked with each
         # choice.
         listed = set(map(key_of, words)) - set(map(key_of, single))
@@ -210,12 +209,7 @@ class Composer:
 
     def _choose(self, words: Sequence[str]) -> DictConfig:
         """Hydra's composition of the choices among ``words``, checked; do not change it."""
-        choices = _choices(words)
-        # A list often repeats what the files choose anyway (densify=adc,volumetric): composing
-        # takes 0.1 s, so equal choices share a composition.
-        if self._are_own(choices):
-            choices = self._own_choices
-        key = tuple(choices.values())
+        key = tuple(_choices(words).values())  # composing takes 0.1 s
         if key not in self._chosen:
             with hydra_ready():
                 self._chosen[key] = self._compose(key, words)
@@ -260,18 +254,6 @@ class Composer:
             if "${" in word:
                 override = parse_word(word)
                 check_texts({override.key_or_group: override.value()}, self.allowed)
-
-    def _are_own(self, choices: Mapping[str, str]) -> bool:
-        """Return whether ``choices`` give the files of the command's own composition."""
-        own = self._chosen.get(tuple(self._own_choices.values()))
-        return (
-            own is not None
-            and choices.keys() >= self._own_choices.keys()
-            and all(
-                str(own.hydra.runtime.choices.get(bare_key(key))) == word.partition("=")[2]
-                for key, word in choices.items()
-            )
-        )
 
 
 def _swept_groups(sweeper: DictConfig) -> set[str]:

@@ -16,7 +16,7 @@ from gsbench.launch.outcomes import Outcome, outcome_of_results
 from gsbench.launch.record import asked_metrics, record
 from gsbench.launch.slurm import run_slurm
 from gsbench.runs.freshness import Change
-from gsbench.runs.keys import STAGES
+from gsbench.runs.keys import STAGES, VIEWS
 from gsbench.runs.layout import STORE
 from gsbench.runs.nested import GSBENCH
 from gsbench.runs.store import Store
@@ -75,7 +75,7 @@ def _begin(trials: Sequence[Trial], unfinished: Sequence[Trial], asks: bool = Tr
             raise
         log.info("%s cannot be written to (%s), so its plan stays as it is", runs, error.strerror)
         return
-    Store(runs / STORE).sweep(STAGES)
+    Store(runs / STORE).sweep((*STAGES, VIEWS))
     record(trials, asks)
 
 

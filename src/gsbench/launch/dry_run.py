@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -16,7 +16,7 @@ from gsbench.config.compose import Trial
 from gsbench.errors import InputError
 from gsbench.eval.facts import LPIPS
 from gsbench.launch.guess import Guess, guess_training
-from gsbench.launch.states import arm_names, ask_queue, label_of, state_in_queue
+from gsbench.launch.states import arm_names, ask_queue, label_of, state_in_queue, summary_of
 from gsbench.parsing import DamagedError
 from gsbench.runs.config_hash import determining_settings
 from gsbench.runs.layout import RESULTS, SEED, TRIAL_GLOB
@@ -24,9 +24,6 @@ from gsbench.runs.nested import SHOWN, flatten, sha256_of
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.user_code import user_modules
 from gsbench.words import counted, readable_time, some_of
-
-# in the order of a summary
-STATES = ("done", "partial", "missing", "running", "queued", "failed", "damaged")
 
 
 class FinishedTrials:
@@ -84,7 +81,7 @@ def describe_plan(trials: Sequence[Trial], parallel: int = 1) -> list[str]:
     lines: list[str] = []
     remaining, without_estimate, learned_from = 0.0, 0, 0
     guess: Guess | None = None  # of the last trial that no finished one is similar to
-    counts: Counter[str] = Counter()
+    states: list[str] = []
     finished = FinishedTrials(trials[0].files.runs)
     queue = ask_queue(trial.folder for trial in trials)
     arms = arm_names({trial.folder: trial.overrides for trial in trials})
@@ -100,20 +97,18 @@ def describe_plan(trials: Sequence[Trial], parallel: int = 1) -> list[str]:
             note = f"  as in {experiment}: nothing to compute"
         else:
             seconds, known_from = finished.estimate(trial.values)
-            # a stopped training goes on from its checkpoint
-            done = folder.stage_and_step()[1] / max(1, trial.values["train"]["iterations"])
             if not known_from and (found := guess_training(trial.values, parallel)):
                 seconds, guess = found.seconds, found
-            remaining += seconds * (1 - min(1.0, done))
+            # a stopped training goes on from its checkpoint
+            remaining += seconds * (1 - folder.share_done(trial.values["train"]["iterations"]))
             learned_from = max(learned_from, known_from)
             without_estimate += seconds == 0
         if state == "missing" and (change := _change_since_last(trial, arms)):
             note += f"  {change}"
-        counts[state] += 1
+        states.append(state)
         lines.append(f"{state:<8} {label_of(folder.path, arms)}{note}")
-    summary = ", ".join(f"{counts[state]} {state}" for state in STATES if counts[state])
-    lines.append(f"{counted(len(trials), 'trial')}: {summary}")
-    if counts["done"] == len(trials):
+    lines.append(summary_of(states))
+    if {*states} == {"done"}:
         return lines
     if without_estimate:
         time = (

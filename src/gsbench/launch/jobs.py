@@ -196,16 +196,13 @@ def run_local(trials: Sequence[Trial], mirror: Mirror) -> list[Outcome]:
     with bar(values["name"]) as report:
 
         def show(ended: int, running: Sequence[Trial]) -> None:
-            done = ended + sum(map(share_done, running))
+            done = ended + sum(
+                trial.files.share_done(trial.values["train"]["iterations"]) for trial in running
+            )
             note = f"{ended} of {len(trials)} trials, {len(running)} running"
             report("trials", round(BAR * done), BAR * len(trials), note)
 
         return _run(trials, executor, parallel, mirror, show)
-
-
-def share_done(trial: Trial) -> float:
-    """The share of a running trial's iterations that are done."""
-    return min(1.0, trial.files.stage_and_step()[1] / max(1, trial.values["train"]["iterations"]))
 
 
 def job_folder(values: dict[str, Any]) -> Path:

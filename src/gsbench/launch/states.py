@@ -5,10 +5,11 @@ A file in a trial's folder names its Slurm job. Loads no torch.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import psutil
 from pydantic import Field
@@ -25,7 +26,36 @@ from gsbench.runs.layout import CONFIG, FAILED, LOCK, RESULTS, SEED, SUBMITTED
 from gsbench.runs.trial_folder import State, TrialFolder
 from gsbench.system.locks import read_holder
 from gsbench.system.programs import answer_of
-from gsbench.words import as_line
+from gsbench.words import as_line, counted
+
+
+class Kind(NamedTuple):
+    """The meaning of a state for the verbs that show and repeat trials."""
+
+    column: str = "waiting"  # of `gsbench.launch.progress.progress_frame`
+    retried: bool = False  # `gsbench retry` runs it again
+    freed: bool = False  # `gsbench clean NAME` lets its results go
+    lasts: bool = False  # it began, and goes on
+
+
+# in the order of lists: what needs a look comes first
+STATES = {
+    "failed": Kind("failed", retried=True, freed=True),
+    "damaged": Kind(retried=True),
+    "running": Kind("running", lasts=True),
+    "queued": Kind(lasts=True),
+    "partial": Kind(retried=True, freed=True),
+    "missing": Kind(retried=True),
+    "superseded": Kind(freed=True),
+    "done": Kind("done"),
+}
+
+
+def summary_of(states: Iterable[str]) -> str:
+    """The number of trials in each state, in one line."""
+    counts = Counter(states)
+    texts = [f"{counts[state]} {state}" for state in reversed(STATES) if counts[state]]
+    return f"{counted(counts.total(), 'trial')}: {', '.join(texts)}"
 
 
 @dataclass(frozen=True)

@@ -157,7 +157,7 @@ def run_trial(trial: Trial, wait: bool = True) -> TrialRecord:
     folder = trial.files
     with storage_errors(folder.runs):
         folder.require_no_links()
-        require_no_links(folder.runs, folder.runs / layout.STORE / layout.VIEWS)
+        require_no_links(folder.runs, folder.runs / layout.STORE / keys.VIEWS.name)
         folder.path.mkdir(parents=True, exist_ok=True)
         with hold(folder.lock, folder.label, wait), log_to(folder.path / layout.LOG):
             if not folder.why_not_done(trial.values):

@@ -186,50 +186,38 @@ def changes(
         is_small = stamp[0] <= MAX_HASHED_BYTES
         if is_small and name in made.digests and digest_of(folder / name) != made.digests[name]:
             yield Change("file", str(folder / name))
+    yield from damaged_entries(made)
+
+
+def damaged_entries(made: MadeOf, thorough: bool = False) -> Iterator[Change]:
+    """The results of a trial's stages in the store that are damaged or gone."""
     for name, entry in made.entries.items():
         try:
-            read_manifest(Path(entry))
+            read_manifest(Path(entry), thorough=thorough)
         except ValueError as error:
             yield Change("stored", name, now=str(error))
 
 
-def changes_of_content(folder: Path, made: MadeOf) -> Iterator[Change]:
-    """The files of a trial, and the results of its stages in the store, with another content."""
-    for name, digest in made.digests.items():
-        path = folder / name
-        if path.is_file() and file_sha256(path) != digest:
-            yield Change("written", name)
-    for name, entry in made.entries.items():
-        try:
-            read_manifest(Path(entry), thorough=True)
-        except ValueError as error:
-            yield Change("stored", name, now=str(error))
-
-
-def change_of_files(
-    folder: Path, digests: Mapping[str, str], stamps: Mapping[str, Stamp], thorough: bool
-) -> Change | None:
-    """A change among the files `JUDGED` since their results were written; None without one.
+def changed_files(
+    folder: Path, made: MadeOf, names: Iterable[str] = JUDGED, thorough: bool = False
+) -> Iterator[Change]:
+    """The files ``names`` of a trial with another content than when its results were written.
 
     A large file with its recorded size and time counts as unchanged, unless ``thorough``. Files
     that are gone do not count, since models are deleted to make room.
     """
-    for name in JUDGED:
-        path, recorded = folder / name, digests.get(name)
+    for name in names:
+        path, recorded = folder / name, made.digests.get(name)
         if recorded is None or not path.is_file():
             continue
-        stamp = stamp_of(path)
-        known = stamps.get(name)
-        if (
-            known is not None and known[0] != stamp[0]
-        ):  # of another size, which may be too large to read
-            return Change("written", name)
+        known, stamp = made.published.get(name), stamp_of(path)
         is_large = stamp[0] > MAX_HASHED_BYTES
-        if is_large and not thorough and known == stamp:
-            continue
-        if (file_sha256(path) if is_large else digest_of(path)) != recorded:
-            return Change("written", name)
-    return None
+        # a file of another size may be too large to read
+        has_changed = known is not None and known[0] != stamp[0]
+        if not has_changed and (thorough or not is_large or known != stamp):
+            has_changed = (file_sha256(path) if is_large else digest_of(path)) != recorded
+        if has_changed:
+            yield Change("written", name)
 
 
 def stamp_of(path: Path) -> Stamp:

@@ -12,7 +12,6 @@ JOBS = ".jobs"  # output of the jobs of launch=local and launch=slurm, with a fo
 
 # in the store
 MANIFEST = "manifest.json"  # in every result: what made it
-VIEWS = "views"  # beside the stages: undistorted photographs of their final size
 
 # in the result of a stage
 TRAINING = "training.json"  # counts, time and memory of a training

@@ -1,4 +1,5 @@
-"""Verbs about this machine: ``doctor`` (what is missing) and ``bench`` (how fast it is)."""
+"""Verbs about this machine: ``doctor`` (what is missing, and what is odd about a capture) and
+``bench`` (how fast it is)."""
 
 import argparse
 import itertools
@@ -6,7 +7,7 @@ import json
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -52,6 +53,12 @@ class Finding(NamedTuple):
 def doctor(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 1 if something is bad, or if a proof fails."""
     parser = ArgumentParser("doctor")
+    parser.add_argument(
+        "words",
+        nargs="*",
+        metavar="SETTING",
+        help="of a scene, such as scene=photos scene.path=/my/photos: what is odd about it",
+    )
     parser.flag("--prove", "compare a rasterizer with the float64 reference on this machine")
     parser.add_argument(
         "--raster", default=AUTO, choices=names(), help="the rasterizer to prove (auto)"
@@ -66,7 +73,16 @@ def doctor(argv: Sequence[str], runs: Path) -> int:
     if options.json or options.raster != AUTO or options.device != "auto":
         raise InputError("doctor: --raster, --device and --json belong to --prove")
     code = 0
-    checks = check_packages(), check_devices(), check_proofs(), check_weights(), check_runs(runs)
+    if options.words:
+        checks: tuple[Iterable[Finding], ...] = (check_scene(options.words),)
+    else:
+        checks = (
+            check_packages(),
+            check_devices(),
+            check_proofs(),
+            check_weights(),
+            check_runs(runs),
+        )
     for verdict, topic, text in itertools.chain(*checks):
         print(f"{verdict:<5} {topic:<12} {text}")
         if verdict == "bad":
@@ -103,6 +119,32 @@ def _describe(proof: RasterProof) -> str:
         f"raster={proof.raster} {verdict} the reference on {proof.device} ({proof.seconds:.0f} "
         f"s): {largest}"
         + (f"; steps use autograd, since {proof.direct_fault}" if proof.direct_fault else "")
+    )
+
+
+def check_scene(words: Sequence[str]) -> Iterator[Finding]:
+    """The rules (docs/captures.md) that say something about a scene, before anything is trained.
+
+    Their lines are logged; what is not usable raises InputError. Photographs without cameras get
+    none here, so rules about cameras and views are left to their trial.
+    """
+    from gsbench.renders.truth import scene_trial
+    from gsbench.runs.keys import INIT, TRAIN
+
+    trial, views = scene_trial(words), False
+    for step in trial.steps():
+        if views := step.stage is TRAIN:
+            break
+        if step.stage is INIT and trial.capture.model is None:
+            break
+        trial.store.get(step)
+    capture = trial.capture
+    odd = [*capture.oddities, *(trial.views.scene.oddities if views else ())]
+    yield Finding(
+        "note" if odd else "ok",
+        str(capture.name),
+        f"{counted(len(capture.image_names), 'photograph')}, {len(capture.test_names)} for testing"
+        f" ({capture.held_out}); odd: {', '.join(one.rule for one in odd) or 'nothing'}",
     )
 
 
