@@ -16,8 +16,8 @@ from gsbench.init.colmap.database import (
     write_keypoints,
     write_matches,
 )
-from gsbench.init.colmap.geometry import verification_options, verify_pairs
 from gsbench.init.colmap.mapping import Attempt, Geometry, map_images, measure_geometry
+from gsbench.init.colmap.matches import verification_options, verify_pairs
 from gsbench.init.colmap.pairs import select_pairs
 from gsbench.init.colmap.reconstruct import common_poses
 from gsbench.logs import no_progress
