@@ -5,6 +5,7 @@ import os
 import time
 from pathlib import Path
 from shlex import split
+from types import SimpleNamespace
 
 import pandas as pd
 import pytest
@@ -17,7 +18,7 @@ from gsbench.launch.record import record
 from gsbench.launch.states import TrialState
 from gsbench.runs.commands import read_history
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.system.own_modules import allowed_modules
+from gsbench.system.programs import allowed_modules
 from gsbench.tracking.sync import MirrorError
 from gsbench.verbs import trials
 from tests.composed import composed
@@ -117,24 +118,13 @@ def test_a_state_without_a_time_has_no_age_and_one_in_the_future_is_new():
 
 def test_superseded_trials_are_shown_and_deleted_on_demand(folders, monkeypatch, said):
     done = folders[0]
-    reasons = {done: "helper was 1, it is now 2"}
-    monkeypatch.setattr(states, "find_superseded", lambda *_: reasons)
+    older = SimpleNamespace(older=[SimpleNamespace(path=done)])
+    monkeypatch.setattr(states, "newest_code", lambda experiment: older)
     assert said("status").endswith(" 3 trials: 1 superseded, 1 missing, 1 failed\n")
     lines = said("status x --forget-superseded").splitlines()
-    assert lines == [f"removed {done}: helper was 1, it is now 2", "1 superseded trial removed"]
+    assert lines == [f"removed {done}: made by earlier code", "1 superseded trial removed"]
     assert not done.exists()
     assert [*read_history(done.parents[2]).planned] == folders[1:]
-
-
-def test_user_modules_are_looked_up_where_the_command_of_each_trial_was_given(
-    folders, monkeypatch, tmp_path
-):
-    asked = []
-    monkeypatch.setattr(
-        states, "find_superseded", lambda trials, folders: asked.append(folders) or {}
-    )
-    states.states_now(folders[0].parents[2])
-    assert asked == [dict.fromkeys(folders, str(tmp_path))]
 
 
 def test_watching_looks_again_until_all_trials_have_ended(runs, monkeypatch, capsys):

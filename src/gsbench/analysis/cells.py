@@ -19,7 +19,7 @@ from gsbench.analysis.differences import (
 )
 from gsbench.analysis.quantities import Quantity, metric_keys
 from gsbench.analysis.results import Experiment, TrialResult, group_by
-from gsbench.analysis.trial_settings import Configured
+from gsbench.analysis.trial_result import Planned, Trained
 from gsbench.errors import InputError
 from gsbench.runs.config_hash import is_hashed
 from gsbench.words import command
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 K = TypeVar("K", bound=Hashable)
-C = TypeVar("C", bound=Configured)
+C = TypeVar("C", Planned, TrialResult)
 
 TRIAL_FIELDS = (
     "scene",
@@ -176,7 +176,7 @@ def check_averageable(trials: Sequence[TrialResult], where: str) -> None:
         raise _refusal(where, {key: list(values) for key, values in across.items()}, trials)
 
 
-def swept_settings(trials: Iterable[Configured]) -> list[str]:
+def swept_settings(trials: Iterable[Trained]) -> list[str]:
     """The settings in which trials of one scene and arm differ, unless `is_ignored`."""
     groups = group_by(trials, lambda trial: (trial.scene, trial.init, trial.densify)).values()
     return sorted(set().union(*map(differing_settings, groups)))

@@ -94,7 +94,7 @@ SENTENCES: dict[str, str] = {
         "The same bits in all trials of one scene and seed: {arms:all}. The settings in which they "
         "differ had no effect, so there is nothing to compare."
     ),
-    # ---- claims, gates and ledgers of ideas
+    # ---- gates
     "failed": "failed: {reasons:few}",
     "other machine": (
         "deviation: the baseline ran on another kind of machine ({baseline:all}) than the new "
@@ -103,9 +103,6 @@ SENTENCES: dict[str, str] = {
     "other library": (
         "deviation: the baseline was made with {library} {baseline:all}, the new trials with "
         "{new:all}"
-    ),
-    "contradiction": (
-        "{idea}: the ledger says {recorded}, but its trials say {now}: one of them was edited"
     ),
     # ---- how to read a table
     "one trial": "One trial per cell, so there is no deviation. Protocol {protocols:list}.{bold}",

@@ -29,7 +29,7 @@ from gsbench.analysis.statistics import (
     outcome_of,
     t_test,
 )
-from gsbench.runs.commands import BY_COMMAND, Question
+from gsbench.runs.commands import BY_COMMAND, LOND, SCREENING, Question
 from gsbench.runs.experiments import Arm
 from gsbench.words import signed
 
@@ -38,6 +38,11 @@ OUTLYING = 5.0
 LEAST_OTHERS = 2  # the fewest other trials that this needs
 # corrects the median sample deviation of three trials, which is too small: 1 / sqrt(ln 2)
 FEW = 1.2
+
+# The chance, at each look, that an idea of a ledger that is as good as the least difference that
+# matters is given up. It costs power and cannot make a false discovery.
+GIVE_UP = 0.05
+GATE = "gate"  # the rule of a gate's question
 
 State = Literal["answered", "running", "stopped", "not tested", "not asked beforehand"]
 ANSWERED: State = "answered"
@@ -248,10 +253,22 @@ def _at_looks(asked: Verdict) -> Verdict:
             break
         at_look = replace(asked, pairs=asked.pairs.first(seeds), level=rate * share)
         verdict = replace(_decide(at_look), state=ANSWERED)
-        verdict = replace(verdict, final=verdict.outcome != UNDECIDED or seeds == looks[-1])
+        decided = verdict.outcome != UNDECIDED or passes(verdict) or gives_up(verdict)
+        verdict = replace(verdict, final=decided or seeds == looks[-1])
         if verdict.final:
             return verdict
     return replace(verdict, state=RUNNING if asked.state == ANSWERED else asked.state)
+
+
+def passes(verdict: Verdict) -> bool:
+    """Return whether an undecided gate ends: its version is not worse by the least difference."""
+    return verdict.question.rule == GATE and verdict.outcome == UNDECIDED and verdict.loss_excluded
+
+
+def gives_up(verdict: Verdict) -> bool:
+    """Return whether an undecided idea of a ledger ends: a gain is unlikely (`GIVE_UP`)."""
+    in_ledger = verdict.question.rule in (SCREENING, LOND) and verdict.outcome == UNDECIDED
+    return in_ledger and verdict.gain_excluded(GIVE_UP)
 
 
 def _measure(verdict: Verdict) -> Verdict:

@@ -13,7 +13,6 @@ from typing import Any
 from hydra.core.override_parser.types import Override
 from omegaconf import OmegaConf
 
-from gsbench.analysis.advice import GRIDS
 from gsbench.analysis.questions import plan_looks
 from gsbench.analysis.results import read_experiment
 from gsbench.app.sweep import Run, Sweep
@@ -27,6 +26,7 @@ from gsbench.files import checked_runs_folder, make_runs_folder
 from gsbench.launch.record import check_looks, planned_rows, record
 from gsbench.runs.layout import RESULTS
 
+GRIDS = "hydra.sweeper.grids"
 log = logging.getLogger(__name__)
 
 # for a setting that only some of the listed choices may have

@@ -14,8 +14,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 import psutil
 from pydantic import Field
 
-from gsbench.analysis.differences import find_superseded
-from gsbench.analysis.results import read_experiment
+from gsbench.analysis.results import newest_code, read_experiment
 from gsbench.errors import InputError
 from gsbench.files import write_json
 from gsbench.parsing import Record, read_if_sound
@@ -58,12 +57,16 @@ def summary_of(states: Iterable[str]) -> str:
     return f"{counted(counts.total(), 'trial')}: {', '.join(texts)}"
 
 
+EARLIER_CODE = "made by earlier code"
+
+
 @dataclass(frozen=True)
 class TrialState:
     """A trial's state, the time at which it began (Unix time), a note, and its entry in the plan.
 
-    A ``queued`` trial waits in Slurm's queue. A finished trial is ``superseded`` if its code is no
-    longer the present code; a failed one if a trial of later code has the same settings.
+    A ``queued`` trial waits in Slurm's queue. A finished trial is ``superseded`` if its code is
+    earlier than that of tables (`newest_code`); a failed one if a trial of later code has the same
+    settings.
     """
 
     folder: Path
@@ -88,15 +91,12 @@ def states_of_experiment(home: Path) -> list[TrialState]:
 
 
 def states_now(home: Path) -> list[TrialState]:
-    """The same, with finished trials that older code made as ``superseded``; reads all results."""
+    """The same, with finished trials that no table counts as ``superseded``; reads all results."""
     states = states_of_experiment(home)
-    folders = {state.folder: state.planned.cwd for state in states if state.planned is not None}
-    # The user's modules are read in the folder where the trial's command was given: another may
-    # have a namesake.
-    reasons = find_superseded(read_experiment(home).trials, folders)
+    older = {trial.path for trial in newest_code(read_experiment(home)).older}
     return [
-        replace(state, state="superseded", note=str(reasons[state.folder]))
-        if state.state == "done" and state.folder in reasons
+        replace(state, state="superseded", note=EARLIER_CODE)
+        if state.state == "done" and state.folder in older
         else state
         for state in states
     ]

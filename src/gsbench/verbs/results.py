@@ -54,7 +54,6 @@ TRIALS, JSON = "trials", "json"
 FAIRNESS = "fairness"
 PAPER_NOTES = "paper"  # `gsbench tables paper` shows the paper's own inconsistencies
 REPORT_NAME = "report.html"
-FILE_SUFFIXES = (".html", ".htm")  # of a report
 
 
 def tables(argv: Sequence[str], runs: Path) -> int:
@@ -255,23 +254,12 @@ def report(argv: Sequence[str], runs: Path) -> int:
         raise InputError(
             f"--baseline {options.baseline}: {experiment.name} has {', '.join(densifiers)}"
         )
-    file = experiment.folder / REPORT_NAME
-    if options.out is not None:
-        file = file_at(options.out, experiment.name)
-    output = writable_output if options.out in (None, file) else own_output
     for warning in experiment.warnings:
         print(f"left out: {warning}", file=sys.stderr)
     text = build_report(experiment, options.baseline, dict(options.where))
-    with output(file):
-        write_text(file, text)
-    print(file)
+    out = options.out or experiment.folder / REPORT_NAME
+    _write({f"-{REPORT_NAME}": text}, out, experiment.name)
     return 0
-
-
-def file_at(out: Path, experiment: str) -> Path:
-    """The file that ``--out`` means: ``out``, or in a folder one with the experiment's name."""
-    is_file = out.suffix.lower() in FILE_SUFFIXES and not out.is_dir()
-    return out if is_file else out / f"{experiment}-{REPORT_NAME}"
 
 
 def explain(argv: Sequence[str], runs: Path) -> int:
