@@ -12,10 +12,16 @@ from numpy.testing import assert_array_equal
 from torch.testing import assert_close
 
 from gsbench.init import MODEL_FOLDER, Dim, read_cloud
-from gsbench.init.networks import matchers
-from gsbench.init.networks.extractors import EXTRACTORS, SUPERPOINT_BORDER, extract_features
+from gsbench.init.networks import models
 from gsbench.init.networks.features import Features, FeatureStore
-from gsbench.init.networks.matchers import build_matcher, match, mutual_nearest_matcher
+from gsbench.init.networks.models import (
+    EXTRACTORS,
+    SUPERPOINT_BORDER,
+    build_matcher,
+    extract_features,
+    match,
+    mutual_nearest_matcher,
+)
 from gsbench.weights import MissingWeightsError, load_state
 from tests.helpers import refusal
 from tests.scene.courtyard.surfaces import surface_distance
@@ -162,13 +168,13 @@ def test_lightglue_reads_the_published_names(untrained_weights, tmp_path, monkey
         published[name] = value
     published.pop("confidence_thresholds")
     torch.save(published, tmp_path / "published.pth")
-    networks, load_into = [], matchers.load_into
+    networks, load_into = [], models.load_into
 
     def note(network, *rest):
         networks.append(network)
         load_into(network, *rest)
 
-    monkeypatch.setattr(matchers, "load_into", note)
+    monkeypatch.setattr(models, "load_into", note)
     matcher_of(tmp_path / "published.pth")
     loaded = networks[0].state_dict()
     assert all(torch.equal(loaded[name], value) for name, value in state.items())
