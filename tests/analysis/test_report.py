@@ -321,33 +321,6 @@ def test_charts_are_well_formed_and_stay_inside(chart):
     assert svg.attrib["aria-label"].startswith("<&>")
 
 
-def test_charts_have_fixed_margins():
-    points = [(0, 0), (5, 10), (10, 0)]
-    figure = ElementTree.fromstring(line_chart("t", [("a", points)], "x", "y"))
-    assert next(figure.iter("svg")).attrib["viewBox"] == "0 0 380 250"
-    step, up = 304 * 5 / 10.4, 180 * 10 / 10.4
-    assert next(figure.iter("polyline")).attrib["points"] == (
-        f"58.0,206.0 {58 + step:.1f},{206 - up:.1f} {58 + 2 * step:.1f},206.0"
-    )
-    rows = [ForestRow("s", -1.0), ForestRow("t", 1.0)]
-    figure = ElementTree.fromstring(forest_plot("t", rows, "difference", 1))
-    assert next(figure.iter("svg")).attrib["viewBox"] == "0 0 380 108"
-    places = [(float(dot.attrib["cx"]), float(dot.attrib["cy"])) for dot in figure.iter("circle")]
-    assert places == [
-        (pytest.approx(247 - 115 / 1.08, abs=0.05), 25),
-        (pytest.approx(247 + 115 / 1.08, abs=0.05), 51),
-    ]
-
-
-def test_each_line_has_a_colour_and_dashes_of_its_own():
-    lines = [(str(k), [(0, k), (1, k)]) for k in range(7)]
-    figure = ElementTree.fromstring(line_chart("t", lines, "x", "y"))
-    look = ("stroke", "stroke-dasharray")
-    strokes = [tuple(map(line.attrib.get, look)) for line in figure.iter("polyline")]
-    assert len(set(strokes)) == 6
-    assert strokes[6] == strokes[0]
-
-
 @pytest.mark.parametrize("log", [False, True])
 @pytest.mark.parametrize(
     "values",
@@ -438,13 +411,6 @@ def test_a_forest_plot_of_a_verdict_has_its_scenes_and_from_two_on_their_mean(ke
     assert f"{quantity(key, []).name}: {better}" in one
     assert "a 0.5." in one
     assert "a 0.5; b −0.25; mean of scenes 0.125." in two
-
-
-def test_an_axis_from_zero_begins_at_zero():
-    axis = Axis([0.0, 10.0], False, 0.0, 104.0)
-    assert [axis.to_px(value) for value in (0, 5, 10)] == pytest.approx([0, 50, 100])
-    balanced = Axis([-3.0, 3.0], False, 0.0, 108.0)
-    assert [balanced.to_px(value) for value in (-3, 0, 3)] == pytest.approx([4, 54, 104])
 
 
 @pytest.mark.parametrize(
