@@ -290,8 +290,8 @@ def show(options: argparse.Namespace, home: Path) -> int:
         ideas = [_facts(book, idea) for idea in book.begun]
         print(json.dumps({"opened": opened, "ideas": ideas} | _left(book), indent=1))
         return 0
-    ideas = [f"{number}. {book.line(idea)}" for number, idea in enumerate(book.begun, 1)]
-    print("\n".join([*book.describe(), *ideas]))
+    lines = [f"{number}. {book.line(idea)}" for number, idea in enumerate(book.begun, 1)]
+    print("\n".join([*book.describe(), *lines]))
     return 0
 
 
