@@ -8,6 +8,7 @@ import os
 import sys
 import threading
 import time
+from inspect import signature
 
 import numba
 import numpy as np
@@ -273,7 +274,7 @@ def _powers(x, exponents, out):
 @pytest.mark.parametrize("name", ["load", "load_numbers", "store", "gather", "scatter"])
 def test_only_contiguous_float32_arrays_are_accepted(name, kind):
     define = getattr(simd, name)._defn
-    others = [types.intp] * (define.__code__.co_argcount - 2)
+    others = [types.intp] * (len(signature(define).parameters) - 2)
     define(None, types.Array(types.float32, 2, "C"), *others)
     with pytest.raises(TypeError, match="a contiguous float32 array is needed"):
         define(None, kind, *others)

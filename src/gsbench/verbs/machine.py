@@ -8,7 +8,6 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -17,7 +16,7 @@ from gsbench.raster.executors import AUTO, EXECUTORS, names, resolve
 from gsbench.runs.trial_record import RasterProof
 from gsbench.scene.rules import MIN_SIZE
 from gsbench.system.install import install_command, version_of
-from gsbench.system.own_modules import allow_modules
+from gsbench.system.programs import allow_modules
 from gsbench.system.resources import available_threads, installed_gpus
 from gsbench.verbs.arguments import ArgumentParser, comma_separated, path, whole_number
 from gsbench.words import counted, readable_bytes
@@ -315,7 +314,6 @@ def _bench_parser() -> ArgumentParser:
         "--threads", type=count, help="CPU threads (default: as many as torch takes)"
     )
     parser.flag("--json", "print JSON")
-    parser.flag("--host", "what a step of raster=triton costs the host; needs no GPU")
     parser.flag("--kernels", "with --json: add the time of each kernel, and of waits for the GPU")
     parser.flag("--no-memory", "do not measure peak memory, in processes of their own")
     return parser
@@ -324,8 +322,6 @@ def _bench_parser() -> ArgumentParser:
 def bench(argv: Sequence[str], _runs: Path | None = None) -> int:
     """Print the table, or with ``--json`` the list of results."""
     options = _bench_parser().parse_args(argv)
-    if options.host:
-        return _bench_host(options.json)
     if options.ply is not None and not options.ply.is_file():
         raise InputError(f"--ply: {options.ply} does not exist")
     if options.kernels and not options.json:
@@ -350,16 +346,6 @@ def bench(argv: Sequence[str], _runs: Path | None = None) -> int:
         kernels=options.kernels,
     )
     print(json.dumps(rows, indent=2) if options.json else table(rows))
-    return 0
-
-
-def _bench_host(as_json: bool) -> int:
-    if find_spec("triton") is None:
-        raise InputError("--host: needs Triton (pip install triton)")
-    from gsbench.bench.host import time_host
-
-    rows = time_host()
-    print(json.dumps(rows, indent=2) if as_json else table(rows))
     return 0
 
 
