@@ -216,7 +216,7 @@ def test_the_optimiser_steps_after_or_before_a_refinement(before, lab):
 @pytest.mark.parametrize("visible_adam", [False, True])
 def test_visible_adam_updates_only_visible_gaussians(visible_adam, lab):
     training = lab.new(NoDensifier(), visible_adam=visible_adam, sh_interval=1)
-    training.fused, given = None, []
+    training.fast, given = None, []
     training.gaussians.optimizer_step = lambda *arguments: given.append(arguments)
     training.iterate(lab.folder)
     ((degree, visible),) = given
