@@ -10,7 +10,7 @@ from gsbench.pipeline.parts import Parts
 from gsbench.pipeline.trial import TrialSteps
 from gsbench.runs.config_hash import config_hash
 from gsbench.runs.store import Store
-from gsbench.system.own_modules import allowed_modules
+from gsbench.system.programs import allowed_modules
 from tests.pipeline.test_keys import WORDS, BareSource
 
 MODULES = ("mine", "variant")

@@ -12,12 +12,11 @@ from PIL import Image
 from gsbench.logs import no_progress
 from gsbench.runs.store import Store
 from gsbench.scene.colmap import plain_camera, read_model
-from gsbench.scene.distortion import largest_distortion
 from gsbench.scene.load import INTRINSICS, Downscaling, ImageToPrepare, load_scene, prepare_all
 from gsbench.scene.options import SplitRule
 from gsbench.scene.rules import inspect
 from gsbench.scene.types import CameraModel
-from gsbench.scene.undistortion import flatten, lens_findings, undistort
+from gsbench.scene.undistortion import flatten, largest_distortion, lens_findings, undistort
 from tests.helpers import read_json, refusal
 from tests.scene.captures import read_colmap
 

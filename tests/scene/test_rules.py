@@ -196,7 +196,7 @@ def test_a_rule_is_silent_up_to_its_limit_and_names_what_is_beyond(name):
 
 
 RULE = Rule(
-    "odd", "read", lambda raw: raw, (0, 1), (0, 2), "{value:g} of {names:few}", "take {low}"
+    "odd", "read", lambda raw: raw, (0, 1), "{value:g} of {names:few}", "take {low}", (0, 2)
 )
 
 

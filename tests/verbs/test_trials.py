@@ -18,7 +18,7 @@ from gsbench.launch.record import record
 from gsbench.launch.states import TrialState
 from gsbench.runs.commands import read_history
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.system.own_modules import allowed_modules
+from gsbench.system.programs import allowed_modules
 from gsbench.tracking.sync import MirrorError
 from gsbench.verbs import trials
 from tests.composed import composed

@@ -17,10 +17,10 @@ from hydra.core.utils import JobReturn, JobStatus
 from hydra.types import HydraContext
 from omegaconf import DictConfig, OmegaConf, read_write
 
+from gsbench.app.arm_search import Goal, goal_of
 from gsbench.app.grids import GRIDS, run_sweep
 from gsbench.app.hydra_main import FOLDER, run_main, words_for_files, words_for_new_folder
 from gsbench.app.sweep import BASIC, HYDRA_ERRORS, OWN, Ended, Sweep
-from gsbench.app.validation_search import Goal, goal_of
 from gsbench.config.compose import Trial, check_permitted, trial_of_job
 from gsbench.config.hydra_setup import installed_nodes
 from gsbench.config.overrides import is_sweep, key_of, task_words
@@ -30,7 +30,7 @@ from gsbench.launch.batch import begin_for_another_launcher
 from gsbench.launch.jobs import check_job_links
 from gsbench.launch.outcomes import Outcome, outcome_of_error
 from gsbench.logs import set_up_logging
-from gsbench.system.own_modules import allow_modules
+from gsbench.system.programs import allow_modules
 from gsbench.words import command
 
 MODE = "hydra.mode"

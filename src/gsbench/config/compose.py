@@ -28,8 +28,8 @@ from gsbench.config.hydra_setup import (
     hydra_ready,
     installed_nodes,
 )
-from gsbench.config.interpolations import check_texts
 from gsbench.config.overrides import bare_key, is_sweep, key_of, parse_word, task_words
+from gsbench.config.permissions import check_texts
 from gsbench.config.schema import ROOT_SETTINGS, Config, check, checked_values, plain
 from gsbench.config.search_path import check_search_path, read_by_gsbench, searched_folders
 from gsbench.config.strange_files import check_choice, check_places, permitted_to_files
@@ -38,7 +38,7 @@ from gsbench.errors import InputError
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.user_code import PERMISSIONS
 from gsbench.settings import check_values
-from gsbench.system.own_modules import allow_modules
+from gsbench.system.programs import allow_modules
 
 MADE_GROUPS = tuple(f"hydra/{name}" for name in MADE_NODES)
 # stands for the seed while settings are resolved that all seeds share: reading it is an error

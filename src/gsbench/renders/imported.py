@@ -27,8 +27,8 @@ from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.pictures import PicturePair, read_picture
 from gsbench.files import atomic, file_sha256, write_text
+from gsbench.pipeline.results import versions
 from gsbench.pipeline.steps.evaluate import summary_of, write_per_view
-from gsbench.pipeline.trial import versions
 from gsbench.renders.truth import ReferenceImages
 from gsbench.runs.commands import (
     Command,

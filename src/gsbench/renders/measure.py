@@ -32,7 +32,7 @@ from gsbench.renders.truth import (
 from gsbench.runs.user_code import PERMISSIONS
 from gsbench.scene.names import Matching, match_by_order, match_pictures
 from gsbench.system.device import select_device
-from gsbench.system.own_modules import allow_modules
+from gsbench.system.programs import allow_modules
 from gsbench.system.resources import available_threads
 from gsbench.words import counted, some_of
 

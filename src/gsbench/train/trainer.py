@@ -26,8 +26,8 @@ from gsbench.raster.depth import render_depth
 from gsbench.raster.executors import find_executor, lacks
 from gsbench.runs.layout import CURVES, EVENTS, HISTOGRAMS
 from gsbench.scene.types import Camera, Scene
-from gsbench.system.compile_clock import CLOCK
 from gsbench.system.device import free_bytes
+from gsbench.system.resources import CLOCK
 from gsbench.system.stopping import deferred, requested
 from gsbench.train.checkpoint import CheckpointWriter, load_checkpoint
 from gsbench.train.growth import GrowthWatch

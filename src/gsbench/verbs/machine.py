@@ -16,7 +16,7 @@ from gsbench.raster.executors import AUTO, EXECUTORS, names, resolve
 from gsbench.runs.trial_record import RasterProof
 from gsbench.scene.rules import MIN_SIZE
 from gsbench.system.install import install_command, version_of
-from gsbench.system.own_modules import allow_modules
+from gsbench.system.programs import allow_modules
 from gsbench.system.resources import available_threads, installed_gpus
 from gsbench.verbs.arguments import ArgumentParser, comma_separated, path, whole_number
 from gsbench.words import counted, readable_bytes

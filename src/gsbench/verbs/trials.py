@@ -39,7 +39,7 @@ from gsbench.runs.experiments import experiment_home, list_experiments, trial_fo
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS
 from gsbench.runs.user_code import PERMISSIONS
-from gsbench.system.own_modules import allow_modules
+from gsbench.system.programs import allow_modules
 from gsbench.tracking.beside import end_with
 from gsbench.tracking.sync import MirrorError
 from gsbench.tracking.sync import sync as send_missing

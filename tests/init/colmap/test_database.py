@@ -14,9 +14,9 @@ from PIL.TiffImagePlugin import IFDRational
 
 from gsbench.init import Sfm
 from gsbench.init.colmap import database as made
-from gsbench.init.colmap import features, geometry, matches
+from gsbench.init.colmap import features, matches
 from gsbench.init.reconstruction import report_lenses, report_unused
-from gsbench.scene.exif import (
+from gsbench.scene.images import (
     DIGITAL_ZOOM,
     EXIF_IFD,
     FOCAL_LENGTH,
@@ -229,7 +229,7 @@ def test_verification_reports_progress_in_parts(database, monkeypatch, count, ea
         listed.extend(file.read_text().splitlines())
 
     monkeypatch.setattr(pycolmap, "verify_matches", verify)
-    geometry.verify_pairs(database, pairs, None, lambda *state: told.append(state))
+    matches.verify_pairs(database, pairs, None, lambda *state: told.append(state))
     assert told == [("verify", done, count) for done in (*range(0, count, each), count)]
     ids = made.image_ids(database)
     assert listed == [f"{ids[first]} {ids[second]}" for first, second in pairs]

@@ -1,4 +1,6 @@
-"""COLMAP's matching of SIFT features, on several cores by processes instead of threads.
+"""COLMAP's matching of SIFT features and its verification of matched pairs.
+
+Matching uses several cores by processes instead of threads:
 
 COLMAP's matcher is not safe with two threads in one process. Its nearest-neighbour search (faiss)
 calls a BLAS that pycolmap's wheels build for one thread and without locks. Two simultaneous calls
@@ -22,9 +24,8 @@ from pathlib import Path
 
 import pycolmap
 
-from gsbench.init.colmap.database import image_ids, rename_images, write_pairs
-from gsbench.init.colmap.geometry import verification_options
-from gsbench.init.options import SiftOptions
+from gsbench.init.colmap.database import image_ids, image_ids_as_names, rename_images, write_pairs
+from gsbench.init.options import ColmapOptions, SiftOptions
 from gsbench.logs import Progress
 from gsbench.system.isolate import run_with_progress
 
@@ -189,3 +190,38 @@ def _insert(
                 connection.execute(
                     f"INSERT INTO main.{table} SELECT * FROM source.{table}{condition}"
                 )
+
+
+# COLMAP reports no progress within a call, so the pairs are divided over several calls
+VERIFY_CALLS = 20
+MIN_PAIRS_PER_CALL = 50
+
+
+def verification_options(options: ColmapOptions) -> pycolmap.TwoViewGeometryOptions:
+    """The options of COLMAP's geometric verification of a pair."""
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = options.seed
+    verification.min_num_inliers = options.min_inliers
+    verification.min_inlier_ratio = options.min_inlier_ratio
+    return verification
+
+
+def verify_pairs(
+    path: Path,
+    pairs: Sequence[tuple[str, str]],
+    options: pycolmap.TwoViewGeometryOptions,
+    progress: Progress,
+) -> None:
+    """Run COLMAP's geometric verification on the stored matches of ``pairs``."""
+    list_file = path.with_suffix(".pairs.txt")
+    size = max(len(pairs) // VERIFY_CALLS, MIN_PAIRS_PER_CALL)
+    progress("verify", 0, len(pairs))
+    with image_ids_as_names(path) as new_names:
+        for start in range(0, len(pairs), size):
+            part = pairs[start : start + size]
+            write_pairs(
+                list_file, [(new_names[first], new_names[second]) for first, second in part]
+            )
+            pycolmap.verify_matches(path, list_file, options)
+            progress("verify", start + len(part), len(pairs))
+    list_file.unlink(missing_ok=True)
