@@ -233,7 +233,7 @@ class Lists(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """How a kernel finds the rows of a Gaussian, those of its units: see `sum_rows`."""
+    """The places of the rows of Gaussians, those of their units: see `sum_rows`."""
 
     counts: Tensor  # [N] int32 number of units of each Gaussian
     first_units: Tensor  # [N] int64
@@ -242,7 +242,7 @@ class Rows(NamedTuple):
 
 
 class Blocks(NamedTuple):
-    """What all kernels read that go through the lists of blocks."""
+    """Inputs of all kernels that go through the lists of blocks."""
 
     starts: Tensor  # [blocks + 1] int32
     entries: Tensor  # [P] int32
@@ -251,7 +251,7 @@ class Blocks(NamedTuple):
 
 
 class Pixels(NamedTuple):
-    """What both passes of compositing read or write besides `Blocks`."""
+    """Memory of both passes of compositing, besides `Blocks`."""
 
     order: Tensor  # [blocks] int64
     background: Tensor  # [3]
