@@ -288,21 +288,22 @@ def test_an_unknown_verb_prints_the_usage(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_whole_day_in_the_interpreter(day):
+def test_one_part_of_each_kind_in_the_interpreter(day):
+    """The tests that other parts run are in `tests/raster`, too."""
     triton = pytest.importorskip("triton")
     if fault := interpreter_fault(triton.__version__, version("numpy")):
         pytest.skip(fault)
-    code, said = day.run("run", "1600", REAL="1")
+    parts = split("host bench-triton-3 bench-triton-skewed-whole train-adc bench-cpu memcheck")
+    code, said = day.run("run", "1600", "proof-triton", *parts, REAL="1")
     assert code == 0, said
     said = day.run("table", str(day.out / "gpu_day.tar.gz"), REAL="1")[1]
     assert "NO (" not in said
     proof = r"^- proof-triton: yes, \d+ s; device .+; versions \{.*'triton'.*; errors \{.*'image'"
     assert re.search(proof, said, re.MULTILINE)
-    assert re.search(r"^- contract: yes, \d+ s; \d+ passed", said, re.MULTILINE)
     assert re.search(r"^- memcheck: yes, \d+ s; 1 passed", said, re.MULTILINE)
     assert re.search(r"^\| triton-3 \| triton \| 3 \| 16x16 \| [\d.]+ \|", said, re.MULTILINE)
     assert re.search(
-        r"^\| train-volumetric \| 2 \| \d+ \| [\d.]+ \| [\d.]+ \| [\d.]+ \| [\d.]+ \| -?[\d.]+ \|",
+        r"^\| train-adc \| 2 \| \d+ \| [\d.]+ \| [\d.]+ \| [\d.]+ \| [\d.]+ \| -?[\d.]+ \|",
         said,
         re.MULTILINE,
     )

@@ -27,7 +27,6 @@ from gsbench.analysis.fairness import EQUAL_COUNTS
 from gsbench.analysis.old_declarations import all_questions
 from gsbench.analysis.verdicts import Verdict, judge
 from gsbench.claims.archive import unpack_archive
-from gsbench.runs.experiments import display_time
 from gsbench.words import counted, signed
 
 FINDINGS = Path(__file__).parents[1]
@@ -122,7 +121,7 @@ def ideas_table(name: str) -> str:
     asked, found = entries[-2:]
     lines += [
         f"### Confirmation on {', '.join(asked['keys']['baseline'])} with {len(asked['seeds'])} "
-        f"seeds ({display_time(asked['time'])})\n",
+        f"seeds ({asked['time'][:16].replace('T', ' ')} UTC)\n",
         "| idea | difference from the baseline | result |",
         "| :--- | ---: | ---: |",
     ]

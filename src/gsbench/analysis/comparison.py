@@ -95,16 +95,6 @@ class Comparison:
         return [answer.sentence for answer in self.answers]
 
     @property
-    def lines(self) -> list[str]:
-        """The badge and the verdict on each idea."""
-        return [answer.line for answer in self.answers]
-
-    @property
-    def headlines(self) -> list[str]:
-        """One line for each idea."""
-        return [answer.headline for answer in self.answers]
-
-    @property
     def risk(self) -> str:
         """The risk of a page with these answers; "" if it states no verdict."""
         verdicts = itertools.chain(*((one.verdict, *one.others) for one in self.answers))

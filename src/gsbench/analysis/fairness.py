@@ -22,7 +22,7 @@ from gsbench.analysis.differences import (
 from gsbench.analysis.notes import Note
 from gsbench.analysis.pairs import pair_trials
 from gsbench.analysis.quantities import COSTS, Reader, relative_change
-from gsbench.analysis.results import Arm, TrialResult, group_by, read_experiment, trials_of
+from gsbench.analysis.results import Arm, TrialResult, group_by, trials_of
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.analysis.trial_settings import canonical
 from gsbench.gaussians.paper_values import PAPER_CAP
@@ -354,7 +354,7 @@ def searches_of(trial: TrialResult) -> dict[str, TuningRecord]:
 
 
 def _search_note(own: Sequence[TrialResult], experiment: str, search: TuningRecord) -> Note:
-    """Say what a search tried and chose, and whether its arm's trials ``own`` came later."""
+    """Say what a search tried and chose, and whether its arm's trials ``own`` have that."""
     best = search.best
     if best is None:
         return Note.of("vain search", arm=search.arm, experiment=experiment)
@@ -373,25 +373,9 @@ def _search_note(own: Sequence[TrialResult], experiment: str, search: TuningReco
         scenes=search.scenes,
         seeds=search.seeds,
         experiment=experiment,
-        when=_when(own, experiment),
         tried=tried,
         more=max(0, len(search.points) - MAX_VALUES),
         others="" if _has_settings(own[0], best) else " These trials have other values.",
-    )
-
-
-def _when(own: Sequence[TrialResult], experiment: str) -> str:
-    """Say whether the search ended before these trials, so that no result guided it."""
-    times = [
-        trial.measured for trial in read_experiment(own[0].path.parents[3] / experiment).trials
-    ]
-    if not times:
-        return "whose own trials are missing"
-    later = sum(trial.measured < max(times) for trial in own)
-    return (
-        f"ended when {later} of these {len(own)} trials had been measured"
-        if later
-        else "before any of these trials"
     )
 
 

@@ -82,7 +82,7 @@ SENTENCES: dict[str, str] = {
     "vain search": "{arm}: the search {experiment} found nothing.",
     "search": (
         "{arm}: the best of {points:n point} by {metric} of validation views ({scenes:all}; seed "
-        "{seeds:list}; the search {experiment}) is {chosen:all}, {when}. Tried: "
+        "{seeds:list}; the search {experiment}) is {chosen:all}. Tried: "
         "{tried:list}{more:if: and % more}.{others}"
     ),
     "varied": (

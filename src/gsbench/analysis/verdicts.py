@@ -13,10 +13,10 @@ import numpy as np
 
 from gsbench.analysis.differences import between_scenes_notes
 from gsbench.analysis.notes import Note
-from gsbench.analysis.pairs import SAME_CAPTURE, Pairs, are_equal, pair, pair_sides
+from gsbench.analysis.pairs import SAME_CAPTURE, Pairs, are_equal, pair
 from gsbench.analysis.quantities import Quantity, asked_quantity
 from gsbench.analysis.questions import look_shares
-from gsbench.analysis.results import TrialResult, Unfinished, group_by
+from gsbench.analysis.results import TrialResult, Unfinished, group_by, trials_of
 from gsbench.analysis.statistics import (
     ALPHA,
     UNDECIDED,
@@ -372,25 +372,25 @@ def interval_of(
     """Mean and 95 % interval of all trials of two arms in any metric; it is no verdict."""
     own = [trial for trial in trials if trial.arm in (baseline, idea)]
     quantity = asked_quantity(metric, own)
-    sides = {
-        scene: ([t for t in of_scene if t.arm == baseline], [t for t in of_scene if t.arm == idea])
-        for scene, of_scene in group_by(own, lambda trial: trial.scene).items()
+    seeds = {
+        arm: {
+            scene: {trial.seed for trial in of_scene}
+            for scene, of_scene in group_by(trials_of(own, arm), lambda trial: trial.scene).items()
+        }
+        for arm in (baseline, idea)
     }
-    sides = {scene: both for scene, both in sides.items() if all(both)}
+    scenes = [scene for scene in seeds[baseline] if scene in seeds[idea]]
     question = Question(
         idea=idea,
         baseline=baseline,
         metric=metric,
         sign=quantity.direction,  # type: ignore[arg-type]
         least=quantity.worthwhile,
-        digests={scene: (one[0].digest, two[0].digest) for scene, (one, two) in sides.items()},
-        seeds={
-            scene: tuple(sorted({t.seed for t in one} & {t.seed for t in two}))
-            for scene, (one, two) in sides.items()
-        },
+        digests=dict.fromkeys(scenes, (str(baseline), str(idea))),
+        seeds={one: tuple(sorted(seeds[baseline][one] & seeds[idea][one])) for one in scenes},
         untested=why or state,
     )
-    pairs = pair_sides(sides, question)
+    pairs = pair(own, question, lambda trial: str(trial.arm))
     notes = (*pairs.left_out, *between_scenes_notes(pairs.of_baseline, pairs.of_arm))
     verdict = Verdict(question, quantity, pairs, state, ALPHA, done=len(own), notes=notes)
     verdict = _measure(verdict)

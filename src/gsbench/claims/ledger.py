@@ -22,13 +22,11 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from gsbench.analysis.fairness import EQUAL_COUNTS
 from gsbench.analysis.quantities import COSTS, relative_change
 from gsbench.analysis.questions import plan_looks
 from gsbench.analysis.results import Arm, Experiment, read_experiment
 from gsbench.analysis.sentences import numbers, reason, with_notes
 from gsbench.analysis.statistics import REFUTED, SUPPORTED, TOO_SMALL
-from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.analysis.verdicts import Verdict, gives_up, judge
 from gsbench.errors import InputError
 from gsbench.runs.commands import (
@@ -54,15 +52,6 @@ BEGUN, IN_TEST = "begun", "in its test"
 CHOOSES = "it only chooses what is tested on new seeds"
 LOOKS_WORSE = "looks worse"  # on the seeds of all ideas, which is no verdict
 MEND = "bring back the file as gsbench wrote it, or begin another ledger"
-HEADS = ("against", "level", "seeds", "difference", "Gaussians", "time", "result", "why")
-LEVEL = (
-    "level: the chance that this test keeps an idea that is no better. All levels follow from the "
-    "share above; each kept idea raises those after it."
-)
-UNTESTED = (
-    "Tests use new seeds. Ideas without a level did not look better on the seeds of all ideas, so "
-    "they were not tested."
-)
 
 
 @dataclass(frozen=True)
@@ -187,15 +176,22 @@ class Book:
         return self.result(idea) in (KEPT, DROPPED, UNDECIDED)
 
     def why(self, idea: str) -> str:
-        """The reason of a result; with unequal numbers of Gaussians it says so."""
+        """The reason of a result."""
         if failure := self.failure(idea):
             return failure
-        verdict, ratio = self.verdicts[idea], self.ratio(idea, "gaussians")
+        verdict = self.verdicts[idea]
         looks_worse = idea not in self.tests and verdict.outcome == REFUTED
-        words = with_notes(LOOKS_WORSE if looks_worse else reason(verdict), verdict)
-        if ratio is None or abs(ratio - 1) <= EQUAL_COUNTS:
-            return words
-        return f"{words}; with {ratio:.2f} times the Gaussians, so not at equal counts"
+        return with_notes(LOOKS_WORSE if looks_worse else reason(verdict), verdict)
+
+    def line(self, idea: str) -> str:
+        """``larger_splits against baseline: kept: better; psnr +0.5 (…); 3 new seeds, level …``"""
+        verdict, test = self.verdicts[idea], self.tests.get(idea)
+        where = f"{counted(verdict.pairs.seeds, 'seed')} of all ideas"
+        if test:
+            where = f"{counted(verdict.pairs.seeds, 'new seed')}, level {50 * test.level:.2g} %"
+        facts = [self.why(idea), f"{self.opened.metric} {numbers(verdict)}", where]
+        shown = "; ".join(facts if numbers(verdict) else facts[:1])
+        return f"{idea} against {self.ideas[idea].against}: {self.result(idea)}: {shown}"
 
     def ratio(self, idea: str, cost: str) -> float | None:
         """An idea's cost over that of what it is compared with."""
@@ -235,7 +231,7 @@ class Book:
                 "confirm on other captures"
             )
 
-    def lines(self) -> list[str]:
+    def describe(self) -> list[str]:
         """Two lines: what decides, and how many of the planned ideas were tried and kept."""
         opened = self.opened
         better = "more" if opened.sign > 0 else "less"
@@ -247,23 +243,6 @@ class Book:
             f"on {', '.join(self.ideas[BASELINE].digests)}, with at most {len(opened.seeds)} "
             "seeds, and as many new ones for what looks better.",
         ]
-
-    def table(self) -> Table:
-        rows = []
-        for number, idea in enumerate(self.begun, 1):
-            verdict, test = self.verdicts[idea], self.tests.get(idea)
-            cells = (
-                self.ideas[idea].against,
-                f"{test.level / 2:.2g}" if test else "",
-                f"{verdict.pairs.seeds}{' new' * bool(test)}",
-                numbers(verdict),
-                *map(_times, (self.ratio(idea, "gaussians"), self.ratio(idea, "train_time"))),
-                self.result(idea),
-                self.why(idea),
-            )
-            rows.append(Row((f"{number} {idea}",), tuple(map(TableEntry, cells))))
-        columns = tuple(Column("", head, ("ledger", head)) for head in HEADS)
-        return Table("Ideas in their order", ("idea",), columns, tuple(rows), (LEVEL, UNTESTED))
 
 
 def read_ledger(home: Path) -> Book:
@@ -308,7 +287,3 @@ def result_of(verdict: Verdict) -> str:
         return KEPT
     dropped = verdict.equal or verdict.outcome in (REFUTED, TOO_SMALL) or gives_up(verdict)
     return DROPPED if dropped else UNDECIDED
-
-
-def _times(ratio: float | None) -> str:
-    return "" if ratio is None else f"×{ratio:.2f}"

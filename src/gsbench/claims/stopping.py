@@ -93,5 +93,6 @@ def log_verdicts(trials: Iterable[Trial]) -> None:
         comparison = compare(newest_code(experiment))
         both = comparison.trials, comparison.pairs
         before = [*counts_notes(*both), *limit_notes(*both)]
-        for line in [*texts(before), *comparison.headlines, *comparison.experiment.versions]:
+        headlines = [answer.headline for answer in comparison.answers]
+        for line in [*texts(before), *headlines, *comparison.experiment.versions]:
             log.info("%s", line)

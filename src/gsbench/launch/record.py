@@ -81,7 +81,7 @@ def record(trials: Sequence[Trial], asks: bool = True) -> list[Question]:
         ) -> Command | None:
             found, shown = ask(rows, asked, measured, history) if asked else ([], [])
             asked_now.extend([*found, *(one for one in history.questions if one.id in shown)])
-            if set(shown) <= set().union(*history.newest.values()):
+            if set(shown) <= history.last:
                 shown = []  # they are the newest ones already
             planned = {
                 trial.folder.relative_to(home).as_posix(): PlannedTrial(

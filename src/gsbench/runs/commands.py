@@ -312,16 +312,11 @@ class History:
                     by_id[name] = by_id.pop(name)
         return tuple(by_id.values())
 
-    @cached_property
-    def newest(self) -> dict[str, set[str]]:
-        """The ids of the questions that the last command about each idea asked or repeated."""
-        ideas, found = {one.id: one.idea.name for one in self.questions}, dict[str, set[str]]()
-        for command in self.commands:
-            own: dict[str, set[str]] = {}
-            for name in (*(one.id for one in command.questions), *command.shows):
-                own.setdefault(ideas.get(name, ""), set()).add(name)
-            found |= own
-        return found
+    @property
+    def last(self) -> set[str]:
+        """The ids of the questions that the last command which asked anything asked or repeated."""
+        asked = ({*(q.id for q in one.questions), *one.shows} for one in reversed(self.commands))
+        return next(filter(None, asked), set())
 
     def _with_baseline(self, question: Question, later: Sequence[Command]) -> Question:
         if all(first for first, _ in question.digests.values()):

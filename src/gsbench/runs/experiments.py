@@ -182,11 +182,6 @@ def stamp_now() -> str:
     return time.strftime(STAMP, time.gmtime())
 
 
-def display_time(stamp: str) -> str:
-    """A time stamp (`STAMP`) for people: ``2026-11-21 20:05 UTC``."""
-    return time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(unix_time(stamp) or 0))
-
-
 def unix_time(text: object) -> int | None:
     """The Unix time of a time stamp (`STAMP`); None if the text is not one."""
     try:

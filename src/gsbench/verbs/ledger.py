@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from gsbench.analysis.results import read_experiment
-from gsbench.analysis.sentences import numbers, sentence
-from gsbench.analysis.table_formats import to_markdown
+from gsbench.analysis.sentences import sentence
 from gsbench.analysis.verdicts import judge
 from gsbench.app.command import run_trials
 from gsbench.app.ledger_trials import (
@@ -121,7 +120,7 @@ def new(options: argparse.Namespace, home: Path) -> int:
 
     make_runs_folder(checked_runs_folder(str(home.parent)))
     append(home, make)
-    print("\n".join(read_ledger(home).lines()))
+    print("\n".join(read_ledger(home).describe()))
     return 0
 
 
@@ -178,7 +177,12 @@ def try_idea(options: argparse.Namespace, home: Path) -> int:
     # An idea of which something is known cannot be tried anew as if it were not.
     if fails and book.is_measured(idea):
         raise GsbenchError(f"{idea}: {fails}; to go on, give the same command again")
-    _print_idea(book, idea, options.json, fails)
+    if options.json:
+        failed = {"result": FAILED, "reason": fails} if fails else {}
+        print(json.dumps(_facts(book, idea) | failed | _left(book)))
+    else:
+        print(f"{idea}: {FAILED}: {fails}" if fails else book.line(idea))
+        print(book.describe()[1])
     return EXIT_CODES.get(FAILED if fails else book.result(idea), UNDECIDED_CODE)
 
 
@@ -286,7 +290,8 @@ def show(options: argparse.Namespace, home: Path) -> int:
         ideas = [_facts(book, idea) for idea in book.begun]
         print(json.dumps({"opened": opened, "ideas": ideas} | _left(book), indent=1))
         return 0
-    print("\n".join([*book.lines(), "", to_markdown(book.table())]))
+    lines = [f"{number}. {book.line(idea)}" for number, idea in enumerate(book.begun, 1)]
+    print("\n".join([*book.describe(), *lines]))
     return 0
 
 
@@ -321,19 +326,6 @@ OPTIONS: tuple[tuple[str, tuple[str, ...], dict[str, Any]], ...] = (  # with the
 
 
 # ---- what is printed
-
-
-def _print_idea(book: Book, idea: str, as_json: bool, fails: str) -> None:
-    facts = _facts(book, idea) | ({"result": FAILED, "reason": fails} if fails else {})
-    if as_json:
-        print(json.dumps(facts | _left(book)))
-        return
-    verdict, seconds = book.verdicts[idea], facts.get("seconds")
-    shown = [f"{idea}: {facts['result']}: {facts['reason']}"]
-    shown += [f"{book.opened.metric} {numbers(verdict)}"] if numbers(verdict) else []
-    shown += [f"{seconds:.2f} times the training time"] if seconds else []
-    print("; ".join(shown))
-    print(book.lines()[1])
 
 
 def _facts(book: Book, idea: str) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from gsbench.analysis.pairs import pair_trials
 from gsbench.analysis.paper import layout_of, load_published, paper_tables
 from gsbench.analysis.planning import seeds_needed
 from gsbench.analysis.quantities import COSTS, relative_change
-from gsbench.analysis.report.charts import ForestRow, forest_plot, line_chart
+from gsbench.analysis.report.charts import forest_plot, line_chart
 from gsbench.analysis.report.curves import event_charts, event_table, training_charts
 from gsbench.analysis.report.quality import quality_charts
 from gsbench.analysis.report.sweeps import sweep_charts
@@ -28,7 +28,7 @@ from gsbench.analysis.report.where import region_maps
 from gsbench.analysis.results import Experiment, TrialResult, group_by, trials_of
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry, fill
 from gsbench.analysis.tables import build_table, with_agreement
-from gsbench.analysis.verdicts import Verdict
+from gsbench.analysis.verdicts import SceneEstimate, Verdict
 from gsbench.eval.facts import find_metric
 from gsbench.parsing import read_if_sound
 from gsbench.runs import layout
@@ -197,9 +197,10 @@ def _spread_of_times(trials: Sequence[TrialResult]) -> str:
 
 
 def _forest(verdict: Verdict) -> str:
-    rows = [ForestRow(scene.scene, scene.mean, scene.interval) for scene in verdict.scenes]
+    rows = [*verdict.scenes]
     if len(rows) > 1:
-        rows.append(ForestRow("mean of scenes", verdict.mean or 0.0, verdict.interval))
+        mean, seeds = verdict.mean or 0.0, verdict.pairs.seeds
+        rows.append(SceneEstimate("mean of scenes", mean, seeds, verdict.interval))
     better = (
         "right of zero is better" if verdict.quantity.direction == 1 else "left of zero is better"
     )

@@ -7,12 +7,12 @@ elements.
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from statistics import median
 from types import MappingProxyType
 
 from gsbench.analysis.statistics import Interval
 from gsbench.analysis.table_formats import fill
+from gsbench.analysis.verdicts import SceneEstimate
 from gsbench.words import true_minus
 
 WIDTH, HEIGHT = 380, 250  # px at full size; text is 12 px
@@ -26,21 +26,6 @@ TICKS = 5
 THOUSANDS = 1e4  # numbers from here on are written with k or M
 
 Points = Sequence[tuple[float, float]]
-
-
-@dataclass(frozen=True)
-class ForestRow:
-    """A difference with its interval, None if it is unknown."""
-
-    label: str
-    mean: float
-    interval: Interval | None = None
-
-    def color(self, better: int) -> str:
-        """Grey if the interval contains 0 or is unknown, green on the side ``better``, else red."""
-        if self.interval is None or not self.interval.excludes_zero():
-            return "#555555"
-        return "#1b7837" if self.mean * better > 0.0 else "#b2182b"
 
 
 def line_chart(
@@ -110,7 +95,7 @@ def line_chart(
     )
 
 
-def forest_plot(title: str, rows: Sequence[ForestRow], x_label: str, better: int) -> str:
+def forest_plot(title: str, rows: Sequence[SceneEstimate], x_label: str, better: int) -> str:
     """Differences with intervals, one per row, and a line at 0; ``better`` is a gain's sign.
 
     An interval much wider than the others is cut, so that it does not stretch the axis.
@@ -131,7 +116,7 @@ def forest_plot(title: str, rows: Sequence[ForestRow], x_label: str, better: int
         for end in (row.interval.low, row.interval.high)
     ]
     words = [
-        f"{row.label} {short_number(row.mean)}"
+        f"{row.scene} {short_number(row.mean)}"
         + (
             f", interval {short_number(row.interval.low)} to {short_number(row.interval.high)}"
             if row.interval
@@ -145,7 +130,7 @@ def forest_plot(title: str, rows: Sequence[ForestRow], x_label: str, better: int
         title=title,
         words=f"{title}. {x_label}. {'; '.join(words)}.",
         rows=[
-            (FOREST_TOP + FOREST_ROW * (k + 0.5), row, row.color(better), _cut(row, most))
+            (FOREST_TOP + FOREST_ROW * (k + 0.5), row, forest_color(row, better), _cut(row, most))
             for k, row in enumerate(rows)
         ],
         x=Axis(ends, False, FOREST_LEFT, WIDTH - RIGHT, ticks=3),
@@ -157,7 +142,14 @@ def forest_plot(title: str, rows: Sequence[ForestRow], x_label: str, better: int
     )
 
 
-def _cut(row: ForestRow, most: float) -> tuple[float, float] | None:
+def forest_color(row: SceneEstimate, better: int) -> str:
+    """Grey if the interval contains 0 or is unknown, green on the side ``better``, else red."""
+    if row.interval is None or not row.interval.excludes_zero():
+        return "#555555"
+    return "#1b7837" if row.mean * better > 0.0 else "#b2182b"
+
+
+def _cut(row: SceneEstimate, most: float) -> tuple[float, float] | None:
     """The ends of a row's interval, at most ``most`` from 0; None without an interval."""
     if row.interval is None:
         return None
