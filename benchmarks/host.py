@@ -97,14 +97,14 @@ class NullDevice:
         trainer.step = 3  # full degree of harmonics
         if way != "autograd":
             recorded = way == "recorded"
-            trainer.direct = DirectStep(
+            trainer.fast = DirectStep(
                 TritonRasterizer(),
                 TritonLoss(options.ssim_weight),
                 trainer.background,
                 recorded,
                 options.visible_adam,
             )
-            vars(trainer.direct)["pool"] = _NullPool()
+            vars(trainer.fast)["pool"] = _NullPool()
 
     def step(self) -> None:
         self.trainer.iterate(UNUSED_FOLDER)

@@ -6,7 +6,7 @@ import json
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from statistics import fmean
@@ -82,7 +82,7 @@ def describe_plan(trials: Sequence[Trial], parallel: int = 1) -> list[str]:
     """Lines for ``--dry-run``: each trial with its state, and the time for the unfinished ones."""
     lines: list[str] = []
     remaining, without_estimate, learned_from = 0.0, 0, 0
-    guess: Guess | None = None  # of the last trial that no finished one is similar to
+    guess = ""  # for the last trial that no finished one is similar to
     states: list[str] = []
     finished = FinishedTrials(trials[0].files.runs)
     queue = ask_queue(trial.folder for trial in trials)
@@ -100,7 +100,7 @@ def describe_plan(trials: Sequence[Trial], parallel: int = 1) -> list[str]:
         else:
             seconds, known_from = finished.estimate(trial.values)
             if not known_from and (found := guess_training(trial.values, parallel)):
-                seconds, guess = found.seconds, found
+                seconds, guess = found
             # a stopped training goes on from its checkpoint
             remaining += seconds * (1 - folder.share_done(trial.values["train"]["iterations"]))
             learned_from = max(learned_from, known_from)
@@ -115,13 +115,13 @@ def describe_plan(trials: Sequence[Trial], parallel: int = 1) -> list[str]:
             "no estimate: no finished trial of this scene with this rasterizer tells how long "
             "one takes here"
         )
-    elif learned_from == 0 and guess is None:
+    elif not (learned_from or guess):
         time = "seconds, since other experiments have the results"
     else:
         at_once = f", {parallel} at once" if parallel > 1 else ""
         duration = readable_time(remaining / parallel)
         sources = [f"estimated from {counted(learned_from, 'finished trial')}"] * (learned_from > 0)
-        sources += [str(guess)] * (guess is not None)
+        sources += [guess] * bool(guess)
         time = f"about {duration}{at_once}, {'; '.join(sources)}"
     return [*lines, f"time: {time}"]
 
@@ -168,26 +168,8 @@ GAUSSIANS_OF_PIXEL = 0.46
 MAX_ENTRIES = 10_000  # of a folder that are looked at for a picture
 
 
-@dataclass(frozen=True)
-class Guess:
-    """The seconds of a training, and what they rest on."""
-
-    seconds: float
-    width: int
-    height: int
-    gaussians: int
-    on_gpu: bool
-
-    def __str__(self) -> str:
-        device = "an H100" if self.on_gpu else "this CPU"
-        return (
-            f"a first guess for trainings on {device}, from pictures of {self.width}×{self.height} "
-            f"px and {self.gaussians:,} Gaussians"
-        )
-
-
-def guess_training(values: Mapping[str, Any], parallel: int = 1) -> Guess | None:
-    """The guess for a trial's resolved values; None without a picture."""
+def guess_training(values: Mapping[str, Any], parallel: int = 1) -> tuple[float, str] | None:
+    """The seconds of a training, and what they rest on; None without a picture."""
     size = picture_size(values["scene"])
     if size is None:
         return None
@@ -202,7 +184,11 @@ def guess_training(values: Mapping[str, Any], parallel: int = 1) -> Guess | None
         threads = available_threads(parallel) if given == "auto" else given
         step = CPU_OF_GAUSSIAN * gaussians + CPU_OF_PIXEL * pixels
         step /= float(np.interp(threads, THREADS, SPEED_UP))
-    return Guess(step * values["train"]["iterations"], *size, gaussians, on_gpu)
+    text = (
+        f"a first guess for trainings on {'an H100' if on_gpu else 'this CPU'}, from pictures of "
+        f"{size[0]}×{size[1]} px and {gaussians:,} Gaussians"
+    )
+    return step * values["train"]["iterations"], text
 
 
 def picture_size(scene: Mapping[str, Any]) -> tuple[int, int] | None:

@@ -37,14 +37,14 @@ def progress_frame(runs: Path, experiment: str) -> pd.DataFrame:
     # A superseded trial will never be done, so with it no sweep would end.
     states = [state for state in states_of_experiment(home) if state.state != "superseded"]
     names = names_of(states)
-    columns = dict.fromkeys(("done", "running", "failed", "waiting"), 0) | {SPEED: 0.0}
-    arms = sorted({arm for arm, _ in names.values()})
-    frame = pd.DataFrame(columns, index=pd.Index(arms, name="arm"))
+    columns: dict[str, float] = {"done": 0, "running": 0, "failed": 0, "waiting": 0, SPEED: 0.0}
+    rows = {arm: columns.copy() for arm in sorted({arm for arm, _ in names.values()})}
     for state in states:
-        arm = names[state.folder][0]
-        frame.loc[arm, STATES[state.state].column] += 1
+        row = rows[names[state.folder][0]]
+        row[STATES[state.state].column] += 1
         if state.state == "running":
-            frame.loc[arm, SPEED] += _speed(TrialFolder(state.folder))
+            row[SPEED] += _speed(TrialFolder(state.folder))
+    frame = pd.DataFrame.from_dict(rows, orient="index", columns=[*columns])
     done = [trial for trial in read_experiment(home).trials if trial.path in names]
     frame.attrs["seconds_left"] = _seconds_left(states, names, done)
     return frame

@@ -195,8 +195,10 @@ def mirror(
             sink.metrics(scalars)
             run = keep(run, logged=run.logged | {name: newest})
         if not live:
-            has_results = _end(sink, trial, options)
-            keep(run, **({"complete": results} if has_results else {"ended": trial.ending()}))
+            if _end(sink, trial, options):
+                keep(run, complete=trial.results_hash())
+            else:
+                keep(run, ended=trial.ending())
         return True
 
 

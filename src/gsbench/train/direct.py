@@ -49,14 +49,6 @@ MOST_SIZES = 4  # of images; each has memory of its own
 FACTORS_KEPT = 4
 
 
-class Differentiated(NamedTuple):
-    """Results of a training step before Adam. The next step overwrites their memory."""
-
-    render: RenderOutput  # ``screen_points.grad`` is filled
-    losses: Tensor  # [3] loss, L1, SSIM; [4] with a regulariser: the loss plus it
-    known: KnownGradients
-
-
 class Shape(NamedTuple):
     """The properties that two steps with the same launches share, besides the parameters."""
 
@@ -71,11 +63,13 @@ class Shape(NamedTuple):
 
 
 class DirectStep:
-    """Renders, measures and differentiates training views; applies Adam.
+    """Renders, measures and differentiates training views; applies Adam (`trainer.FastStep`).
 
     ``graphs`` turns recording on; without it, the same launches are made one by one. With
     ``visible_only``, Adam updates visible Gaussians only.
     """
+
+    applies_adam = False
 
     def __init__(
         self,
@@ -87,7 +81,6 @@ class DirectStep:
     ) -> None:
         self.rasterizer, self.loss, self.background = rasterizer, loss, background
         self.graphs, self.visible_only = graphs, visible_only
-        self.one = torch.ones((), device=background.device)
         self.repeats = 0  # renders that were repeated because lists had too little room
         self._memory: dict[tuple[int, int], _Memory] = {}
         self._plan: dict[tuple[int, int], _Plan] = {}
@@ -108,11 +101,11 @@ class DirectStep:
         extra: str | None,
         mask: Tensor | None = None,
         regularizer: Tensor | None = None,
-    ) -> Differentiated:
+    ) -> tuple[RenderOutput, Tensor]:
         """Render ``camera``, and differentiate the loss against ``target`` [H, W, 3].
 
-        Pixels where ``mask`` [H, W, 1] is False do not count. ``regularizer`` [], a function of the
-        parameters, is added to the loss; only its gradient is computed by autograd. Raises
+        Pixels where ``mask`` [H, W, 1] is False do not count. Only the gradient of ``regularizer``
+        is computed by autograd. The next step overwrites the memory of the results. Raises
         ValueError for bad values of parameters.
         """
         size = camera.width, camera.height
@@ -129,11 +122,10 @@ class DirectStep:
         plan.take(camera, self._numbers(camera), target, mask, further)
         with torch.cuda.device_of(self.background):
             plan.run()
-        found = plan.result()
         if regularizer is None:
-            return found
-        total = found.losses[0] + regularizer.detach()
-        return found._replace(losses=torch.cat([found.losses.to(total), total.view(1)]))
+            return plan.render(), plan.losses
+        total = plan.losses[0] + regularizer.detach()
+        return plan.render(), torch.cat([plan.losses.to(total), total.view(1)])
 
     def optimize(self, gaussians: TrainableGaussians) -> None:
         """Apply Adam with the gradients of the last step; replaced parameters are left out."""
@@ -240,6 +232,7 @@ class _Plan:
         )
         # results, which the next step overwrites
         self.losses = allocate("losses", (3,), torch.float32)
+        self.one = allocate("one", (), torch.float32).fill_(1.0)
         self.g_image = allocate("g_image", (*size, 3), torch.float32)
         self.gradients = [allocate(f"g_{name}", own, torch.float32) for name, own in shapes.items()]
         absolute = allocate("g_absolute", (count, 2), torch.float32) if shape.absolute else None
@@ -308,14 +301,13 @@ class _Plan:
             self._make_room(units, max(pairs, room.pairs))
             self.owner.repeats += 1
 
-    def result(self) -> Differentiated:
+    def render(self) -> RenderOutput:
         image, alpha, radii, frame = self.finished
         # The plan's own request has the camera of its first step.
         request = self.request._replace(camera=self.camera)
         footprint = partial(self.owner.rasterizer.footprint, frame, self.values, request)
         absolute, probe = self.request.absolute, self.probe
-        render = RenderOutput(image, alpha, radii, self.screen_points, absolute, footprint, probe)
-        return Differentiated(render, self.losses, self.known)
+        return RenderOutput(image, alpha, radii, self.screen_points, absolute, footprint, probe)
 
     def replay_adam(self, adam: Graph) -> None:
         """Apply the recorded ``adam`` with the present rates and step counts."""
@@ -352,7 +344,7 @@ class _Plan:
         image, _, radii, frame = self.finished
         image = replace_ignored(image, self.target, self.mask)
         measured = loss.measure(image, self.target, self.losses, memory.scratch, True)
-        loss.differentiate(measured, self.owner.one, self.g_image)
+        loss.differentiate(measured, self.one, self.g_image)
         if self.mask is not None:
             self.g_image.masked_fill_(~self.mask, 0.0)
         found = rasterizer.differentiate(
