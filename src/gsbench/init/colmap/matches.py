@@ -6,9 +6,9 @@ Matching uses several cores by processes instead of threads, since COLMAP's matc
 two threads in one process. Its nearest-neighbour search (faiss) calls a BLAS that pycolmap's wheels
 build for one thread and without locks. Two simultaneous calls can corrupt each other's numbers:
 rarely, and mostly on a busy machine, a pair loses some or most of its matches. With one thread for
-each process, matches are repeatable to the bit; COLMAP's brute force is, too, but took 24 times as
-long. Each call builds a search index for each of its images, which costs more than matching a pair,
-so the pairs are divided into parts with few images.
+each process, matches are repeatable to the bit; COLMAP's brute force took 24 times as long. Each
+call builds a search index for each of its images, which costs more than matching a pair, so the
+pairs are divided into parts with few images.
 """
 
 from __future__ import annotations
