@@ -29,10 +29,10 @@ class SplitLargest(Budgeted):
         return steps if self.due(refinement.step) else []
 
     def faint(self, refinement):
-        return refinement.gaussians.values.opacities < self.prune_opacity * self.cull
+        return refinement.gaussians.values.opacities < self.prune_opacity * refinement.cull
 
     def large(self, refinement):
-        limit = self.size * self.context.extent * self.strictness
+        limit = self.size * self.context.extent * refinement.strictness
         return self.statistics["seen"] & (refinement.gaussians.values.scales.amax(-1) > limit)
 
     def prune_faint(self, refinement):

@@ -27,9 +27,9 @@ from IPython.display import HTML, Markdown
 
 from gsbench.analysis import load_experiment, to_frame
 from gsbench.analysis.comparison import compare
-from gsbench.analysis.designs import seeds_needed
 from gsbench.analysis.images import choose_views
 from gsbench.analysis.pairs import pair_trials
+from gsbench.analysis.planning import seeds_needed
 from gsbench.analysis.table_formats import to_markdown
 from gsbench.analysis.tables import build_table
 from gsbench.cli import run

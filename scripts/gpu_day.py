@@ -114,7 +114,7 @@ def plan() -> list[Row]:
         Row([faster_gs(OF_FASTER_GS, "compile")], 0),
         Row([gsbench("proof-triton", "doctor --json --prove --raster triton")], 50),
         Row([check("contract", f"{contract}triton{some}"), check("bits", bits)], 50),
-        Row([gsbench("host", "bench --host --json")], 15, True),
+        Row([Part("host", [PYTHON, "-m", "benchmarks.host"])], 15, True),
         *(Row([bench(f"triton-{n}", "triton", n)], 75 / len(COUNTS), True) for n in COUNTS),
         *(
             Row([bench_of_lists(scene, split=split)], 10, True)

@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 
 from gsbench.analysis.questions import look_shares, plan_looks
 from gsbench.analysis.thresholds import Region, evenness
-from gsbench.claims.ledger import GIVE_UP, SCREEN
+from gsbench.analysis.verdicts import GIVE_UP
+from gsbench.claims.ledger import SCREEN
 
 IDEAS, RATE = 40, 0.1
 SCENES, SEEDS = 3, 6

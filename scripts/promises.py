@@ -29,8 +29,12 @@ import simulations
 from numpy.typing import NDArray
 from scipy import special
 
-from gsbench.analysis.designs import Components, estimate_components
-from gsbench.analysis.planning import Purpose, deviation_range
+from gsbench.analysis.planning import (
+    Components,
+    Purpose,
+    deviation_range,
+    estimate_components,
+)
 from gsbench.analysis.questions import plan_looks
 from gsbench.analysis.results import Arm, TrialResult, Unfinished
 from gsbench.analysis.statistics import REFUTED, SUPPORTED

@@ -285,8 +285,8 @@ def api_page() -> str:
     lines = [
         "# Public names",
         "",
-        "A program may rely on these names, and on no others. [Releasing](releasing.md) says how "
-        "long they stay.",
+        "A program may rely on these names, and on no others "
+        "([how long](contributing.md#what-stays-stable)).",
         "",
     ]
     for module, names in public_names().items():

@@ -1,4 +1,4 @@
-"""Write ``src/gsbench/released.json``, the digests of this release's packages (docs/releasing.md).
+"""Write ``src/gsbench/released.json``, the digests of this release's packages (CONTRIBUTING.md).
 
 python scripts/released.py
 """

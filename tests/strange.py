@@ -9,7 +9,7 @@ import yaml
 
 from gsbench import cli
 from gsbench.errors import InputError
-from gsbench.system.own_modules import allowed_modules
+from gsbench.system.programs import allowed_modules
 from tests.helpers import write
 
 BOMB = "from pathlib import Path\nPath('exploded').touch()\nclass Bomb:\n    pass\n"

@@ -20,7 +20,7 @@ BEGIN = "FORGED"  # no line of an output may begin with it
 HOSTILE = f"a\n{BEGIN}: better in PSNR\x1b[31m`![p](http://e)` <img src=x>\\<img src=x>"
 # texts that name the trial's folder, or are one of a few words: others are refused
 FIXED = ("status", "experiment", "scene", "init", "densify", "evaluated_from")
-RECORDS = ("trained_by", "initial_cloud", "twins", "budget", "code", "raster_proof", "declared")
+RECORDS = ("trained_by", "initial_cloud", "twins", "budget", "code", "raster_proof")
 FULL = {
     "trained_by": {"program": "p", "version": "1", "said": "s", "command": ["c"]},
     "metric_facts": {"sharp": {"label": "Sharp", "direction": 1, "unit": "u"}},
@@ -52,7 +52,6 @@ FULL = {
         "seconds": 1.0,
     },
     "raster_passed_over": ["triton: no GPU"],
-    "declared": {"metric": "psnr", "time": "2026-01-01T00:00:00Z"},
     "measured": "2026-01-01T00:00:00Z",
 }
 COMMANDS = (

@@ -22,7 +22,6 @@ from gsbench.parsing import (
     Text,
     Whole,
     fault_of,
-    iterate_rows,
     one_line,
     parse_typed,
     read_bytes,
@@ -34,6 +33,7 @@ from gsbench.parsing import (
     resolved,
     without_byte_order_mark,
 )
+from gsbench.runs.rows import iterate_rows
 from tests.helpers import refusal, write
 
 

@@ -264,15 +264,6 @@ def test_glob_lists_the_options_of_a_group():
     assert [trial.values["densify"]["name"] for trial in trials] == ["absgrad", "absgs", "adc"]
 
 
-def test_report_writes_into_a_folder_as_tables_does(place):
-    from gsbench.verbs.results import file_at
-
-    (place / "folder.html").mkdir()
-    assert file_at(Path("a/page.html"), "x") == Path("a/page.html")
-    assert file_at(Path("a"), "x") == Path("a/x-report.html")
-    assert file_at(Path("folder.html"), "x") == Path("folder.html/x-report.html")
-
-
 # ---- property: any value of any setting is accepted and then stays, or is refused in one line
 
 SCHEMA_KEYS = [

@@ -13,7 +13,7 @@ import numpy as np
 
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.quantities import asked_quantity
-from gsbench.analysis.questions import Asked, ask, rows_of
+from gsbench.analysis.questions import Asked, ask
 from gsbench.analysis.results import read_experiment
 from gsbench.config.compose import Trial
 from gsbench.runs.commands import Command, PlannedTrial, append
@@ -298,7 +298,7 @@ def ask_about(runs, chosen=lambda trial: True, experiment="exp", metric="psnr", 
     }
 
     def make(history):
-        found, shown = ask(rows_of(own), Asked(metric=metric, **about), rows_of(known), history)
+        found, shown = ask(own, Asked(metric=metric, **about), known, history)
         return Command(
             words=("-m",),
             cwd="/",

@@ -12,6 +12,7 @@ adjusted for the number of intervals beside it.
 from __future__ import annotations
 
 import functools
+import json
 import re
 import tempfile
 import zipfile
@@ -22,13 +23,10 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from gsbench.analysis.ledger_table import describe_ledger, ledger_tables
+from gsbench.analysis.fairness import EQUAL_COUNTS
 from gsbench.analysis.old_declarations import all_questions
-from gsbench.analysis.sentences import p_text
-from gsbench.analysis.table_formats import to_markdown
 from gsbench.analysis.verdicts import Verdict, judge
 from gsbench.claims.archive import unpack_archive
-from gsbench.runs.ledger import read_ledger
 from gsbench.words import counted, signed
 
 FINDINGS = Path(__file__).parents[1]
@@ -89,11 +87,61 @@ ASKED = [
 
 
 def ideas_table(name: str) -> str:
-    """A ledger of ideas, as `gsbench ledger show` prints it, and its confirmations."""
-    with tempfile.TemporaryDirectory() as folder:
-        home = unpack_archive(ARCHIVES / f"{name}.zip", Path(folder)).folder
-        ledger = read_ledger(home)
-    return "\n".join([*describe_ledger(ledger), "", *map(to_markdown, ledger_tables(ledger))])
+    """A ledger of gsbench 0.1, which later versions no longer read, and its confirmation."""
+    with zipfile.ZipFile(ARCHIVES / f"{name}.zip") as archive:
+        content = archive.read("ledger.jsonl").decode()
+    opened, *entries = (json.loads(line)["entry"] for line in content.splitlines())
+    ended = {one["idea"]: one for one in entries if one["kind"] == "ended"}
+    started = [one for one in entries if one["kind"] == "started"]
+    kept = sum(one["result"] == "kept" for one in ended.values())
+    lines = [
+        f"{opened['metric']} decides: less is better, and {opened['least']} is the least that "
+        f"matters. At most {100 * opened['rate']:g} % of the kept ideas are expected to be no "
+        "better.",
+        f"{len(started)} of {opened['ideas']} planned ideas were tried, and {kept} kept, on "
+        f"{', '.join(opened['keys'])}, with at most {len(opened['seeds'])} seeds.",
+        "\n### Ideas in their order\n",
+        "| idea | against | level | seeds | difference | Gaussians | time | result | why |",
+        "| :--- |" + " ---: |" * 8,
+    ]
+    for number, one in enumerate(started, 1):
+        end = ended[one["idea"]]
+        why, ratio = end["reason"], end["gaussians"]
+        if abs(ratio - 1) > EQUAL_COUNTS:
+            why += f"; with {ratio:.2f} times the Gaussians, so not at equal counts"
+        lines.append(
+            f"| {number} {one['idea']} | {one['against']} | {one['level']:.2g} | {end['seeds']} | "
+            f"{_with_interval(end.get('difference'))} | ×{ratio:.2f} | ×{end['seconds']:.2f} | "
+            f"{end['result']} | {why} |"
+        )
+    lines.append(
+        "\n- level: the chance that this test keeps an idea that is no better. All levels follow "
+        "from the share above; each kept idea raises those after it.\n"
+    )
+    asked, found = entries[-2:]
+    lines += [
+        f"### Confirmation on {', '.join(asked['keys']['baseline'])} with {len(asked['seeds'])} "
+        f"seeds ({asked['time'][:16].replace('T', ' ')} UTC)\n",
+        "| idea | difference from the baseline | result |",
+        "| :--- | ---: | ---: |",
+    ]
+    lines += [
+        f"| {idea} | {_with_interval(found['differences'][idea])} | {result} |"
+        for idea, result in found["results"].items()
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def p_text(p: float) -> str:
+    """``below 0.001``, or p with three decimals."""
+    return "below 0.001" if p < 0.001 else f"{p:.3f}"
+
+
+def _with_interval(difference: dict[str, float] | None) -> str:
+    if difference is None:
+        return ""
+    mean, low, high = (signed(difference[key], ".4g") for key in ("mean", "low", "high"))
+    return f"{mean} ({low} to {high})"
 
 
 def read_trials(name: str) -> pd.DataFrame:

@@ -6,7 +6,6 @@ most `MAX_DEPTH` levels and only plain values.
 """
 
 import codecs
-import logging
 import math
 import os
 import re
@@ -35,8 +34,6 @@ from pydantic_core import CoreSchema, ErrorDetails, core_schema, from_json
 from gsbench.errors import InputError
 from gsbench.files import open_plain
 from gsbench.words import as_line
-
-log = logging.getLogger(__name__)
 
 # enough for the plan of 80,000 trials, or a training that logs each of 300,000 iterations
 MAX_BYTES = 64 << 20
@@ -413,31 +410,3 @@ def describe_misfit(error: ValidationError) -> str:
         f"is damaged: {key} is {reprlib.repr(first['input'])} "
         f"({first['msg'].removeprefix('Value error, ').lower()})"
     )
-
-
-def iterate_rows(content: bytes, kind: type[T], path: Path) -> Iterator[tuple[str, T]]:
-    """Parse the JSON lines of the file ``path``; yields each line with its object of ``kind``.
-
-    A damaged line and the lines after it are left out. There is a warning, except for an incomplete
-    last line, which a killed process leaves.
-    """
-    lines = content.splitlines(keepends=True)
-    # Parsing all lines at once is faster. Only if that fails are they parsed one by one.
-    try:
-        rows = parse_typed(b"[" + b",".join(lines) + b"]", list[kind], path)  # type: ignore[valid-type]
-    except DamagedError:
-        rows = []
-    if len(rows) == len(lines):  # otherwise a line holds several values
-        yield from (
-            (line.decode("utf-8").rstrip("\r\n"), row)
-            for line, row in zip(lines, rows, strict=True)
-        )
-        return
-    for number, line in enumerate(lines, 1):
-        try:
-            row = parse_typed(line, kind, path)
-        except DamagedError as error:
-            if line.endswith(b"\n") or number < len(lines):
-                log.warning("left out: %s from line %d on, which %s", path, number, error.reason)
-            return
-        yield line.decode("utf-8").rstrip("\r\n"), row

@@ -1,7 +1,5 @@
 """The differences between two arms are named wherever the arms are compared."""
 
-import itertools
-import random
 from types import SimpleNamespace
 
 import pytest
@@ -12,11 +10,11 @@ from gsbench.analysis.differences import (
     DEPARTURES,
     ELSEWHERE,
     NO_RECORD,
+    compared_trials,
     ingredients,
     ingredients_between,
     ingredients_note,
     is_mixed,
-    representatives,
 )
 from gsbench.runs.config_hash import config_hash
 from gsbench.runs.experiments import Arm
@@ -217,23 +215,20 @@ def test_experiments_list_the_control_of_every_mixed_arm():
     assert checked >= 2
 
 
-def test_representatives_share_scene_and_seed_if_possible():
+def test_compared_trials_share_scene_and_seed_if_possible():
     arms = Arm("sfm", "a"), Arm("sfm", "b")
-    generator = random.Random(0)
-    for _ in range(200):
-        trials = [
-            SimpleNamespace(arm=arm, scene=generator.randrange(3), seed=generator.randrange(3))
-            for arm in arms
-            for _ in range(generator.randrange(1, 4))
-        ]
-        generator.shuffle(trials)
-        one, other = ([trial for trial in trials if trial.arm == arm] for arm in arms)
-        pairs = itertools.product(one, other)
-        expected = min(
-            pairs, key=lambda pair: (pair[0].scene != pair[1].scene, pair[0].seed != pair[1].seed)
-        )
-        found = representatives(trials, *arms)
-        assert found[0] is expected[0]
-        assert found[1] is expected[1]
+
+    def pairs(*places):
+        trials = [SimpleNamespace(arm=arms[side], scene=s, seed=k) for side, s, k in places]
+        found = compared_trials(trials, *arms)
+        return [(one.scene, one.seed, other.scene, other.seed) for one, other in found]
+
+    assert pairs((0, "x", 0), (0, "x", 1), (1, "x", 1)) == [("x", 1, "x", 1)]
+    assert pairs((0, "x", 0), (0, "y", 0), (1, "y", 2)) == [("y", 0, "y", 2)]
+    assert pairs((0, "x", 0), (0, "y", 0), (1, "y", 0), (1, "x", 0)) == [
+        ("x", 0, "x", 0),
+        ("y", 0, "y", 0),
+    ]
+    assert pairs((0, "x", 0), (0, "x", 1), (1, "y", 1)) == [("x", 1, "y", 1)]
     with pytest.raises(KeyError, match="sfm"):
-        representatives(trials, arms[0], Arm("sfm", "c"))
+        compared_trials([], *arms)

@@ -4,11 +4,8 @@ import os
 
 import pytest
 
-from gsbench.analysis.differences import find_superseded
 from gsbench.analysis.report.build import build_report
-from gsbench.analysis.results import read_experiment
 from gsbench.analysis.tables import build_table
-from gsbench.runs import freshness
 from gsbench.verbs.results import explain_cell
 from tests.analysis.helpers import loaded, page_of
 from tests.trials import write_trial
@@ -127,38 +124,3 @@ def test_explain_names_the_commit_and_the_edited_packages(tmp_path):
     said = explain_cell("exp:garden:psnr:adc", tmp_path / "other")
     assert "commit    0123abcd\n" in said
     assert "since the last release" not in said
-
-
-@pytest.mark.parametrize(
-    "old, new, here, reasons",
-    [
-        (code(OLD), code(NEW), None, {"seed0": "mine was 11111111, later trials have 22222222"}),
-        (code(OLD), code(NEW), OLD, {"seed1": "mine was 22222222, it is now 11111111"}),
-        (
-            code(OLD),
-            code(NEW),
-            "3" * 64,
-            {
-                "seed0": "mine was 11111111, it is now 33333333",
-                "seed1": "mine was 22222222, it is now 33333333",
-            },
-        ),
-        (code(), code(train=2), None, {"seed0": "stage train was 1, later trials have 2"}),
-        (
-            of_gsbench(train="a" * 16),
-            of_gsbench(train="b" * 16),
-            None,
-            {"seed0": "gsbench's train was aaaaaaaa, later trials have bbbbbbbb"},
-        ),
-        ({}, code(), None, {}),  # entered from elsewhere: no code of ours made it
-    ],
-)
-def test_superseded_trials_are_named_with_the_reason(
-    tmp_path, monkeypatch, old, new, here, reasons
-):
-    first = finished_at(write_trial(tmp_path, 0, "aaaaaaaa", MINE, psnr=1.0, _code=old), 1000)
-    second = finished_at(write_trial(tmp_path, 1, "bbbbbbbb", MINE, psnr=1.0, _code=new), 2000)
-    monkeypatch.setattr(freshness, "module_digest", lambda name, folder: {"there": here}[folder])
-    folders = {first: "there", second: "there"} if here else {}
-    found = find_superseded(read_experiment(tmp_path / "exp").trials, folders)
-    assert {path.name.partition("-")[2]: str(one) for path, one in found.items()} == reasons

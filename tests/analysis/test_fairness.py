@@ -2,12 +2,9 @@
 
 import re
 import shutil
-from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
-from gsbench.analysis import fairness
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.fairness import UNLIKE, _shown, fairness_table
 from gsbench.analysis.notes import Note
@@ -150,7 +147,7 @@ def test_a_search_that_proposed_the_settings_is_named(tmp_path):
 
     (line,) = tuning()
     assert "the best of 2 points by psnr of validation views (courtyard; seed 100; the" in line
-    assert "is densify.volume_threshold=0.1, " in line
+    assert "is densify.volume_threshold=0.1. " in line
     assert line.endswith("Tried: 0.1 (27.6), 0.06841 (27.5). These trials have other values.")
     write(tmp_path / "vth/tuning.json", record | {"points": points[1:]})
     unequal, line = tuning()
@@ -162,28 +159,6 @@ def test_a_search_that_proposed_the_settings_is_named(tmp_path):
     nothing = [point | {"value": None} for point in points]
     write(tmp_path / "vth/tuning.json", record | {"points": nothing})
     assert tuning() == ["Tuning. sfm-volumetric: the search vth found nothing."]
-
-
-@pytest.mark.parametrize(
-    "searched, said",
-    [
-        (("2026-01", "2026-02"), "before any of these trials"),
-        # a trial of the same moment may not have guided the search
-        (("2026-03", "2026-01"), "before any of these trials"),
-        (("2026-04", "2026-01"), "ended when 1 of these 3 trials had been measured"),
-        (("2026-06",), "ended when 3 of these 3 trials had been measured"),
-        ((), "whose own trials are missing"),
-    ],
-)
-def test_the_sheet_says_whether_a_search_ended_before_the_trials(searched, said, monkeypatch):
-    def trials(times):
-        return [
-            SimpleNamespace(measured=time, path=Path("runs/exp/garden/sfm-adc/x")) for time in times
-        ]
-
-    experiments = {Path("runs/vth"): SimpleNamespace(trials=trials(searched))}
-    monkeypatch.setattr(fairness, "read_experiment", experiments.__getitem__)
-    assert fairness._when(trials(("2026-03", "2026-05", "2026-05")), "vth") == said
 
 
 # --- where it is shown

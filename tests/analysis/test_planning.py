@@ -3,8 +3,15 @@
 import numpy as np
 import pytest
 
-from gsbench.analysis.designs import POWER, Components, Design, estimate_components, power_of_mean
-from gsbench.analysis.planning import Purpose, deviation_range
+from gsbench.analysis.planning import (
+    POWER,
+    Components,
+    Design,
+    Purpose,
+    deviation_range,
+    estimate_components,
+    power_of_mean,
+)
 from gsbench.analysis.questions import look_shares, plan_looks
 from gsbench.analysis.statistics import t_test
 

@@ -7,17 +7,18 @@ import pytest
 
 from gsbench.analysis.questions import (
     Asked,
-    Row,
     announce,
     ask,
     choose_pairs,
     count_tries,
     level_of,
     look_shares,
+    place_of,
     plan_looks,
     read_least,
     unreachable,
 )
+from gsbench.analysis.trial_result import Planned
 from gsbench.runs.commands import Command, History
 from gsbench.runs.experiments import Arm
 from tests.helpers import refusal
@@ -32,7 +33,7 @@ def row(densify="mine", seed=0, scene=HERE, init="sfm", code="", variant=(), **s
     config = {"scene.name": scene} | {f"densify.{key}": value for key, value in settings.items()}
     config |= dict(variant)
     digest = f"{init}-{densify}/{hashed}{code and '+'}{code}"
-    return Row(scene, init, densify, hashed, seed, config, digest, tuple(variant))
+    return Planned(scene, init, densify, hashed, seed, config, digest, tuple(variant))
 
 
 def sweep(*densifiers, seeds=(0, 1, 2), **how):
@@ -45,7 +46,7 @@ def asked(planned, measured=(), before=None, about=PSNR):
     found, shown = ask(planned, about, measured, before)
     now = Command(words=(), cwd="", time=0.0, questions=tuple(found), shows=tuple(shown))
     after = replace(before, commands=(*before.commands, now))
-    results = {(one.digest, one.place) for one in planned}
+    results = {(one.digest, place_of(one)) for one in planned}
     return replace(after, results=after.results | results), found, shown
 
 

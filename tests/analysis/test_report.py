@@ -14,10 +14,16 @@ from PIL import Image
 from plyfile import PlyData
 
 from gsbench.analysis.images import _jpeg_uri, choose_views, read_compared, texture_energy
-from gsbench.analysis.pairs import pair_trials
+from gsbench.analysis.pairs import Pairs, pair_trials
 from gsbench.analysis.quantities import quantity
 from gsbench.analysis.report.build import _forest, build_report, search_summary, trial_figures
-from gsbench.analysis.report.charts import Axis, ForestRow, forest_plot, line_chart, short_number
+from gsbench.analysis.report.charts import (
+    Axis,
+    forest_color,
+    forest_plot,
+    line_chart,
+    short_number,
+)
 from gsbench.analysis.report.curves import event_table, mean_by_step
 from gsbench.analysis.report.volumes import (
     _logged_histograms,
@@ -28,6 +34,7 @@ from gsbench.analysis.report.volumes import (
 )
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.statistics import Interval
+from gsbench.analysis.verdicts import SceneEstimate
 from gsbench.runs.rows import Histogram
 from tests.analysis.helpers import ADC, VOLUMETRIC, loaded, page_of, rows_of, trials_of
 from tests.helpers import refusal, write
@@ -299,13 +306,18 @@ def test_mean_curves_use_common_steps():
     ]
 
 
+def row_of(label, mean, interval=None):
+    """A row of a forest plot."""
+    return SceneEstimate(label, mean, 3, interval)
+
+
 CHARTS = {
     "lines": lambda title: line_chart(
         title, [("a", [(1, 1), (10, 5)]), ("b", [(2, 3)])], "x", "y", log=True
     ),
     "flat": lambda title: line_chart(title, [("a", [(5, 1), (5, 1)])], "x", "y", marker=5),
     "forest": lambda title: forest_plot(
-        title, [ForestRow("s", 0.1, Interval(-0.1, 0.3)), ForestRow("t", 0.2)], "d", 1
+        title, [row_of("s", 0.1, Interval(-0.1, 0.3)), row_of("t", 0.2)], "d", 1
     ),
 }
 
@@ -319,33 +331,6 @@ def test_charts_are_well_formed_and_stay_inside(chart):
         for name, limit in limits.items():
             assert 0 <= float(element.attrib.get(name, 0)) <= limit
     assert svg.attrib["aria-label"].startswith("<&>")
-
-
-def test_charts_have_fixed_margins():
-    points = [(0, 0), (5, 10), (10, 0)]
-    figure = ElementTree.fromstring(line_chart("t", [("a", points)], "x", "y"))
-    assert next(figure.iter("svg")).attrib["viewBox"] == "0 0 380 250"
-    step, up = 304 * 5 / 10.4, 180 * 10 / 10.4
-    assert next(figure.iter("polyline")).attrib["points"] == (
-        f"58.0,206.0 {58 + step:.1f},{206 - up:.1f} {58 + 2 * step:.1f},206.0"
-    )
-    rows = [ForestRow("s", -1.0), ForestRow("t", 1.0)]
-    figure = ElementTree.fromstring(forest_plot("t", rows, "difference", 1))
-    assert next(figure.iter("svg")).attrib["viewBox"] == "0 0 380 108"
-    places = [(float(dot.attrib["cx"]), float(dot.attrib["cy"])) for dot in figure.iter("circle")]
-    assert places == [
-        (pytest.approx(247 - 115 / 1.08, abs=0.05), 25),
-        (pytest.approx(247 + 115 / 1.08, abs=0.05), 51),
-    ]
-
-
-def test_each_line_has_a_colour_and_dashes_of_its_own():
-    lines = [(str(k), [(0, k), (1, k)]) for k in range(7)]
-    figure = ElementTree.fromstring(line_chart("t", lines, "x", "y"))
-    look = ("stroke", "stroke-dasharray")
-    strokes = [tuple(map(line.attrib.get, look)) for line in figure.iter("polyline")]
-    assert len(set(strokes)) == 6
-    assert strokes[6] == strokes[0]
 
 
 @pytest.mark.parametrize("log", [False, True])
@@ -418,33 +403,29 @@ def test_a_short_number_has_three_digits(value, text):
 
 def test_a_row_of_a_forest_plot_has_the_colour_of_its_verdict():
     green, red, grey = "#1b7837", "#b2182b", "#555555"
-    up, down = ForestRow("s", 0.2, Interval(0.1, 0.3)), ForestRow("s", -0.2, Interval(-0.3, -0.1))
-    assert [up.color(1), up.color(-1), down.color(1), down.color(-1)] == [green, red, red, green]
-    assert ForestRow("s", 0.2).color(1) == ForestRow("s", 0.2, Interval(-0.1, 0.5)).color(1) == grey
+    up, down = row_of("s", 0.2, Interval(0.1, 0.3)), row_of("s", -0.2, Interval(-0.3, -0.1))
+    colors = [forest_color(row, side) for row in (up, down) for side in (1, -1)]
+    assert colors == [green, red, red, green]
+    for interval in (None, Interval(-0.1, 0.5)):
+        assert forest_color(row_of("s", 0.2, interval), 1) == grey
 
 
 @pytest.mark.parametrize(
     "key, better", [("psnr", "right of zero is better"), ("flip", "left of zero is better")]
 )
 def test_a_forest_plot_of_a_verdict_has_its_scenes_and_from_two_on_their_mean(key, better):
-    scenes = [
-        SimpleNamespace(scene=name, mean=mean, interval=None)
-        for name, mean in (("a", 0.5), ("b", -0.25))
-    ]
+    scenes = [row_of(name, mean) for name, mean in (("a", 0.5), ("b", -0.25))]
     one, two = (
-        _forest(SimpleNamespace(scenes=own, mean=0.125, interval=None, quantity=quantity(key, [])))
+        _forest(
+            SimpleNamespace(
+                scenes=own, mean=0.125, interval=None, quantity=quantity(key, []), pairs=Pairs(())
+            )
+        )
         for own in (scenes[:1], scenes)
     )
     assert f"{quantity(key, []).name}: {better}" in one
     assert "a 0.5." in one
     assert "a 0.5; b −0.25; mean of scenes 0.125." in two
-
-
-def test_an_axis_from_zero_begins_at_zero():
-    axis = Axis([0.0, 10.0], False, 0.0, 104.0)
-    assert [axis.to_px(value) for value in (0, 5, 10)] == pytest.approx([0, 50, 100])
-    balanced = Axis([-3.0, 3.0], False, 0.0, 108.0)
-    assert [balanced.to_px(value) for value in (-3, 0, 3)] == pytest.approx([4, 54, 104])
 
 
 @pytest.mark.parametrize(
@@ -565,7 +546,7 @@ def test_a_search_is_summed_up_in_a_line_and_a_chart(tmp_path):
 def test_a_forest_plot_has_at_least_two_grid_lines_for_any_range():
     """A range of -0.09 to 0.09 once had only one tick, at zero."""
     for reach in (0.0886, 0.09, 0.11, 1.0, 3.3, 940.0):
-        row = ForestRow("a", 0.1 * reach, Interval(-reach, reach))
+        row = row_of("a", 0.1 * reach, Interval(-reach, reach))
         chart = forest_plot("t", [row], "difference", 1)
         assert chart.count('class="grid"') >= 2, reach
 
@@ -592,8 +573,8 @@ def test_a_sweep_over_a_setting_has_a_chart_with_its_baseline(tmp_path):
 
 
 def test_a_wide_interval_of_one_scene_does_not_stretch_the_axis():
-    rows = [ForestRow(f"s{k}", 0.1, Interval(-0.1, 0.3)) for k in range(3)]
-    wide = forest_plot("t", [*rows, ForestRow("wide", 0.1, Interval(-9.0, 9.2))], "d", 1)
+    rows = [row_of(f"s{k}", 0.1, Interval(-0.1, 0.3)) for k in range(3)]
+    wide = forest_plot("t", [*rows, row_of("wide", 0.1, Interval(-9.0, 9.2))], "d", 1)
     lines = re.findall(r'<line x1="([\d.]+)" x2="([\d.]+)"', wide)
     own, cut = (float(b) - float(a) for a, b in (lines[0], lines[-1]))
     assert 1 < cut / own < 6

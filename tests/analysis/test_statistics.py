@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from gsbench.analysis.designs import (
+from gsbench.analysis.planning import (
     Components,
     Design,
-    designs_needed,
+    Purpose,
     estimate_components,
-    power,
+    fewest_seeds,
+    make_plan,
+    power_like_these,
     seeds_needed,
 )
 from gsbench.analysis.statistics import (
@@ -114,24 +116,17 @@ def test_scenes_like_these_are_judged_by_the_sign_test():
     means = np.array([-0.044, 0.001, 0.002, 0.003, 0.004, 0.005, 0.006, 0.007])
     found = judge_like_these(means, 1, 0.005)
     assert (found.helped, found.scenes, found.beyond) == (7, 8, 3)
-    expected = scipy.stats.binomtest(7, 8)
-    assert found.p == pytest.approx(expected.pvalue)
-    share = expected.proportion_ci()
-    assert (found.share.low, found.share.high) == pytest.approx((share.low, share.high))
     assert found.outcome == "undecided"
     assert found.needed == 8
-    assert found.power() == pytest.approx(0.9**8)
     assert judge_like_these(np.abs(means), 1, 0.001).outcome == "supported"
     lower, either = (judge_like_these(means, sign, 0.005) for sign in (-1, 0))
     assert (lower.helped, lower.beyond) == (1, 1)
     assert (either.helped, either.beyond) == (7, 3)
     assert judge_like_these(means[:5], 1, 0.005) is None
     nothing = judge_like_these(np.zeros(6), 1, 0.0)
-    assert (nothing.helped, nothing.beyond, nothing.p) == (0, 6, 1.0)
-    none, expected = judge_like_these(-np.ones(6), 1, None), scipy.stats.binomtest(0, 6)
-    assert (none.share.low, none.beyond, none.outcome) == (0.0, None, "refuted")
-    assert none.share.high == pytest.approx(expected.proportion_ci().high)
-    assert none.p == pytest.approx(expected.pvalue)
+    assert (nothing.helped, nothing.beyond) == (0, 6)
+    none = judge_like_these(-np.ones(6), 1, None)
+    assert (none.helped, none.beyond, none.outcome) == (0, None, "refuted")
 
 
 def test_the_interval_of_the_median_is_exact():
@@ -150,13 +145,10 @@ def test_the_interval_of_the_median_is_exact():
 def test_the_statement_agrees_with_the_sign_test_at_every_level():
     rng = np.random.default_rng(1)
     for _ in range(50):
-        found = judge_like_these(
-            rng.normal(0.5, 1, int(rng.integers(6, 14))), 1, None, float(rng.choice([0.05, 0.0125]))
-        )
-        assert (found.outcome != "undecided") == (found.p <= found.level)
-
-
-# --- looks
+        means, level = rng.normal(0.5, 1, int(rng.integers(6, 14))), rng.choice([0.05, 0.0125])
+        found = judge_like_these(means, 1, None, float(level))
+        p = scipy.stats.binomtest(found.helped, len(means)).pvalue
+        assert (found.outcome != "undecided") == (p <= level)
 
 
 # --- false outcomes of simulated checks; scripts/untruths.py has the large table
@@ -220,32 +212,32 @@ def test_power_is_the_share_of_simulated_sweeps_that_see_the_difference(like_ask
         seen = [scipy.stats.binomtest(int(count), design.scenes).pvalue <= 0.05 for count in agree]
     else:
         seen = habits.p_values(values)[1] < 0.05
-    assert power(design, effect, KNOWN, like_asked) == pytest.approx(np.mean(seen), abs=0.03)
+    power = power_like_these if like_asked else Purpose().power
+    assert power(design, effect, KNOWN) == pytest.approx(np.mean(seen), abs=0.03)
 
 
-@pytest.mark.parametrize("like_these", [False, True])
-def test_planned_designs_have_the_fewest_seeds_that_suffice(like_these):
-    designs = designs_needed(0.35, KNOWN, like_these)
+@pytest.mark.parametrize("power, first", [(power_like_these, 6), (Purpose().power, 1)])
+def test_planned_designs_have_the_fewest_seeds_that_suffice(power, first):
+    designs = fewest_seeds(lambda one: power(one, 0.35, KNOWN), range(1, 31))
     for one in designs:
-        assert power(one, 0.35, KNOWN, like_these) >= 0.8
+        assert power(one, 0.35, KNOWN) >= 0.8
         fewer = Design(one.scenes, one.seeds - 1)
-        assert one.seeds == 2 or power(fewer, 0.35, KNOWN, like_these) < 0.8
+        assert one.seeds == 2 or power(fewer, 0.35, KNOWN) < 0.8
     assert all(b.scenes > a.scenes and b.seeds < a.seeds for a, b in itertools.pairwise(designs))
-    assert min(one.scenes for one in designs) >= (6 if like_these else 1)
+    assert min(one.scenes for one in designs) >= first
 
 
 def test_seeds_do_not_replace_scenes():
     """If scenes differ by more than the effect, no number of seeds shows scenes like these."""
     scattered = Components(between=5.0, within=0.1, scenes=4, trials=12)
-    assert designs_needed(0.5, scattered, like_these=True) == []
-    assert designs_needed(0.5, scattered, like_these=False)[0] == Design(1, 3)
+    found = make_plan(scattered, 0.5, Purpose(), 5)
+    assert found.like_these == ()
+    assert found.these[0] == Design(1, 3)
     assert Design(1, 3).trials == 6  # of two arms
 
 
-def test_impossible_plans_are_refused():
+def test_a_plan_for_scenes_like_these_needs_two_scenes():
     one_scene = estimate_components([np.array([0.0, 2.0])])
+    assert make_plan(one_scene, 1.0, Purpose(), 5).like_these is None
     with refusal("two"):
-        designs_needed(1.0, one_scene, like_these=True)
-    for difference in (0.0, float("nan"), float("inf")):
-        with refusal("other than 0"):
-            designs_needed(difference, KNOWN, like_these=False)
+        power_like_these(Design(6, 2), 1.0, one_scene)

@@ -1,14 +1,13 @@
 """From a command line to trials and an exit code, with stand-ins for trials."""
 
 import logging
-from types import SimpleNamespace
 
 import pytest
 from omegaconf import OmegaConf
 
 from gsbench.app import command
 from gsbench.app.command import one_trial_per_scene, summarize
-from gsbench.app.sweep import Ended, check_sweep_settings
+from gsbench.app.sweep import check_sweep_settings
 from gsbench.config.compose import Trial
 from gsbench.errors import GsbenchError, InputError
 from gsbench.launch.outcomes import Outcome
@@ -138,34 +137,6 @@ def test_a_comparison_of_versions_has_a_trial_of_each_scene(tmp_path, monkeypatc
 def test_a_dry_run_explains_a_reference_to_nothing(runs):
     with refusal(r"^hydra\.run\.dir: Interpolation key 'nope' not found"):
         command.compose_trials(["hydra.run.dir=${nope}"])
-
-
-@pytest.mark.parametrize(
-    "words, other, trials, did, code",
-    [
-        (["--dry-run"], "", 2, "dry_run", 0),
-        (["--dry-run"], "optuna", 2, "dry_run", 0),
-        ([], "", 0, "own_path", 0),
-        ([], "", 2, "own_path", 1),
-        ([], "optuna", 2, "run_by_hydra", 1),
-    ],
-)
-def test_only_trials_that_ran_are_summarized(
-    tmp_path, monkeypatch, words, other, trials, did, code
-):
-    ended, done = Ended([trial(tmp_path, seed) for seed in range(trials)]), []
-    job = SimpleNamespace(chdir=False)
-    sweep = SimpleNamespace(
-        other_sweeper=other, config=SimpleNamespace(hydra=SimpleNamespace(job=job))
-    )
-    monkeypatch.setattr(command, "_read", lambda words, multirun: sweep)
-    ends = (("dry_run", 0), ("own_path", ended), ("run_by_hydra", ended if other else None))
-    for name, end in ends:
-        run = lambda asked, *_, did=(name, end): done.append((did[0], asked)) or did[1]  # noqa: E731
-        monkeypatch.setattr(command, name, run)
-    monkeypatch.setattr(command, "summarize", lambda outcomes, trials: int(trials is ended.trials))
-    assert command.launch(words) == code
-    assert done[-1] == (did, sweep)
 
 
 def test_a_dry_run_shows_as_many_log_lines_as_the_run_would(runs, monkeypatch):

@@ -11,15 +11,10 @@ import pytest
 from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
 
-from gsbench.app import command, hydra_app, sweep
-from gsbench.app.hydra_app import (
-    Goal,
-    Job,
-    goal_of,
-    words_for_files,
-    words_for_new_folder,
-    words_without_sweeper,
-)
+from gsbench.app import command, hydra_app, hydra_main, sweep
+from gsbench.app.arm_search import Goal, goal_of
+from gsbench.app.hydra_app import Job, words_without_sweeper
+from gsbench.app.hydra_main import words_for_files, words_for_new_folder
 from gsbench.errors import GsbenchError, InputError
 from gsbench.launch.outcomes import Outcome
 from tests.app.stand_ins import done, trial
@@ -269,7 +264,7 @@ def test_hydra_writes_its_files_if_one_is_asked_for(
 ):
     caplog.set_level(logging.INFO, "gsbench")
     own = copy.deepcopy(OWN_FILES)
-    monkeypatch.setattr(hydra_app, "installed_nodes", lambda words: own)
+    monkeypatch.setattr(hydra_main, "installed_nodes", lambda words: own)
     runtime = {"choices": {"hydra/launcher": "gsbench"}}
     config = OmegaConf.create(
         {"hydra": OWN_FILES | changes | {"runtime": runtime}, "launch": {"name": launch}}

@@ -29,7 +29,7 @@ from tests.trials import ask_about, search_record, write_runs
 MANY = {"scenes": [f"scene{k}" for k in range(9)], "seeds": range(3), "views": 25}
 
 
-UNSIGNED = ("archive.json", "ro-crate-metadata.json")
+UNSIGNED = ("archive.json",)
 
 
 def export(tmp_path, **plan):
@@ -140,33 +140,6 @@ def test_an_archive_has_no_pixels_no_paths_and_no_passwords(tmp_path):
         one.config.get("scene.path") == "garden"
         for one in unpack_archive(tmp_path / "exp.zip", runs / "b").trials
     )
-
-
-def test_an_archive_is_an_ro_crate(tmp_path):
-    """RO-Crate 1.2, sections 2 (packaging), 3 (root data entity) and 4 (data entities)."""
-    file = export(tmp_path)
-    content = members(file)
-    crate = json.loads(content["ro-crate-metadata.json"])
-    by_id = {entity["@id"]: entity for entity in crate["@graph"]}
-    assert len(by_id) == len(crate["@graph"])
-    assert crate["@context"] == "https://w3id.org/ro/crate/1.2/context"
-    descriptor, root = by_id["ro-crate-metadata.json"], by_id["./"]
-    assert descriptor["@type"] == "CreativeWork"
-    assert descriptor["conformsTo"] == {"@id": "https://w3id.org/ro/crate/1.2"}
-    assert descriptor["about"] == {"@id": "./"}
-    assert root["@type"] == "Dataset"
-    assert all(root[key] for key in ("name", "description", "datePublished"))
-    parts = {entity["@id"] for entity in root["hasPart"]}
-    assert parts == {"archive.json"} <= content.keys()
-    assert all(by_id[part]["@type"] == "File" for part in parts)
-
-    def references(value):
-        if isinstance(value, dict):
-            own = {value["@id"]} if value.keys() == {"@id"} else set()
-            return own.union(*map(references, value.values()))
-        return set().union(*map(references, value)) if isinstance(value, list) else set()
-
-    assert references(crate["@graph"]) <= by_id.keys() | {"https://w3id.org/ro/crate/1.2"}
 
 
 def cut(file):

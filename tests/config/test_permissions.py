@@ -20,7 +20,7 @@ from gsbench.config.permissions import permission_advice
 from gsbench.config.trust import ADDRESS_VARIABLES, check_permissions, foreign_address
 from gsbench.errors import InputError
 from gsbench.launch.record import record
-from gsbench.runs.ledger import Ended, Opened, Started, append, begin_ledger
+from gsbench.runs.commands import Idea, Ledger, append, command_now
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.install import conf_dir
 from tests.helpers import read_json, refusal, write
@@ -110,21 +110,15 @@ def _plan(settings):
 
 def _ledger(settings):
     """A stranger's ledger with a kept idea, whose baseline has the settings."""
-    home = Path("runs/x")
-    home.mkdir(parents=True)
-    time, words = "2026-01-01T00:00:00Z", (*_words(settings), "seed=0,1,2,3")
-    opened = {"metric": "psnr", "sign": 1, "least": 0.5, "ideas": 40, "rate": 0.1, "seeds": (0, 1)}
-    keys, own = ({"courtyard": f"courtyard/sfm-adc/{arm}"} for arm in "01")
-    begin_ledger(home, Opened(time=time, words=words, keys=keys, **opened))
-    idea = {"time": time, "idea": "i"}
-    started = {"against": "baseline", "level": 0.1, "identity": "1", "words": words, "keys": own}
-    append(home, lambda book: Started(**idea, **started))
-    append(home, lambda book: Ended(**idea, result="kept", reason="better", seeds=4))
-    return [
-        split("ledger try x densify.split_size=0.02"),
-        split("ledger try x --against i densify.split_size=0.02"),
-        split("ledger confirm x scene=courtyard scene.name=y seed=7,8"),
-    ]
+    home, words = Path("runs/x"), (*_words(settings), "seed=0,1,2,3")
+    opened = {"metric": "psnr", "sign": 1, "least": 0.5, "relative": False, "ideas": 40}
+    book = Ledger(**opened, rate=0.1, seeds=(0, 1))
+    for name, hash_, against in (("baseline", "0", ""), ("i", "1", "baseline")):
+        digests = {"courtyard": f"sfm-adc/{hash_}"}
+        idea = Idea(name=name, identity=hash_, words=words, digests=digests, against=against)
+        line = command_now((), ledger=None if against else book, idea=idea)
+        append(home, lambda history, line=line: line)
+    return [split("ledger try x densify.split_size=0.02")]
 
 
 def _configuration(settings):

@@ -18,10 +18,10 @@ from tests.helpers import refusal
 
 ARMS = "densify=adc,volumetric"
 SWEEPS = {  # words, and how often Hydra composes for them
-    "seeds": ([ARMS, "seed=0,1,2"], 2),
+    "seeds": ([ARMS, "seed=0,1,2"], 3),
     "values": (
         [ARMS, "densify.max_gaussians=1000,2000", "train.iterations=100,1e3", "seed=0,1"],
-        2,
+        3,
     ),
     "texts": (["scene=colmap", "scene.path=/a,/b,'/c d'", "seed=3,4"], 1),
     "values for a name alike": (["scene.views=10,20", "scene.width=40,80"], 1),
@@ -34,10 +34,10 @@ SWEEPS = {  # words, and how often Hydra composes for them
         ["scene=colmap", "scene.path='/${${name}}'", "name=seed,device", "seed=1,2"],
         1,
     ),
-    "added": ([ARMS, "+densify.growth_cap=3,4", "seed=0,1"], 2),
+    "added": ([ARMS, "+densify.growth_cap=3,4", "seed=0,1"], 3),
     "null": (["densify.max_gaussians=null,5", "seed=0,1"], 1),
     "lists": (["eval.at=[],[3]", "train.iterations=10,20"], 1),
-    "a choice after its values": (["densify.max_gaussians=7,8", ARMS], 2),
+    "a choice after its values": (["densify.max_gaussians=7,8", ARMS], 3),
     "quotes": (['name="1"', "train.iterations=8,'9'", "seed=0,1"], 1),
 }
 

@@ -16,10 +16,9 @@ from gsbench.app.command import compose_trials
 from gsbench.config.build import build
 from gsbench.config.command_words import typed_permissions
 from gsbench.config.compose import compose_one
-from gsbench.config.permissions import load_class
-from gsbench.config.programs import SBATCH_RESOURCES, foreign_variables
+from gsbench.config.permissions import SBATCH_RESOURCES, foreign_variables, load_class
 from gsbench.runs.user_code import module_digest
-from gsbench.system.own_modules import allow_modules
+from gsbench.system.programs import allow_modules
 from tests.helpers import refusal, write
 from tests.strange import BOMB, ask, experiment
 from tests.strange import place as place

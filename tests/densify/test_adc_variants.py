@@ -199,11 +199,10 @@ def test_a_round_of_quantile_adc_matches_the_restatement(rate, step):
 
 def test_the_faintest_share_is_pruned_and_an_empty_set_is_accepted():
     densifier, logits = QuantileADC(prune_share=0.1), torch.arange(11.0)
-    assert densifier.faint(logits).tolist() == [True] + [False] * 10
-    densifier.cull = 3.0
-    assert densifier.faint(logits).tolist() == [True] * 3 + [False] * 8
-    assert densifier.faint(logits[:0]).shape == (0,)
-    assert densifier.faint(logits[:1]).tolist() == [False]
+    for cull, faint in ((1.0, 1), (3.0, 3)):
+        assert densifier.faint(logits, cull).tolist() == [True] * faint + [False] * (11 - faint)
+    assert densifier.faint(logits[:0], 1.0).shape == (0,)
+    assert densifier.faint(logits[:1], 1.0).tolist() == [False]
 
 
 def test_a_governed_round_of_quantile_adc_ends_at_its_target():

@@ -11,8 +11,8 @@ from gsbench.densify.scores import blended_sums, by_mean, by_median, draw, draw_
 from gsbench.eval.ssim import ssim_map
 from gsbench.raster.reference import (
     ReferenceRasterizer,
-    bin_gaussians,
     blending_weights,
+    members_of_tiles,
     project,
     tile_rectangles,
 )
@@ -71,9 +71,10 @@ def alphas(gaussians, camera):
     """alpha T of every Gaussian in every pixel, [N, H, W]."""
     found = np.zeros((len(gaussians), HEIGHT, WIDTH))
     projected = project(gaussians, camera)
-    for tile, members in bin_gaussians(projected.depths, *tile_rectangles(projected, camera), 3):
-        for y in range(tile // 3 * 16, min(tile // 3 * 16 + 16, HEIGHT)):
-            for x in range(tile % 3 * 16, min(tile % 3 * 16 + 16, WIDTH)):
+    tiles = members_of_tiles(projected.depths, *tile_rectangles(projected, camera), camera)
+    for members, (rows, columns) in tiles:
+        for y in range(rows.start, rows.stop):
+            for x in range(columns.start, columns.stop):
                 index = projected.index[members]
                 pixel = torch.tensor([[x, y]], dtype=torch.float64)
                 weights = blending_weights(

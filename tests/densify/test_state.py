@@ -138,36 +138,3 @@ def test_normal_draws_on_another_device_are_seeded_by_the_generator(monkeypatch)
     drawn = standard_normal((4, 3), rng, torch.zeros(1, device="meta", dtype=torch.float64))
     assert drawn == ((4, 3), torch.float64, "meta")
     assert seeds == [int(torch.randint(2**62, (1,), generator=again))]
-
-
-def test_an_unknown_class_keyword_is_refused():
-    with pytest.raises(TypeError, match="keyword"):
-
-        class Wrong(Densifier, wrong=1): ...
-
-
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-def test_state_can_be_loaded_from_a_checkpoint_on_a_gpu():
-    """The trainer moves everything in a checkpoint to the GPU, but the lineage stays on the CPU."""
-    cuda = torch.device("cuda")
-    densifier = Gathering()
-    gaussians = trained(random_gaussians(6).map(lambda tensor: tensor.to(cuda)), 1.0)
-    densifier.begin(gaussians.values.detach(), DensifyContext(1.0, device=cuda))
-    refinement = Refinement(7, gaussians, generator(0), RefineEvent(7, 6))
-    densifier.clone(refinement, torch.arange(6, device=cuda) % 2 == 0)
-    saved = densifier.state_dict()
-    moved = {
-        group: {name: tensor.to(cuda) for name, tensor in saved[group].items()} for group in saved
-    }
-    again = Gathering()
-    again.load_state_dict(moved, DensifyContext(1.0, device=cuda))
-    assert again.statistics["sum"].device.type == "cuda"
-    assert all(tensor.device.type == "cpu" for tensor in again.lineage.state_dict().values())
-    again.edit(refinement, keep=torch.arange(9, device=cuda) > 3)
-    assert again.lineage.ids.tolist() == list(range(4, 9))
-    assert again.lineage.state_dict()["ids"].numpy().tolist() == list(range(4, 9))
-    like = gaussians.values.means.detach()
-    assert torch.equal(*[standard_normal((9, 3), generator(5), like) for _ in range(2)])
-    rng = generator(5)
-    assert not torch.equal(standard_normal((9, 3), rng, like), standard_normal((9, 3), rng, like))

@@ -3,9 +3,7 @@
 import csv
 import html
 import json
-import os
 import shutil
-import sys
 from pathlib import Path
 from shlex import split
 
@@ -16,33 +14,25 @@ from PIL import Image
 
 from gsbench.cli import run
 from gsbench.scene.types import ANGLE, DISTANCE
-from tests.end_to_end.conftest import SMALL
+from tests.end_to_end.conftest import FINISHED, SMALL
 from tests.helpers import read_json
-from tests.processes import completed
 
 pytestmark = pytest.mark.slow
 EVAL = ["eval.lpips=[squeeze]", "eval.download=false"]
 SCENE = split("scene.views=12 scene.width=96 scene.height=72")
 
 
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory, environment):
-    """A runs folder with two trials of one arm."""
-    runs = tmp_path_factory.mktemp("trained")
-    words = [*split("-m gsbench.cli -m"), *SMALL, *split("name=small densify=adc seed=0,1")]
-    own = environment | {"GSBENCH_RUNS": str(runs)}
-    completed([sys.executable, *words], cwd=runs, env=own)
+@pytest.fixture
+def runs(runs, monkeypatch, environment):
+    """The folder of the finished experiment, for commands in this process."""
+    monkeypatch.setenv("GSBENCH_RUNS", str(runs))
+    monkeypatch.setenv("TORCH_HOME", environment["TORCH_HOME"])
+    (runs / "mlflow.db").unlink(missing_ok=True)
     return runs
 
 
-@pytest.fixture
-def runs(trained, tmp_path):
-    """A copy of the runs folder that the test may change."""
-    return Path(shutil.copytree(trained, tmp_path / "runs", copy_function=os.link))
-
-
 def trial(runs, arm="random-adc", seed=0):
-    return next(runs.glob(f"small/courtyard/{arm}/*-seed{seed}"))
+    return next(runs.glob(f"{FINISHED}/courtyard/{arm}/*-seed{seed}"))
 
 
 def results(folder):
@@ -66,34 +56,28 @@ def better_renders(runs, folder, seed):
     return folder
 
 
-def test_renders_of_a_trial_are_measured_with_its_metrics_to_the_last_digit(gsbench, runs):
+def test_renders_of_a_trial_are_measured_with_its_metrics_to_the_last_digit(said, runs):
     own = trial(runs)
     for truth, settings in (
         (str(own), []),
-        ("small:courtyard:adc:0", []),
+        (f"{FINISHED}:courtyard:adc:0", []),
         ("courtyard", SCENE + EVAL),
     ):
-        done = gsbench(f"evaluate {own}/renders --truth {truth} --json", *settings)
-        found = json.loads(done.stdout)
+        found = json.loads(said(f"evaluate {own}/renders --truth {truth} --json", *settings))
         assert found["metrics"] == results(own)["metrics"]
         assert found["protocol"] == "paper-1"
         for view, row in views(own).items():
             metrics = {key: value for key, value in row.items() if key not in (ANGLE, DISTANCE)}
             assert {key: repr(value) for key, value in found["views"][view].items()} == metrics
     truth = f"--truth {own}/ground_truth --protocol standard"
-    shown = gsbench(f"evaluate {own}/renders {truth}")
-    assert "protocol standard-1" in shown.stdout
+    assert "protocol standard-1" in said(f"evaluate {own}/renders {truth}")
 
 
-def test_entered_renders_are_in_the_table_and_get_a_verdict(
-    gsbench, runs, tmp_path, monkeypatch, capsys
-):
+def test_entered_renders_are_in_the_table_and_get_a_verdict(said, refused, runs, tmp_path):
     for seed in (0, 1):
         folder = better_renders(runs, tmp_path / f"theirs{seed}", seed)
-        done = gsbench(
-            f"evaluate {folder} --truth courtyard --as small:theirs --seed {seed}",
-        )
-        assert "names matched apart from leading zeros" in done.stdout
+        done = said(f"evaluate {folder} --truth courtyard --as {FINISHED}:theirs --seed {seed}")
+        assert "names matched apart from leading zeros" in done
     entered = trial(runs, "random-theirs", 1)
     found = results(entered)
     assert found["evaluated_from"] == "renders"
@@ -102,26 +86,22 @@ def test_entered_renders_are_in_the_table_and_get_a_verdict(
     picture = np.asarray(Image.open(entered / "renders/0008.png"))
     assert_array_equal(picture, np.asarray(Image.open(tmp_path / "theirs1/render_8.png")))
 
-    table = gsbench("tables small")
-    assert (  # the page of the table has all notes
+    page = html.unescape(said(f"tables {FINISHED} --format html"))  # it has all notes
+    assert (
         "Renders of another program, measured as they are (its conditions are not known): "
-        "random-theirs." in html.unescape(gsbench("tables small --format html").stdout)
+        "random-theirs." in page
     )
-    row = next(line for line in table.stdout.splitlines() if "theirs" in line)
+    row = next(line for line in said(f"tables {FINISHED}").splitlines() if "theirs" in line)
     assert row.count("n/a") == 3  # LPIPS (not asked for), Gaussians, time
     assert "**" not in row  # nobody asked beforehand, so nothing is shown to be best
-    gsbench("report small")
-    text = (runs / "small/report.html").read_text()
+    said(f"report {FINISHED}")
+    text = (runs / f"{FINISHED}/report.html").read_text()
     assert "NOT ASKED" in text
     assert "by a training elsewhere, which left no record" in text
-    monkeypatch.setenv("GSBENCH_RUNS", str(runs))
-    (runs / "mlflow.db").unlink()  # its addresses are those of the folder that was copied
-    for words in ("status small", "explain small:courtyard:psnr:theirs", "sync small"):
-        assert run(words.split()) == 0
-    for words in (["view"], split("export --out x.ply")):
-        capsys.readouterr()
-        assert run([*words, "small:courtyard:theirs"]) == 2
-        assert "renders" in capsys.readouterr().err
+    for verb in ("status {}", "explain {}:courtyard:psnr:theirs", "sync {}"):
+        said(verb.format(FINISHED))
+    for verb in ("view", "export --out x.ply"):
+        assert "renders" in refused(verb, f"{FINISHED}:courtyard:theirs")
 
 
 def test_folders_of_renders_are_compared_without_any_trial(runs, tmp_path, monkeypatch, capsys):
@@ -141,21 +121,17 @@ def test_folders_of_renders_are_compared_without_any_trial(runs, tmp_path, monke
     assert "**" not in table  # nobody asked beforehand, so no best is shown
 
 
-def test_a_model_from_a_ply_is_measured_like_a_trained_one(gsbench, runs, tmp_path):
+def test_a_model_from_a_ply_is_measured_like_a_trained_one(said, runs, tmp_path):
     """With train=none and init=ply, a PLY is only rendered; a trial's own one gives its metrics."""
     model = tmp_path / "theirs.ply"
     shutil.copyfile(trial(runs) / "point_cloud.ply", model)
     scene = [word for word in SMALL if word.startswith(("scene", "eval"))]
-    words = [
-        *scene,
-        *split(f"init=ply init.name=random init.path={model} train=none densify=none name=small"),
-    ]
-    gsbench(*words, "densify.name=model")
+    place = f"init.path={model} name={FINISHED} densify.name=model"
+    said(*scene, *split(f"init=ply init.name=random train=none densify=none {place}"))
     found = results(trial(runs, "random-model"))
     assert found["metrics"] == results(trial(runs))["metrics"]
     assert found["evaluated_from"] == "model"
     assert found["num_gaussians"] == results(trial(runs))["num_gaussians"]
-    table = gsbench("tables small")
-    page = gsbench("tables small --format html").stdout
+    assert "not compared" not in said(f"tables {FINISHED}")
+    page = said(f"tables {FINISHED} --format html")
     assert "A model that another program trained, rendered here" in page
-    assert "not compared" not in table.stdout

@@ -1,5 +1,6 @@
 """Real trainings of versions of a densifier: the gate's exit codes, and the commit of bisect."""
 
+import shutil
 import sys
 from shlex import split
 
@@ -38,10 +39,27 @@ def write_class(folder, step, worse):
     (folder / "mine.py").write_text(CLASS.format(step=step, worse=worse))
 
 
-def test_the_gate_passes_an_equal_version_and_stops_a_worse_one(gsbench, tmp_path):
+@pytest.fixture(scope="module")
+def good(tmp_path_factory, environment):
+    """The archive of the good version, and the runs folder with its trials."""
+    home = tmp_path_factory.mktemp("good")
+    write_class(home, 0, worse=False)
+    own = environment | {"GSBENCH_RUNS": str(home / "runs")}
+    for words in (["-m", *WORDS, "name=good", "seed=0,1,2"], split("export --results good")):
+        command = [sys.executable, "-m", "gsbench.cli", *words]
+        completed(command, cwd=home, env=own)
+    return home
+
+
+@pytest.fixture(autouse=True)
+def place(good, tmp_path):
+    """A folder of the test with the archive and the good version's trials."""
+    shutil.copytree(good / "runs", tmp_path / "runs", symlinks=True)
+    shutil.copy(good / "good.zip", tmp_path)
     write_class(tmp_path, 0, worse=False)
-    gsbench("-m", *WORDS, "name=good", "seed=0,1,2")
-    gsbench("export --results good --out good.zip")
+
+
+def test_the_gate_passes_an_equal_version_and_stops_a_worse_one(gsbench, tmp_path):
     same = gsbench("gate good.zip", *WORDS)
     assert "passed: equal to the last bit in all 2 pairs of trials" in same.stdout
     # in the same runs folder, with trials of another version
@@ -64,9 +82,6 @@ def test_git_bisect_finds_the_commit_with_the_gate_and_skips_what_does_not_impor
         command = ["git", "-c", "user.name=x", "-c", "user.email=x@y", *words]
         return completed(command, code, cwd=tmp_path, env=own).stdout.strip()
 
-    write_class(tmp_path, 0, worse=False)
-    gsbench("-m", *WORDS, "name=good", "seed=0,1,2")
-    gsbench("export --results good --out good.zip")
     (tmp_path / ".gitignore").write_text("runs/\n*.zip\n")
     git("init", "-q", "-b", "main")
     for step in range(1, 6):

@@ -101,8 +101,15 @@ def test_another_launcher_runs_each_trial_as_a_job(gsbench, tmp_path, package, l
     assert all(len(place) == 16 for place in places)
 
 
-@pytest.mark.parametrize("name", [".hydra", ".hydra/multirun.yaml", ".hydra/0/.hydra/config.yaml"])
-@pytest.mark.parametrize("sweeper", ["gsbench", "basic"])
+@pytest.mark.parametrize(
+    "name, sweeper",
+    [
+        (".hydra", "gsbench"),
+        (".hydra/multirun.yaml", "gsbench"),
+        (".hydra/0/.hydra/config.yaml", "gsbench"),
+        (".hydra/0/.hydra/config.yaml", "basic"),
+    ],
+)
 def test_hydra_writes_through_no_link_of_a_strangers_runs_folder(gsbench, tmp_path, name, sweeper):
     precious = tmp_path / "precious"
     precious.mkdir() if name == ".hydra" else precious.write_text("mine")

@@ -8,7 +8,7 @@ from shlex import split
 
 import pytest
 
-from gsbench.runs.ledger import Ended, Started, read_ledger
+from gsbench.claims.ledger import read_ledger
 from tests.end_to_end.conftest import SMALL
 
 pytestmark = pytest.mark.slow
@@ -41,8 +41,9 @@ def test_two_ideas_at_once_share_the_baseline(do, start, tmp_path):
     ends = [process.communicate(timeout=300) for process in both]
     assert {process.returncode for process in both} <= {0, 1, 3}, ends
     ledger = read_ledger(tmp_path / "runs/night")
-    assert len(ledger.started) == len(ledger.ended) == 2
-    assert len({one.seeds for one in ledger.tests.values()}) == len(ledger.tests)
+    assert len(ledger.begun) == 2
+    seeds = {next(iter(one.seeds.values())) for one in ledger.tests.values()}
+    assert len(seeds) == len(ledger.tests)
     baselines = (tmp_path / "runs/night").glob("courtyard/random-adc/*-seed0/results.json")
     assert len(list(baselines)) == 2  # that of the ledger, and that of the second idea
 
@@ -56,14 +57,12 @@ def test_a_killed_try_continues(do, start, tmp_path):
         time.sleep(0.05)
     killed.send_signal(signal.SIGKILL)
     killed.communicate()
-    begun = read_ledger(home)
-    assert not begun.ended
+    (idea,) = read_ledger(home).begun
+    assert not read_ledger(home).is_decided(idea)
     code = do("ledger try night", "densify=volumetric")
     assert code.returncode in (0, 1, 3)
-    entries = read_ledger(home).entries
-    assert entries[: len(begun.entries)] == begun.entries
-    assert sum(isinstance(one, Started) for one in entries) == 1
-    assert sum(isinstance(one, Ended) for one in entries) == 1
+    assert read_ledger(home).begun == [idea]
+    assert read_ledger(home).is_decided(idea)
 
 
 def test_edited_code_is_another_idea_and_broken_code_does_not_count_as_tried(do, tmp_path):

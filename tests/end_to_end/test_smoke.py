@@ -97,10 +97,10 @@ def test_the_same_command_again_computes_nothing(gsbench, runs):
     assert [path.stat().st_mtime_ns for path in sorted(runs.rglob("results.json"))] == written
 
 
-def test_tables_and_report(gsbench, runs):
-    table = gsbench("tables", FINISHED)
-    assert re.search(r"\| courtyard \| random \| volumetric \|.* ± ", table.stdout)
-    gsbench("report", FINISHED)
+def test_tables_and_report(said, runs, monkeypatch):
+    monkeypatch.setenv("GSBENCH_RUNS", str(runs))
+    assert re.search(r"\| courtyard \| random \| volumetric \|.* ± ", said("tables", FINISHED))
+    said("report", FINISHED)
     page = (runs / f"{FINISHED}/report.html").read_text()
     assert page.count("<svg") >= 1
     assert "data:image/" in page
@@ -191,22 +191,6 @@ def test_questions_of_a_file_and_their_archive(gsbench, runs, tmp_path):
     sentence = re.search(r"<p>(random-none against random-adc: [^<]+)", page)[1]
     assert sentence in again.read_text()
     assert not (tmp_path / "elsewhere").exists()
-
-
-@pytest.mark.parametrize(
-    "word, hint",
-    [
-        ("densify=volumetrik", "volumetric"),
-        ("densify.grad_threshold=1", "gradient_threshold"),
-        ("tabels", "tables"),
-    ],
-)
-def test_a_misspelt_word_is_one_line_with_the_right_one(gsbench, tmp_path, word, hint):
-    (line,) = gsbench(word, code=2).stderr.strip().splitlines()
-    assert line.startswith("gsbench:")
-    assert word.split("=")[-1] in line or word.split("=")[0] in line
-    assert hint in line
-    assert not list(tmp_path.rglob("results.json"))
 
 
 def test_a_mirror_in_mlflow(gsbench, runs):

@@ -14,6 +14,7 @@ from gsbench.cli import run
 from gsbench.init import Sfm
 from gsbench.init.base import MODEL_FOLDER
 from gsbench.pipeline.steps.scene import CaptureSource
+from gsbench.runs.store import Store
 from gsbench.scene.courtyard.render import render_courtyard
 from gsbench.scene.load import load_scene
 from gsbench.scene.options import SceneConfig
@@ -99,7 +100,7 @@ def test_a_training_from_transforms_json_equals_that_from_colmap(scene, tmp_path
 
 
 def _scene(capture, cache):
-    return load_scene(capture, capture.model, cache, max_size=300)
+    return load_scene(capture, capture.model, Store(cache), max_size=300)
 
 
 def test_distorted_photographs_give_the_same_scene(shared, tmp_path):

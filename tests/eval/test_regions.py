@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-import torch
-from numpy.testing import assert_allclose, assert_array_equal
 
 from gsbench.eval.evaluator import Evaluator, summarize
 from gsbench.eval.facts import find_metric

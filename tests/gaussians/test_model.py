@@ -25,7 +25,7 @@ from tests.gaussians.helpers import random_gaussians
         ("gaussians", "scale", "sh_rest, scales, opacities, rotations; did you mean scales?"),
         ("training", "means", "has no 'means'; it has values.means, values.log_scales, "),
         ("training", "opacity", "values.rotations; did you mean values.opacities?"),
-        ("refinement", "gaussian", "has step, gaussians, rng, event; did you mean gaussians?"),
+        ("refinement", "gaussian", "event, strictness, cull; did you mean gaussians?"),
         ("context", "views_", "extent, white_background, device, views, training_views"),
         ("render", "depths", "RenderOutput has no 'depths'; it has image, alpha, radii, screen_p"),
     ],

@@ -9,17 +9,21 @@ import numpy as np
 import pytest
 import torch
 from numpy.testing import assert_array_equal
-from PIL import Image
 from torch.testing import assert_close
 
 from gsbench.init import MODEL_FOLDER, Dim, read_cloud
-from gsbench.init.networks import matchers
-from gsbench.init.networks.extractors import EXTRACTORS, SUPERPOINT_BORDER, extract_features
+from gsbench.init.networks import models
 from gsbench.init.networks.features import Features, FeatureStore
-from gsbench.init.networks.matchers import build_matcher, match, mutual_nearest_matcher
+from gsbench.init.networks.models import (
+    EXTRACTORS,
+    SUPERPOINT_BORDER,
+    build_matcher,
+    extract_features,
+    match,
+    mutual_nearest_matcher,
+)
 from gsbench.weights import MissingWeightsError, load_state
 from tests.helpers import refusal
-from tests.init.models import digest
 from tests.scene.courtyard.surfaces import surface_distance
 
 CPU = torch.device("cpu")
@@ -89,23 +93,6 @@ def test_lightglue_matches_enough_points(few, untrained_weights, tmp_path, caplo
 
 
 # ---- an interrupted run continues, and entries of other settings are not read
-
-
-@pytest.mark.slow
-def test_only_missing_or_damaged_files_are_computed_again(few, untrained_weights, tmp_path):
-    init, output = superpoint(untrained_weights, matcher="mutual_nearest"), tmp_path
-    init.run(few, output / "out", work_dir=output / "work")
-    features, matches = (
-        sorted((output / "work" / kind).iterdir()) for kind in ("features", "matches")
-    )
-    assert (len(features), len(matches)) == (4, 6)
-    features[0].unlink()
-    features[1].write_bytes(b"half a file")
-    matches[5].unlink()
-    times = {path: path.stat().st_mtime_ns for path in features[2:] + matches[:5]}
-    init.run(few, output / "again", work_dir=output / "work")
-    assert {path: path.stat().st_mtime_ns for path in times} == times
-    assert digest(output / "again" / MODEL_FOLDER) == digest(output / "out" / MODEL_FOLDER)
 
 
 def test_other_settings_or_images_have_other_file_names(courtyard, tmp_path):
@@ -181,13 +168,13 @@ def test_lightglue_reads_the_published_names(untrained_weights, tmp_path, monkey
         published[name] = value
     published.pop("confidence_thresholds")
     torch.save(published, tmp_path / "published.pth")
-    networks, load_into = [], matchers.load_into
+    networks, load_into = [], models.load_into
 
     def note(network, *rest):
         networks.append(network)
         load_into(network, *rest)
 
-    monkeypatch.setattr(matchers, "load_into", note)
+    monkeypatch.setattr(models, "load_into", note)
     matcher_of(tmp_path / "published.pth")
     loaded = networks[0].state_dict()
     assert all(torch.equal(loaded[name], value) for name, value in state.items())
@@ -284,28 +271,6 @@ def test_weights_of_another_network_or_shape_are_refused(untrained_weights, tmp_
             build(file)
 
 
-@pytest.mark.slow
-def test_images_without_keypoints_are_left_out_with_a_warning(few, untrained_weights, tmp_path):
-    """A blank photograph is named in a warning; if all are blank, it is an error."""
-    images = tmp_path / "images"
-    images.mkdir()
-    for name in few.image_names:
-        shutil.copy(few.images / name, images)
-    Image.new("RGB", (320, 240)).save(images / few.image_names[3])
-    capture = replace(few, images=images)
-    # Without biases, a black picture gives each of the 65 classes of a cell the score 1/65.
-    above_blank = {"keypoint_threshold": 0.016, "max_keypoints": 1000}
-    init = superpoint(untrained_weights, matcher="mutual_nearest", **above_blank)
-    report = init.run(capture, tmp_path / "out")
-    assert report.counts["images_without_keypoints"] == 1
-    assert any(f"no keypoint in {few.image_names[3]}" in warning for warning in report.warnings)
-    assert report.num_points > 50
-    for name in few.image_names:
-        Image.new("RGB", (320, 240)).save(images / name)
-    with refusal("no keypoint in any image"):
-        init.run(capture, tmp_path / "blank")
-
-
 def test_too_little_gpu_memory_for_matching_is_reported():
     features = features_of(np.zeros((1000, 8)))
     with refusal(r"1000 keypoints ran out of memory: lower init.max_image_size"):
@@ -323,22 +288,9 @@ def test_an_empty_image_has_no_matches():
     assert match(mutual_nearest_matcher(0.9, CPU), some, some[:0]).shape == (0, 2)
 
 
-@pytest.mark.parametrize(
-    "options, message",
-    [
-        (
-            {"extractor": "sift"},
-            "init.extractor must be 'superpoint', 'aliked' or 'disk', got 'sift'",
-        ),
-        ({"matcher": "superglue"}, "init.matcher must be .* got 'superglue'"),
-        ({"extractor": "aliked", "aliked_model": "t16"}, "init.matcher=lightglue has no weights"),
-        ({"filter_threshold": -1}, r"init.filter_threshold must be a number in \[0, 1\], got -1"),
-        ({"max_keypoints": 0}, "init.max_keypoints must be a whole number above 0, got 0"),
-    ],
-)
-def test_settings_are_checked_by_name(options, message):
-    with refusal(message):
-        Dim(**options)
+def test_lightglue_has_no_weights_for_the_small_aliked():
+    with refusal("init.matcher=lightglue has no weights"):
+        Dim(extractor="aliked", aliked_model="t16")
 
 
 def test_an_unknown_device_is_refused(courtyard, untrained_weights, tmp_path):

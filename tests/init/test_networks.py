@@ -87,6 +87,13 @@ def test_each_image_and_pair_is_computed_once(networks, job):
     again = run(job)
     assert networks.made == ["extractor", "matcher"]  # no network is loaded again
     assert (again.counts, len(networks.extracted), len(networks.matched)) == (found.counts, 3, 3)
+    store = open_store(job)  # what is gone or damaged is computed again, and nothing else
+    store.features_path("a.png").unlink()
+    store.features_path("b.png").write_bytes(b"half a file")
+    store.matches_path("b.png", "c.png").unlink()
+    run(job)
+    assert networks.extracted[3:] == ["a.png", "b.png"]
+    assert networks.matched[3:] == [(3, 4)]
 
 
 def test_images_without_keypoints_and_pairs_without_matches_are_counted(networks, job):

@@ -169,10 +169,3 @@ def test_centre_errors_are_in_reference_units_and_relative_to_the_extent():
     assert found.center_mean == pytest.approx(0.3 / 4)
     assert found.center_rmse == pytest.approx(0.3 / 2)
     assert found.center_rmse_relative == pytest.approx(0.3 / 4)
-
-
-def assert_axes(axes, up):
-    """Check the axes of a view from above: at right angles, right-handed, and the last is ``up``."""
-    assert_allclose(axes[2], up, atol=1e-9)
-    assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(axes) == pytest.approx(1.0)

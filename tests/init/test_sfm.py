@@ -186,21 +186,3 @@ def test_photos_that_cannot_be_matched_are_refused(tmp_path, pixels, said):
 def test_two_photos_are_refused(courtyard, tmp_path):
     with refusal("has 2 images: sfm needs at least 3"):
         Sfm().run(replace(courtyard, image_names=courtyard.image_names[:2]), tmp_path)
-
-
-@pytest.mark.parametrize(
-    "options, message",
-    [
-        ({"poses": "both"}, "init.poses must be 'shared' or 'own', got 'both'"),
-        ({"camera_model": "THIN_PRISM"}, "init.camera_model must be 'SIMPLE_PINHOLE', .*, got 'TH"),
-        ({"pairs": "all"}, "init.pairs must be .* got 'all'"),
-        ({"max_ratio": 1.5}, r"init.max_ratio must be a number in \(0, 1\], got 1.5"),
-        ({"max_image_size": 0}, "init.max_image_size must be a whole number of at least 32, got 0"),
-        ({"threads": 0}, r"init.threads must be a whole number in \[1, 4096\] or 'auto', got 0"),
-        ({"seed": 0.5}, "init.seed must be a whole number in .*, got 0.5"),
-        ({"focal_length": float("nan")}, "init.focal_length must be a number above 0 or null, got"),
-    ],
-)
-def test_settings_are_checked_by_name(options, message):
-    with refusal(message):
-        Sfm(**options)

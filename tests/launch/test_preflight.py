@@ -8,7 +8,6 @@ import pytest
 from gsbench.launch import batch, dry_run
 from gsbench.launch.batch import (
     begin_for_another_launcher,
-    borrowed_names,
     check_trackers,
     missing_folders,
     missing_weights,
@@ -20,30 +19,6 @@ from gsbench.runs.commands import read_history
 from tests.helpers import refusal
 from tests.launch.test_jobs import SLURM, Mirrored
 from tests.trials import LOCAL, bare_trial, write_results
-
-
-@pytest.mark.parametrize(
-    "group, name, target, said",
-    [
-        ("densify", "adc", "mine.Patient", ["densify.name=patient"]),
-        # the name of another class of gsbench
-        ("densify", "volumetric", "mine.Patient", ["densify.name=patient"]),
-        ("densify", "mine", "mine.Patient", []),
-        ("init", "random", "mine.Shell", ["init.name=shell"]),
-        # another class of gsbench
-        ("densify", "adc", "gsbench.densify.AbsGS", []),
-        ("densify", "adc", None, []),
-    ],
-)
-def test_a_users_class_under_a_name_of_gsbench_gets_a_warning(group, name, target, said):
-    values = {"init": {"name": "sfm"}, "densify": {"name": "adc"}}
-    values[group] = {"name": name, "_target_": target}
-    trials = [SimpleNamespace(values=values)] * 2
-    lines = borrowed_names(trials)
-    assert len(lines) == len(said)
-    for line, word in zip(lines, said, strict=True):
-        assert line.startswith(f"{target} is shown as {name}, ")
-        assert line.endswith(word)
 
 
 def trial(runs, seed=0, launch=None, **settings):

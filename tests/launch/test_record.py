@@ -8,7 +8,14 @@ import pytest
 
 from gsbench.app.command import compose_trials
 from gsbench.launch.record import asked_metrics, check_looks, planned_rows, record, remove
-from gsbench.runs.commands import digest_of, read_history, remember_result
+from gsbench.runs.commands import (
+    Ledger,
+    append,
+    command_now,
+    digest_of,
+    read_history,
+    remember_result,
+)
 from gsbench.runs.experiments import Arm
 from tests.end_to_end.conftest import SMALL
 from tests.helpers import refusal
@@ -96,10 +103,13 @@ def test_a_repeated_question_becomes_the_newest_again(tmp_path):
 def test_searches_ledgers_and_verbs_with_rules_of_their_own_ask_nothing(tmp_path):
     assert record(sweep(tmp_path, 0, 1), asks=False) == []
     assert len(history(tmp_path).planned) == 4
-    for name in ("tuning.json", "ledger.jsonl"):
-        (tmp_path / "exp" / name).touch()
-        assert record(sweep(tmp_path, 2, 3)) == []
-        (tmp_path / "exp" / name).unlink()
+    (tmp_path / "exp/tuning.json").touch()
+    assert record(sweep(tmp_path, 2, 3)) == []
+    (tmp_path / "exp/tuning.json").unlink()
+    opened = {"metric": "psnr", "sign": 1, "least": 0.5, "relative": False, "ideas": 40}
+    ledger = Ledger(**opened, rate=0.1, seeds=(0, 1))
+    append(tmp_path / "exp", lambda history: command_now(ledger=ledger))
+    assert record(sweep(tmp_path, 4, 5)) == []
 
 
 def test_a_trial_that_is_read_from_its_own_record_is_no_command(tmp_path):

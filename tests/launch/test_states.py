@@ -10,7 +10,7 @@ import pytest
 
 from gsbench.config.compose import Trial
 from gsbench.launch import states
-from gsbench.launch.dry_run import FinishedTrials, _determining, describe_plan
+from gsbench.launch.dry_run import FinishedTrials, describe_plan
 from gsbench.launch.record import record, remove
 from gsbench.launch.states import (
     QueuedJob,
@@ -228,12 +228,3 @@ def test_an_estimate_is_of_the_same_scene_and_rasterizer_and_if_possible_densifi
     assert estimate(trained("none").values) == (pytest.approx(200), 2)
     for other in ({"raster": {"name": "reference"}}, {"scene": {"name": "a_scene", "width": 99}}):
         assert estimate(trained("adc", **other).values) == (0.0, 0)
-
-
-def test_a_dry_run_compares_settings_and_the_users_code():
-    values = {"name": "x", "densify": {"_target_": "mine.Mine", "decay": 0.9}}
-    assert _determining(values, {"mine": "1" * 64}) == {
-        "densify._target_": "mine.Mine",
-        "densify.decay": 0.9,
-        "code of mine": "11111111",
-    }

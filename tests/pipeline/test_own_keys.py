@@ -7,11 +7,10 @@ import pytest
 from gsbench.config.compose import compose_one
 from gsbench.pipeline import trial as pipeline_trial
 from gsbench.pipeline.parts import Parts
-from gsbench.pipeline.steps.scene import view_versions
 from gsbench.pipeline.trial import TrialSteps
 from gsbench.runs.config_hash import config_hash
 from gsbench.runs.store import Store
-from gsbench.system.own_modules import allowed_modules
+from gsbench.system.programs import allowed_modules
 from tests.pipeline.test_keys import WORDS, BareSource
 
 MODULES = ("mine", "variant")
@@ -120,14 +119,3 @@ def test_options_of_a_users_class_are_in_the_key_whatever_their_names(home):
         "config",
         "evaluate",
     }
-
-
-def test_the_cache_of_prepared_photographs_depends_on_the_code(monkeypatch):
-    monkeypatch.setattr(
-        "gsbench.pipeline.steps.scene.edited", lambda packages: dict.fromkeys(packages, "edited")
-    )
-    view_versions.cache_clear()
-    found = view_versions()
-    view_versions.cache_clear()
-    assert found["scene"] == "edited"
-    assert {"pycolmap", "pillow"} <= found.keys()

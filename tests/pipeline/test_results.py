@@ -9,7 +9,8 @@ import pytest
 
 from gsbench.config.compose import compose_one
 from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER, REPORT_FILE
-from gsbench.pipeline.trial import cloud_hash, results_of, source_files, versions
+from gsbench.pipeline.results import cloud_hash, results_of, versions
+from gsbench.pipeline.trial import source_files
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.runs.keys import EVALUATE, INIT, STAGES, TRAIN, Step
 from gsbench.runs.nested import sha256_of

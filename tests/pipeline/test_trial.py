@@ -13,6 +13,7 @@ from gsbench.errors import TrainingError
 from gsbench.pipeline.parts import Parts, build_own_rasterizer
 from gsbench.pipeline.trial import _recorded_failures, run_trial
 from gsbench.runs import layout
+from gsbench.runs.keys import VIEWS
 from gsbench.runs.trial_folder import TrialFolder
 from tests.helpers import read_json, refusal
 
@@ -205,7 +206,7 @@ def test_nothing_is_written_through_a_link_in_the_runs_folder(tmp_path, place):
         "scene": own.path.parents[1],
         "trial": own.path,
         "log.txt": own.path / "log.txt",
-        "store/views": own.runs / layout.STORE / layout.VIEWS,
+        "store/views": own.runs / layout.STORE / VIEWS.name,
     }[place]
     link.parent.mkdir(parents=True)
     link.symlink_to(outside / "private" if place == "log.txt" else outside)

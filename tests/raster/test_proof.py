@@ -103,16 +103,6 @@ def test_a_fault_of_the_loss_is_a_failure():
     assert image.endswith(" at training step 10")
 
 
-def test_the_compared_training_follows_the_schedule_of_learning_rates(monkeypatch):
-    steps = []
-    monkeypatch.setattr(
-        module.TrainableGaussians, "set_step", lambda self, step: steps.append(step)
-    )
-    target = torch.zeros(TINY.height, TINY.width, 3, dtype=torch.float64)
-    module._train(ReferenceRasterizer(), TINY, target, torch_photometric_loss)
-    assert steps == [*range(1, 11)]
-
-
 def test_values_that_are_not_finite_fail_and_are_not_kept_as_errors():
     class Missing(CpuRasterizer):
         def render(self, *arguments, **options):
@@ -243,12 +233,6 @@ def test_a_device_without_memory_for_a_proof_is_named(monkeypatch):
     with refusal("device=cuda:1 has no memory left to prove raster=triton"):
         module.prove_apart("triton", "cuda:1")
     assert asked == [(module._prove_by_name, "triton", "cuda:1", "the proof of raster=triton")]
-
-
-def test_a_proof_by_name_is_that_of_its_rasterizer(monkeypatch):
-    monkeypatch.setattr(module, "prove", lambda *arguments: arguments)
-    rasterizer, device = module._prove_by_name("reference", "cpu")
-    assert (rasterizer.name, device) == ("reference", CPU)
 
 
 def test_only_one_process_makes_a_proof_at_a_time(cache, monkeypatch):

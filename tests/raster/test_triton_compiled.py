@@ -10,16 +10,12 @@ from torch.utils._pytree import tree_leaves
 
 pytest.importorskip("triton")
 
-from triton.runtime.jit import JITFunction
 
 from gsbench.gaussians.trainable import ParameterState, Update
-from gsbench.raster.contract import Case, render_with_gradients
+from gsbench.raster.contract import Case
 from gsbench.raster.triton import composite, executor, lists
 from gsbench.raster.triton.executor import TritonRasterizer
-from gsbench.raster.triton.launch import launch_grid, only_compiled
-from gsbench.train import proof
 from gsbench.train.adam_triton import TritonAdam
-from gsbench.train.compile_ahead import compile_ahead
 from gsbench.train.loss_triton import (
     MULTIPROCESSORS,
     PROGRAMS_HELD,
@@ -131,30 +127,6 @@ def test_kernels_compile_without_spills(launches, target, monkeypatch):
     assert len({name for name, _ in compiled}) == 14
     # Adam has three variants for each width of a parameter
     assert len(compiled) == (24 if target == 90 else 17) + 12
-
-
-def test_the_kernels_of_a_proof_are_compiled_ahead(launches):
-    """Those of all degrees and variants; what is left to compile takes a tenth of a second each."""
-    compile_ahead(TritonRasterizer(), torch.device("cpu"))
-    ahead = {(launch.name, specialization(launch)) for launch in launches}
-    assert all(launch.named["enable_fp_fusion"] for launch in launches)
-    launches.clear()
-    for scene in proof.SCENES:
-        render_with_gradients(TritonRasterizer(), scene, torch.float32)[0].footprint()
-        step(scene)
-    adam_step(CASE)
-    needed = {(launch.name, specialization(launch)) for launch in launches}
-    assert {name for name, _ in needed - ahead} <= {"adam_step", "sum_cover"}
-
-
-def test_launches_ahead_only_compile(monkeypatch):
-    """No CUDA driver is needed, since the kernels do not run."""
-    calls = []
-    monkeypatch.setattr(JITFunction, "run", lambda *_, warmup, **__: calls.append(warmup))
-    with only_compiled():
-        launch_grid(lists.summarise, 1)(count=0)
-    launch_grid(lists.summarise, 1)(count=0)
-    assert calls == [True, False]
 
 
 def test_no_kernel_is_compiled_again_for_other_sizes(launches):

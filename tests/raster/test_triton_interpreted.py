@@ -435,7 +435,7 @@ class FixedViews:
             trainer.rasterizer, TritonLoss(options.ssim_weight), BLACK, False, visible_only
         )
         if direct:
-            trainer.direct = self.direct
+            trainer.fast = self.direct
 
     def iterate(self, steps):
         for _ in range(steps):
@@ -479,7 +479,7 @@ def test_the_footprint_of_a_direct_step_is_that_of_its_own_view():
     model, cameras = steps.trainer.gaussians, [view.camera for view in steps.trainer.scene.train]
     target = torch.zeros(17, 20, 3, dtype=torch.uint8)
     for camera in cameras:
-        render = steps.direct.step(model, camera, target, 1, False, None).render
+        render, _ = steps.direct.step(model, camera, target, 1, False, None)
         found = render.require_footprint()
         expected = TritonRasterizer().render(model.values, camera, 1, BLACK).require_footprint()
         for own, theirs in zip(vars(found).values(), vars(expected).values(), strict=True):

@@ -15,12 +15,12 @@ from gsbench.analysis.comparison import compare
 from gsbench.analysis.results import load_experiment
 from gsbench.cli import run
 from gsbench.config.compose import compose_one
-from gsbench.eval.matching import Matching
 from gsbench.renders import truth as truths
 from gsbench.renders.imported import Destination, Measured, check_destination, find_destination
 from gsbench.renders.measure import _lines
 from gsbench.renders.truth import ReferenceImages, find_reference_images
 from gsbench.runs.keys import STAGES
+from gsbench.scene.names import Matching
 from tests.helpers import read_json, refusal, write
 from tests.trials import write_runs
 
@@ -211,14 +211,16 @@ def test_photographs_of_a_scene_are_its_test_views_at_the_size_of_a_trial(
         "compose_one": compose,
         "Parts": lambda config: config,
         "Store": lambda root: SimpleNamespace(get=get),
-        "TrialSteps": lambda config, store: trial,
+        "TrialSteps": lambda config, store: SimpleNamespace(
+            **vars(trial), parts=SimpleNamespace(values=config), store=store
+        ),
     }.items():
         monkeypatch.setattr(truths, name, stand_in)
     place = tmp_path / "ground_truth"
     write(place / "masks" / "a.png", b"")
     truth = find_reference_images("garden", [word], tmp_path)
     asked = ["scene=garden", word]
-    assert composed == [asked, [asked[0], "init=random", "init.count=100", word]][:times]
+    assert composed == [asked, ["init=random", "init.count=100", *asked]][:times]
     assert built == [tmp_path / name for name in ("scene", "init", "ground_truth")]
     assert truth.photographs == {"b.JPG": place / "b.png", "a.png": place / "a.png"}
     assert (truth.what, truth.scene, truth.init) == ("the test views of garden", "garden", None)

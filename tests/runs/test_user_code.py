@@ -17,7 +17,7 @@ from gsbench.runs.user_code import (
     unnamed_modules,
     user_modules,
 )
-from gsbench.system.own_modules import allow_modules, allowed_modules
+from gsbench.system.programs import allow_modules, allowed_modules
 from tests.helpers import write
 
 NAMES = ("own_code", "helper", "pack", "late")

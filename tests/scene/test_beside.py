@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
 from gsbench.normalization import Normalization
+from gsbench.runs.store import Store
 from gsbench.scene.beside import files_beside, pixels_of_view, read_beside
 from gsbench.scene.load import load_scene
 from gsbench.scene.types import CameraModel, to_pinhole
@@ -69,7 +70,9 @@ def test_pixels_of_a_view_are_the_nearest_of_the_picture():
     chosen = pixels_of_view(picture, lens, view)
     for row in range(15):
         for column in range(20):
-            assert chosen[row, column] == picture[(2 * row + 1) * 6 // 30, (2 * column + 1) * 8 // 40]
+            assert (
+                chosen[row, column] == picture[(2 * row + 1) * 6 // 30, (2 * column + 1) * 8 // 40]
+            )
 
 
 def test_pixels_of_an_undistorted_view_follow_the_lens():
@@ -107,13 +110,13 @@ def test_views_have_depth_in_the_units_of_the_training(scene_folder, tmp_path):
         normalization=Normalization(scale=2.0),
     )
     kinds = ["depth", "normals"]
-    scene = load_scene(capture, capture.model, tmp_path / "cache", max_size=32, beside=kinds)
+    scene = load_scene(capture, capture.model, Store(tmp_path / "cache"), max_size=32, beside=kinds)
     views = {view.name: view for view in (*scene.train, *scene.test)}
     size = views[first].image.shape[:2]
     assert_allclose(views[first].beside["depth"], np.full(size, 6.0))
     assert_allclose(views[second].beside["depth"], np.full(size, 10.0))
     assert views[first].beside["normals"].shape == (*size, 3)
     assert "normals" not in views[second].beside
-    plain = load_scene(capture, capture.model, tmp_path / "cache", max_size=32)
+    plain = load_scene(capture, capture.model, Store(tmp_path / "cache"), max_size=32)
     assert not any(view.beside for view in plain.train)
     assert_array_equal(plain.train[0].image, scene.train[0].image)

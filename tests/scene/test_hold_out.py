@@ -159,34 +159,6 @@ def test_too_many_sectors_are_refused():
 
 
 @pytest.mark.parametrize(
-    "name, least, most",
-    [
-        ("max_images", 3, 10**6),
-        ("test_every", 2, 999),
-        ("sectors", 2, 999),
-        ("sector", 0, 7),
-        ("downscale", 1, 99),
-        ("max_size", 16, 10**6),
-        ("views", 3, 9999),
-        ("width", 16, 16384),
-        ("height", 16, 16384),
-        ("seed", 0, 2**31 - 1),
-    ],
-)
-def test_a_setting_has_limits(name, least, most):
-    def config(value):
-        of_courtyard = name in ("views", "width", "height", "seed")
-        kind, path = ("courtyard", None) if of_courtyard else ("colmap", "/a")
-        split = "sector" if name in ("sector", "sectors") else "every_nth"
-        return SceneConfig(name="a", kind=kind, path=path, split=split, **{name: value})
-
-    assert [getattr(config(value), name) for value in (least, most)] == [least, most]
-    for value in (least - 1, *([most + 1] if most in (7, 9999, 16384, 2**31 - 1) else [])):
-        with refusal(rf"scene\.{name}"):
-            config(value)
-
-
-@pytest.mark.parametrize(
     "kind, changes",
     [
         ("transforms", {"sparse": "sparse/0"}),

@@ -9,11 +9,13 @@ from PIL import Image
 
 from gsbench.config.compose import compose_one
 from gsbench.runs.config_hash import arm_hash, config_hash
+from gsbench.runs.store import Store
 from gsbench.scene import rules
 from gsbench.scene.load import load_scene
 from gsbench.scene.options import SceneConfig
 from gsbench.scene.rules import BY_ID, RULES, Finding, Rule, check_accept, inspect
 from gsbench.scene.types import Camera, Scene, Twins, View
+from gsbench.verbs.machine import doctor
 from tests.helpers import refusal
 from tests.scene.captures import read_colmap, read_photos
 
@@ -194,7 +196,7 @@ def test_a_rule_is_silent_up_to_its_limit_and_names_what_is_beyond(name):
 
 
 RULE = Rule(
-    "odd", "read", lambda raw: raw, (0, 1), (0, 2), "{value:g} of {names:few}", "take {low}"
+    "odd", "read", lambda raw: raw, (0, 1), "{value:g} of {names:few}", "take {low}", (0, 2)
 )
 
 
@@ -253,12 +255,12 @@ def test_prepared_views_of_an_accepted_lens_are_judged_again(make_scene, tmp_pat
     plain, accepting = (
         read_colmap("toy", root, accept=accept) for accept in ([], ["lens-turns-back"])
     )
-    scene = load_scene(accepting, accepting.model, tmp_path / "cache")
-    again = load_scene(accepting, accepting.model, tmp_path / "cache")
+    scene = load_scene(accepting, accepting.model, Store(tmp_path / "cache"))
+    again = load_scene(accepting, accepting.model, Store(tmp_path / "cache"))
     assert [odd.refused for odd in again.oddities if odd.rule == "lens-turns-back"] == [True]
     assert again.oddities == scene.oddities
     with refusal("turns back inside the picture"):
-        load_scene(plain, plain.model, tmp_path / "cache")
+        load_scene(plain, plain.model, Store(tmp_path / "cache"))
 
 
 def test_what_is_accepted_changes_no_hash_of_a_trial():
@@ -268,6 +270,23 @@ def test_what_is_accepted_changes_no_hash_of_a_trial():
     )
     assert config_hash(plain) == config_hash(accepting)
     assert arm_hash(plain) == arm_hash(accepting)
+
+
+@pytest.mark.parametrize("kind, odd", [("photos", "copies"), ("colmap", "copies, near-twins")])
+def test_doctor_names_the_rules_that_say_something_of_a_scene(
+    kind, odd, make_scene, tmp_path, capsys, caplog
+):
+    """Near twins are seen in views, which need cameras."""
+    root = make_scene()
+    first, second, third = sorted((root / "images").iterdir())[:3]
+    second.write_bytes(first.read_bytes())
+    with Image.open(first) as picture:
+        Image.fromarray(np.asarray(picture) // 2).save(third)
+    words = [f"scene={kind}", f"scene.path={root}", f"runs={tmp_path / 'runs'}"]
+    assert doctor(words, tmp_path) == 0
+    said = "5 photographs, 1 for testing (every 8th image)"
+    assert capsys.readouterr().out == f"note  scene        {said}; odd: {odd}\n"
+    assert "1 photograph left out, with the name or content of another" in caplog.text
 
 
 def test_only_known_rules_that_may_be_broken_can_be_accepted():

@@ -14,8 +14,7 @@ from gsbench.pipeline.steps.scene import CaptureSource, masked_capture, masking_
 from gsbench.scene import transforms
 from gsbench.scene.colmap import read_model, read_reference
 from gsbench.scene.options import SceneConfig
-from gsbench.scene.transforms import read_transforms
-from gsbench.scene.transforms_keys import HARMLESS, REFUSED
+from gsbench.scene.transforms import HARMLESS, REFUSED, read_transforms
 from tests.helpers import change_json, read_json, refusal
 from tests.scene.cameras import cameras_of
 from tests.scene.captures import read_with_step

@@ -188,7 +188,7 @@ def test_status_and_retry_manage_a_sweep_that_was_left_to_slurm(place, environme
     assert f"Slurm job {array}_1, pending (" in listing.stdout
     assert "nothing to retry" in gsbench(place, environment, "retry", "cluster").stdout
     assert (
-        "2 trials: 1 running, 1 queued" in gsbench(place, environment, *sweep, "--dry-run").stdout
+        "2 trials: 1 queued, 1 running" in gsbench(place, environment, *sweep, "--dry-run").stdout
     )
 
     second = gsbench(place, environment, *sweep, pause=2 * PAUSE)

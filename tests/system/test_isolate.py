@@ -207,43 +207,6 @@ def test_a_fresh_interpreter_gets_this_search_path(monkeypatch):
     assert command[4:] == ['[["a"], {"mine": "/there"}]', "1", "2"]
 
 
-def test_descendants_are_killed_until_none_is_left(monkeypatch):
-    did = []
-    rounds = iter([["runs", "zombie", "gone"], ["runs"], ["zombie"]])
-
-    class Process:
-        def __init__(self, state=""):
-            self.state = state
-
-        def children(self, recursive):
-            assert recursive
-            return [Process(state) for state in next(rounds)]
-
-        def status(self):
-            if self.state == "gone":
-                raise psutil.NoSuchProcess(1)
-            return psutil.STATUS_ZOMBIE if self.state == "zombie" else "running"
-
-        def kill(self):
-            did.append("kill")
-
-    reaped = iter([(5, 0), (0, 0)])
-
-    def waitpid(pid, options):
-        assert (pid, options) == (-1, os.WNOHANG)
-        if (found := next(reaped, None)) is None:
-            raise ChildProcessError
-        return found
-
-    monkeypatch.setattr(psutil, "Process", Process)
-    monkeypatch.setattr(os, "waitpid", waitpid)
-    monkeypatch.setattr(time, "sleep", did.append)
-    isolate.end_descendants()
-    assert did == ["kill", 0.01, "kill", 0.01]
-    assert list(rounds) == []
-    assert list(reaped) == []
-
-
 def test_descendants_that_cannot_be_killed_are_given_up(monkeypatch):
     now = iter([100.0, 104.9, 105.0])
     asked = []

@@ -9,9 +9,9 @@ import threading
 import pytest
 from filelock import FileLock, Timeout
 
-from gsbench.system import locks, own_modules
+from gsbench.system import locks, programs
 from gsbench.system.locks import BusyError, LockHolder, describe_holder, hold, is_held, read_holder
-from gsbench.system.own_modules import AllowedModules, adopt_modules, allow_modules
+from gsbench.system.programs import AllowedModules, adopt_modules, allow_modules
 from gsbench.system.stopping import (
     SIGNALS,
     SIGNALS_WITHOUT_INTERRUPT,
@@ -151,7 +151,7 @@ def test_whether_a_lock_is_held_is_seen_on_every_system(tmp_path, monkeypatch, s
 
 def test_only_allowed_modules_are_found_in_their_folder(tmp_path, monkeypatch):
     finder = AllowedModules()
-    monkeypatch.setattr(own_modules, "_allowed", finder)
+    monkeypatch.setattr(programs, "_allowed", finder)
     monkeypatch.setattr(sys, "meta_path", list(sys.meta_path))
     monkeypatch.chdir(tmp_path)
     for name in ("mine", "other"):

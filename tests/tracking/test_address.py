@@ -75,22 +75,6 @@ def test_sync_leaves_out_a_trial_whose_configuration_lacks_a_group(
     assert said.err == ""
 
 
-@pytest.mark.parametrize(
-    "place", ["http://127.0.0.1:{port}/api", "{outside}", "{runs}/mlartifacts/../../outside"]
-)
-@pytest.mark.slow
-def test_artifacts_outside_the_runs_folder_are_refused(place, tmp_path, monkeypatch, capfd):
-    runs, outside = tmp_path / "runs", tmp_path / "outside"
-    outside.mkdir()
-    folder, values = ended_trial(runs, name="theirs")
-    monkeypatch.delenv(VARIABLE, raising=False)
-    address = place.format(port=free_port(), outside=outside, runs=runs)
-    connect(None, runs).create_experiment("theirs", artifact_location=address)
-    with refusal("would send artifacts to"):
-        mirror_trial(options(), folder, values)
-    assert not list(outside.iterdir())
-
-
 def test_a_link_among_the_artifacts_is_not_followed(tmp_path):
     runs, private = tmp_path / "runs", tmp_path / "private"
     private.write_text("secret")

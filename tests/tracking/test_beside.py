@@ -17,7 +17,6 @@ from tests.tracking.helpers import (
     child_environment,
     following,
     found_runs,
-    free_port,
     options,
     run_of,
     write_trial,
@@ -174,11 +173,10 @@ def test_a_trial_is_shown_from_its_beginning_to_its_end(runs):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("uri", ["down", "not a database", "nonsense"])
+@pytest.mark.parametrize("uri", ["not a database", "nonsense"])
 def test_a_broken_tracker_harms_no_trial(uri, tmp_path, caplog):
     (tmp_path / "broken.db").write_text("this is no database" * 100)
     address = {
-        "down": f"http://127.0.0.1:{free_port()}",
         "not a database": f"sqlite:///{tmp_path}/broken.db",
         "nonsense": "gopher://x",
     }[uri]

@@ -11,9 +11,9 @@ import pytest
 from PIL import Image
 
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.system.locks import BusyError
+from gsbench.system.locks import BusyError, hold
 from gsbench.tracking import connect
-from gsbench.tracking.sync import TrackerRun, make_sink
+from gsbench.tracking.sync import make_sink, mirror
 from tests.conftest import ROOT
 from tests.helpers import read_json, refusal, write
 from tests.tracking.helpers import (
@@ -311,10 +311,9 @@ def test_curves_are_shown_while_the_trial_runs(shown, tmp_path):
     folder, values = finished(shown.runs)  # an earlier command left results and curves
     files = TrialFolder(folder)
     (folder / "results.json").unlink()
-    run = TrackerRun(files, shown.settings, values, ["kept"])
-    with pytest.raises(BusyError):  # one process at a time
-        TrackerRun(files, shown.settings, values, ["kept"])
-    run.add_curves()
+    with hold(folder / ".mlflow.lock", "mirroring"), pytest.raises(BusyError):
+        mirror(files, shown.settings, values, ["kept"], live=True)
+    assert mirror(files, shown.settings, values, ["kept"], live=True)
     assert ("train/loss", 1) not in shown.one()["metrics"]
     training = {"stage": "train", "folder": str(tmp_path / "building")}
     (tmp_path / "building").mkdir()
@@ -323,11 +322,11 @@ def test_curves_are_shown_while_the_trial_runs(shown, tmp_path):
     for text in ('{"step": 10, "loss": 0.5}\n{"step": 20, "lo', 'ss": 0.25}\n', ""):
         with (tmp_path / "building/metrics.jsonl").open("a") as stream:
             stream.write(text)
-        run.add_curves()
+        mirror(files, shown.settings, values, ["kept"], live=True)
         curve = {s: v for (key, s), v in shown.one()["metrics"].items() if key == "train/loss"}
         seen.append(curve)
     assert seen == [{10: 0.5}, {10: 0.5, 20: 0.25}, {10: 0.5, 20: 0.25}]
-    run.end()
+    assert shown.mirror(folder, values)
     assert shown.one()["status"][0] == ("FAILED" if shown.kind == "WandB" else "KILLED")
 
 

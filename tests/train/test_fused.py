@@ -52,12 +52,16 @@ def test_numbers_without_a_gradient_yet_keep_their_bits(active):
         assert torch.equal(one, other)
 
 
+def by_autograd(*parts):
+    return None, CpuAdam(1)
+
+
 @pytest.mark.parametrize("kind", ["none", "volumetric", *STATEFUL])
 def test_a_fused_training_has_the_bits_of_one_by_autograd(kind, lab, monkeypatch):
     more = {"none": NoDensifier, "volumetric": lambda: small(Volumetric, volume_threshold=0.01)}
     make, calls = (more | STATEFUL)[kind], []
-    call = FusedStep.__call__
-    monkeypatch.setattr(FusedStep, "__call__", lambda *a: calls.append(1) or call(*a))
+    call = FusedStep.step
+    monkeypatch.setattr(FusedStep, "step", lambda *a: calls.append(1) or call(*a))
     fused = lab.train(make(), "fused")
     if kind not in (
         "mcmc",
@@ -67,7 +71,7 @@ def test_a_fused_training_has_the_bits_of_one_by_autograd(kind, lab, monkeypatch
         "steepgs",
     ):  # others look at the model in some steps
         assert len(calls) > 100
-    monkeypatch.setattr(trainer, "fused_step", lambda *parts: None)
+    monkeypatch.setattr(trainer, "fast_steps", by_autograd)
     plain = lab.train(make(), "plain")
     assert same(fused, plain)
     assert lab.text(EVENTS, "fused") == lab.text(EVENTS, "plain")
@@ -80,7 +84,7 @@ def test_chunks_have_the_bits_of_the_whole(lab, monkeypatch):
     monkeypatch.setattr(lab, "truth", many)
     for fuse in (True, False):
         if not fuse:
-            monkeypatch.setattr(trainer, "fused_step", lambda *parts: None)
+            monkeypatch.setattr(trainer, "fast_steps", by_autograd)
         results.append(lab.train(NoDensifier(), str(fuse), iterations=6))
     assert len(results[0]) > 2 * CHUNK
     assert same(*results)
@@ -91,18 +95,18 @@ class Curious(NoDensifier):
 
 
 def test_a_densifier_of_the_users_sees_the_model_before_adam(lab, monkeypatch):
-    monkeypatch.setattr(FusedStep, "__call__", lambda *a: pytest.fail("fused"))
+    monkeypatch.setattr(FusedStep, "step", lambda *a: pytest.fail("fused"))
     lab.train(Curious(), iterations=3)
 
 
 def test_masked_and_last_steps_are_not_fused(lab, monkeypatch):
-    steps, call = [], FusedStep.__call__
+    steps, call = [], FusedStep.step
 
     def noted(self, model, *given):
         steps.append(model.adam["means"].step + 1)
         return call(self, model, *given)
 
-    monkeypatch.setattr(FusedStep, "__call__", noted)
+    monkeypatch.setattr(FusedStep, "step", noted)
     lab.train(NoDensifier(), "plain", iterations=5)
     assert steps == [1, 2, 3, 4]
     steps.clear()

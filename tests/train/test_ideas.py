@@ -118,7 +118,7 @@ def test_the_gradient_of_a_term_is_its_weight_times_its_own(lab):
         for one in (Ideas(), own)
     ]
     for trainer in made:
-        trainer.step, trainer.fused = 1, None
+        trainer.step, trainer.fast = 1, None
         trainer._differentiate(0)
     plain, moved = (trainer.gaussians.values.means.grad for trainer in made)
     expected = torch.zeros_like(plain)

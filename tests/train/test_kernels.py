@@ -12,7 +12,7 @@ from gsbench.densify import NoDensifier
 from gsbench.gaussians.trainable import ParameterState, Update
 from gsbench.raster.cpu import CpuRasterizer, executor
 from gsbench.raster.reference import ReferenceRasterizer
-from gsbench.system.compile_clock import CLOCK, CompileClock
+from gsbench.system.resources import CLOCK, CompileClock
 from gsbench.train import adam_cpu, loss_cpu, trainer
 from gsbench.train.kernels import compiled_beside, kernels_of
 from gsbench.train.loss import PhotometricLoss

@@ -116,23 +116,3 @@ def test_densifiers_get_no_error_at_ignored_pixels(picture):
     inside = torch.nn.functional.max_pool2d(mask[None, None, ..., 0].float(), 11, 1, 5)[0, 0] == 0
     assert inside.any()
     assert (scene.dissimilarity(0, image)[inside] < 1e-6).all()
-
-
-def test_masks_are_reduced_with_their_images(picture):
-    from gsbench.train.resolution import ScaledViews
-
-    _, target, mask = picture
-    views = [
-        View("a", CAMERA, target.numpy(), mask.numpy()[..., 0]),
-        View("b", CAMERA, target.numpy()),
-    ]
-    device = torch.device("cpu")
-    pictures = ScaledViews(views, Targets(views, device), device, None)
-    for scale in (1, 2, 5):
-        cameras, targets = pictures.at(scale)
-        small = targets.mask(0)
-        assert small.shape == (cameras[0].height, cameras[0].width, 1)
-        assert small.shape[:2] == targets.get(0).shape[:2]
-        assert targets.mask(1) is None
-        assert small.float().mean() <= mask.float().mean() + 0.02
-        assert small.any()

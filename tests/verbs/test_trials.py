@@ -1,24 +1,24 @@
 """``gsbench status``, ``retry`` and ``sync``, without a training."""
 
-import io
 import json
 import os
 import time
 from pathlib import Path
 from shlex import split
+from types import SimpleNamespace
 
+import pandas as pd
 import pytest
-from rich.console import Console
 
 from gsbench.config.compose import compose_one
 from gsbench.errors import GsbenchError
 from gsbench.launch import states
-from gsbench.launch.progress import Progress
+from gsbench.launch.progress import SPEED
 from gsbench.launch.record import record
 from gsbench.launch.states import TrialState
 from gsbench.runs.commands import read_history
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.system.own_modules import allowed_modules
+from gsbench.system.programs import allowed_modules
 from gsbench.tracking.sync import MirrorError
 from gsbench.verbs import trials
 from tests.composed import composed
@@ -118,73 +118,37 @@ def test_a_state_without_a_time_has_no_age_and_one_in_the_future_is_new():
 
 def test_superseded_trials_are_shown_and_deleted_on_demand(folders, monkeypatch, said):
     done = folders[0]
-    reasons = {done: "helper was 1, it is now 2"}
-    monkeypatch.setattr(states, "find_superseded", lambda *_: reasons)
+    older = SimpleNamespace(older=[SimpleNamespace(path=done)])
+    monkeypatch.setattr(states, "newest_code", lambda experiment: older)
     assert said("status").endswith(" 3 trials: 1 superseded, 1 missing, 1 failed\n")
     lines = said("status x --forget-superseded").splitlines()
-    assert lines == [f"removed {done}: helper was 1, it is now 2", "1 superseded trial removed"]
+    assert lines == [f"removed {done}: made by earlier code", "1 superseded trial removed"]
     assert not done.exists()
     assert [*read_history(done.parents[2]).planned] == folders[1:]
 
 
-def test_user_modules_are_looked_up_where_the_command_of_each_trial_was_given(
-    folders, monkeypatch, tmp_path
-):
-    asked = []
-    monkeypatch.setattr(
-        states, "find_superseded", lambda trials, folders: asked.append(folders) or {}
-    )
-    states.states_now(folders[0].parents[2])
-    assert asked == [dict.fromkeys(folders, str(tmp_path))]
-
-
-def shown(progress):
-    """The lines of the watched table, without the frame of the table."""
-    console = Console(width=100, record=True, file=io.StringIO())
-    console.print(trials._progress_view("x", progress))
-    text = console.export_text()
-    return [" ".join(line.strip("│┃ ").replace("│", " ").split()) for line in text.splitlines()]
-
-
-def cell(**counts):
-    return dict.fromkeys(("done", "running", "failed", "waiting"), 0) | counts
-
-
-def test_the_watched_table_has_arms_scenes_speed_time_left_and_leader():
-    cells = {
-        ("adc", "yard"): cell(done=1, running=2, waiting=1),
-        ("mcmc", "yard"): cell(done=3, failed=1),
-        ("mcmc", "hall"): cell(waiting=2),
-    }
-    speeds = {("adc", "yard"): 7.25, ("mcmc", "hall"): 1.0}
-    lines = shown(Progress(cells, speeds, 120.0, "adc leads [so far]"))
-    assert lines[0] == "x: trials done of all"
-    assert "adc – 1/4, 2 running" in lines
-    assert "mcmc 0/2 3/4, 1 failed" in lines
-    assert lines[-2:] == ["8.2 iterations/s, about 2 min left", "adc leads [so far]"]
-    ended = Progress({("adc", "yard"): cell(done=3)}, {}, 0.0, "")
-    assert not any("left" in line or "iterations" in line for line in shown(ended))
-
-
-def test_watching_looks_again_until_all_trials_have_ended(folders, monkeypatch, capsys):
-    looks = [
-        Progress({("adc", "yard"): cell(**{state: 1})}, {}, None, "")
-        for state in ("running", "running", "done")
-    ]
+def test_watching_looks_again_until_all_trials_have_ended(runs, monkeypatch, capsys):
+    looks = []
+    for state in ("running", "waiting", "done"):
+        columns = {key: [0] for key in ("done", "running", "failed", "waiting")}
+        looks.append(pd.DataFrame(columns | {state: [1234], SPEED: [8.25]}, index=["adc[lr=1]"]))
+        looks[-1].attrs["seconds_left"] = 120.0
     waited = []
-    monkeypatch.setattr(trials, "progress_of", lambda home: looks.pop(0))
+    monkeypatch.setattr(trials, "progress_frame", lambda *_: looks.pop(0))
     monkeypatch.setattr(time, "sleep", waited.append)
-    trials._watch(folders[0].parents[2])
+    trials._watch(runs, "x")
     assert waited == [trials.SECONDS_BETWEEN_LOOKS] * 2
-    assert "1/1" in capsys.readouterr().out
+    said = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "adc[lr=1] 1234 0 0 0 8.25" in said
+    assert "about 2 min left" in said
 
 
-def test_ctrl_c_ends_only_the_watching(folders, monkeypatch):
+def test_ctrl_c_ends_only_the_watching(folders, runs, monkeypatch):
     def interrupted(_):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(time, "sleep", interrupted)
-    trials._watch(folders[0].parents[2])
+    trials._watch(runs, "x")
 
 
 # ---- retry

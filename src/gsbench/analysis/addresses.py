@@ -6,9 +6,10 @@ An arm is typed as `Arm` prints it, with or without its initialiser and its sett
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 from gsbench.analysis.results import Arm, TrialResult, group_by
+from gsbench.analysis.trial_result import Trained
 from gsbench.errors import InputError
 from gsbench.words import split_outside_brackets
 
@@ -21,17 +22,6 @@ CELL = (
     "'demo:courtyard:psnr:momentum[decay=0.9]'"
 )
 ARM = re.compile(r"(?P<name>[^\[\]]+)(\[(?P<settings>.*)\])?")
-
-
-class OfAnArm(Protocol):
-    """A trial, finished or planned."""
-
-    @property
-    def arm(self) -> Arm: ...
-    @property
-    def config(self) -> Mapping[str, Any]: ...
-    @property
-    def variant(self) -> tuple[tuple[str, str], ...]: ...
 
 
 @dataclass(frozen=True)
@@ -58,7 +48,7 @@ class ArmName:
         """Return whether initialiser (if given) and densifier are those of ``arm``."""
         return self.name in (f"{arm.init}-{arm.densify}", arm.densify)
 
-    def fits(self, trial: OfAnArm) -> bool:
+    def fits(self, trial: Trained) -> bool:
         """Return whether a trial has the name and the settings."""
         if not self.names(trial.arm):
             return False

@@ -6,7 +6,7 @@ beforehand has a mean and an interval.
 """
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -14,10 +14,9 @@ from typing import Any
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.notes import Note, texts
 from gsbench.analysis.old_declarations import all_questions
-from gsbench.analysis.pairs import are_equal
 from gsbench.analysis.quantities import choose_quantities
-from gsbench.analysis.questions import Asked, Row, choose_pairs, rows_of
-from gsbench.analysis.results import Arm, Experiment, TrialResult
+from gsbench.analysis.questions import Asked, choose_pairs
+from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by
 from gsbench.analysis.sentences import asked_words, badge, headline, risk, sentence
 from gsbench.analysis.statistics import REFUTED, SUPPORTED
 from gsbench.analysis.verdicts import (
@@ -29,11 +28,10 @@ from gsbench.analysis.verdicts import (
     judge,
 )
 from gsbench.runs.commands import Question, code_in, questions_elsewhere
+from gsbench.runs.experiments import DEFAULT_METRIC
 from gsbench.runs.layout import LEDGER, TUNING
-from gsbench.words import command
 
-DEFAULT_METRIC = "psnr"
-LEDGER_DECIDES = "the ledger's tests decide ({})"
+OLD_LEDGER = f"the ledger of an earlier gsbench decided ({LEDGER})"
 
 
 @dataclass(frozen=True)
@@ -95,16 +93,6 @@ class Comparison:
     def sentences(self) -> list[str]:
         """The verdict on each idea, in a sentence or two each."""
         return [answer.sentence for answer in self.answers]
-
-    @property
-    def lines(self) -> list[str]:
-        """The badge and the verdict on each idea."""
-        return [answer.line for answer in self.answers]
-
-    @property
-    def headlines(self) -> list[str]:
-        """One line for each idea."""
-        return [answer.headline for answer in self.answers]
 
     @property
     def risk(self) -> str:
@@ -180,9 +168,8 @@ def compare(experiment: Experiment, baseline: str | None = None) -> Comparison:
     if (experiment.folder / TUNING).exists():
         # the points of a search were chosen by results, so no test of them is valid
         return Comparison(experiment, trials, ())
-    rows = rows_of(trials)
     if baseline is not None:
-        pairs = choose_pairs(rows, Asked(metric=DEFAULT_METRIC, baseline=baseline))
+        pairs = choose_pairs(trials, Asked(metric=DEFAULT_METRIC, baseline=baseline))
         known = {trial.arm for trial in trials}
         answers = [
             _with_metrics(interval_of(trials, *pair, DEFAULT_METRIC), trials, *pair)
@@ -190,12 +177,10 @@ def compare(experiment: Experiment, baseline: str | None = None) -> Comparison:
             if known.issuperset(pair)
         ]
         return Comparison(experiment, trials, tuple(answers))
-    return Comparison(experiment, trials, tuple(_answers(experiment, trials, rows)))
+    return Comparison(experiment, trials, tuple(_answers(experiment, trials)))
 
 
-def _answers(
-    experiment: Experiment, trials: Sequence[TrialResult], rows: Sequence[Row]
-) -> list[Answer]:
+def _answers(experiment: Experiment, trials: Sequence[TrialResult]) -> list[Answer]:
     everything = [*trials, *experiment.older]
     arms = {(trial.scene, trial.digest): trial.arm for trial in trials}
     # questions that an experiment's file names have an answer each
@@ -208,7 +193,7 @@ def _answers(
     ideas = {idea for _, idea, _ in verdicts}
     unasked = [
         pair
-        for pair in choose_pairs(rows, Asked(metric=DEFAULT_METRIC))
+        for pair in choose_pairs(trials, Asked(metric=DEFAULT_METRIC))
         if pair[1] not in ideas and {trial.arm for trial in trials}.issuperset(pair)
     ]
     answers = []
@@ -229,8 +214,8 @@ def _answers(
         answers.append(replace(answer, earlier=earlier))
     answers.sort(key=lambda answer: answer.earlier)
     state, why = NOT_ASKED, ""
-    if (experiment.folder / LEDGER).exists():  # it has asked, and its levels follow its own order
-        state, why = NOT_TESTED, LEDGER_DECIDES.format(command("ledger", "show", experiment.name))
+    if (experiment.folder / LEDGER).exists():
+        state, why = NOT_TESTED, OLD_LEDGER
     for pair in unasked:
         shown = interval_of(trials, *pair, DEFAULT_METRIC, state, why)
         answers.append(_with_metrics(shown, trials, *pair))
@@ -353,18 +338,9 @@ def winners(comparison: Comparison) -> dict[tuple[str, frozenset[str]], set[Arm]
 
 def same_bits_notes(trials: Sequence[TrialResult]) -> list[Note]:
     """A note on settings of one densifier that had no effect: all their results are equal."""
-    places: dict[Arm, dict[tuple[str, int], TrialResult]] = {}
+    results: dict[Arm, set[Hashable]] = {}
     for trial in trials:
-        places.setdefault(trial.arm, {})[trial.scene, trial.seed] = trial
-    equal: dict[Arm, list[Arm]] = {}
-    for one, two in itertools.combinations(places, 2):
-        both = places[one].keys() & places[two].keys()
-        same = (one.init, one.densify) == (two.init, two.densify) and both
-        known = itertools.chain(*equal.values())
-        if (
-            same
-            and one not in known
-            and all(are_equal(places[one][place], places[two][place]) for place in both)
-        ):
-            equal.setdefault(one, [one]).append(two)
-    return [Note.of("same bits", arms=own) for own in equal.values()]
+        values = trial.record.num_gaussians, *sorted(trial.metrics.items())
+        results.setdefault(trial.arm, set()).add((trial.scene, trial.seed, *values))
+    same = group_by(results, lambda arm: (arm.name, frozenset(results[arm])))
+    return [Note.of("same bits", arms=arms) for arms in same.values() if len(arms) > 1]

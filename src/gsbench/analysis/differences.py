@@ -5,24 +5,22 @@ that belong together share one name. A densifier class adds the ingredients in w
 ADC. All are read from the trials' recorded configurations and code.
 """
 
-import time
+import itertools
 from collections import defaultdict
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from functools import cache
-from pathlib import Path
-from types import MappingProxyType
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from gsbench.analysis.notes import Note
-from gsbench.analysis.results import Arm, TrialPair, TrialResult, group_by, seeds_text
-from gsbench.analysis.trial_settings import Configured, canonical
+from gsbench.analysis.results import Arm, TrialPair, TrialResult, group_by
+from gsbench.analysis.trial_result import Trained
+from gsbench.analysis.trial_settings import canonical
 from gsbench.gaussians.paper_values import RATES
 from gsbench.runs.config_hash import (
     is_ignored,
     is_ingredient,
     is_of_scene,
 )
-from gsbench.runs.freshness import Change, Part, code_changes, present_version
+from gsbench.runs.freshness import Part
 from gsbench.runs.nested import SHOWN
 from gsbench.words import counted, some_of
 
@@ -106,7 +104,7 @@ def differing_conditions(trials: Sequence[TrialResult], code: bool = True) -> di
     return {key: sorted(values) for key, values in values_by_condition.items() if len(values) > 1}
 
 
-def differing_settings(trials: Sequence[Configured]) -> dict[str, list[str]]:
+def differing_settings(trials: Sequence[Trained]) -> dict[str, list[str]]:
     """The settings in which trials differ, with their values, unless `is_ignored`.
 
     A missing key counts as unset (null): trials from before a setting existed equal later ones that
@@ -210,57 +208,6 @@ def differing_code(trials: Iterable[TrialResult]) -> dict[Part, Versions]:
     return differing
 
 
-def describe_code(part: Part, versions: Mapping[str, Sequence[TrialResult]]) -> str:
-    """The versions of a part of the code in one line, the oldest first.
-
-    For example ``mine.Patient: 3fa9c1d2 (garden seeds 0, 1; 2026-11-21 18:40) | …``.
-    """
-    ordered = sorted(versions.items(), key=lambda item: max(trial.finished for trial in item[1]))
-    texts = [
-        f"{version:.{SHOWN}} ({_scenes_and_seeds(trials)}; {_when(trials)})"
-        for version, trials in ordered
-    ]
-    return f"{part.short}: {' | '.join(texts)}"
-
-
-def _scenes_and_seeds(trials: Sequence[TrialResult]) -> str:
-    """``garden seeds 0, 1; room seed 0``"""
-    by_scene = sorted(group_by(trials, lambda trial: trial.scene).items())
-    return "; ".join(f"{scene} {seeds_text(own)}" for scene, own in by_scene)
-
-
-def _when(trials: Sequence[TrialResult]) -> str:
-    """The time at which trials were finished, to the minute, or the first and the last time."""
-    times = sorted(trial.finished for trial in trials)
-    minutes = [time.strftime("%Y-%m-%d %H:%M", time.localtime(finished)) for finished in times]
-    return minutes[0] if minutes[0] == minutes[-1] else f"{minutes[0]} to {minutes[-1]}"
-
-
-def find_superseded(
-    trials: Sequence[TrialResult], folders: Mapping[Path, str] = MappingProxyType({})
-) -> dict[Path, Change]:
-    """The folders of trials that older code made, each with the reason.
-
-    The user's modules are compared with those in the folder of the trial's command (``folders``).
-    If that is unknown, and for gsbench's own code, the version of the trial that finished last
-    counts as the present one.
-    """
-    ordered = sorted(trials, key=lambda trial: trial.finished)
-    latest = {part: version for trial in ordered for part, version in trial.code.items()}
-    present, reasons = cache(present_version), {}
-    for trial in trials:
-        folder = folders.get(trial.path)
-        here = {part: present(part, folder) for part in trial.code if part.kind == "module"}
-        unknown = {part: made for part, made in trial.code.items() if here.get(part) is None}
-        changes = [
-            *code_changes(trial.code, here.get),
-            *code_changes(unknown, latest.get, "later code"),
-        ]
-        if changes:
-            reasons[trial.path] = changes[0]
-    return reasons
-
-
 def ingredients(one: Mapping[str, Any], other: Mapping[str, Any]) -> tuple[str, ...]:
     """The ingredients in which two configurations with dotted keys differ.
 
@@ -307,19 +254,17 @@ def ingredients_between(trials: Sequence[TrialResult], first: Arm, second: Arm) 
 
 
 def compared_trials(trials: Iterable[TrialResult], first: Arm, second: Arm) -> list[TrialPair]:
-    """Pairs of trials that show all settings in which two arms differ.
+    """A pair of trials of two arms on each scene that both have, of one seed if possible.
 
-    These are one pair of `representatives`, but one of each scene that both arms have if the
-    settings of an arm differ between scenes.
+    Without a common scene it is one pair. Raises KeyError for an arm without trials.
     """
-    own = [trial for trial in trials if trial.arm in (first, second)]
-    alone = [representatives(own, first, second)]
-    by_arm = group_by(own, lambda trial: trial.arm)
-    if not any(map(settings_between_scenes, by_arm.values())):
-        return alone
-    by_scene = group_by(own, lambda trial: trial.scene).values()
-    shared = [group for group in by_scene if len({trial.arm for trial in group}) == len(by_arm)]
-    return [representatives(group, first, second) for group in shared] or alone
+    by_arm = group_by(trials, lambda trial: trial.arm)
+    everywhere = list(itertools.product(by_arm[first], by_arm[second]))
+    shared = [pair for pair in everywhere if pair[0].scene == pair[1].scene]
+    by_scene = group_by(shared, lambda pair: pair[0].scene).values()
+    return [
+        min(own, key=lambda pair: pair[0].seed != pair[1].seed) for own in by_scene or [everywhere]
+    ]
 
 
 def ingredients_note(names: Sequence[str], first: Arm, second: Arm) -> Note:
@@ -336,29 +281,6 @@ def is_mixed(names: Sequence[str]) -> bool:
     """Return whether the named ingredients are more than one, or stand for an unknown number."""
     bundles = (NO_RECORD, ELSEWHERE, BY_PROGRAM.partition("{")[0])
     return len(names) > 1 or any(name.startswith(bundles) for name in names)
-
-
-def representatives(
-    trials: Iterable[TrialResult], first: Arm, second: Arm
-) -> tuple[TrialResult, TrialResult]:
-    """One trial of each arm: of the same scene and seed if possible.
-
-    Otherwise both are of the same scene, or else of the same seed. Raises KeyError for an arm
-    without trials.
-    """
-    by_arm = group_by(trials, lambda trial: trial.arm)
-    ones, others = by_arm[first], by_arm[second]
-    places: tuple[Callable[[TrialResult], Hashable], ...] = (
-        lambda trial: (trial.scene, trial.seed),
-        lambda trial: trial.scene,
-        lambda trial: trial.seed,
-    )
-    for place in places:
-        partners = group_by(others, place)
-        for one in ones:
-            if found := partners.get(place(one)):
-                return one, found[0]
-    return ones[0], others[0]
 
 
 def _class_ingredients(config: Mapping[str, Any]) -> tuple[str, ...]:

@@ -5,11 +5,11 @@ recorded.
 """
 
 import itertools
+import math
 import statistics
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from typing import Any
 
-from gsbench.analysis.advice import Advice, equal_counts_settings, start_smaller, train_longer
 from gsbench.analysis.differences import (
     between_scenes_notes,
     compared_trials,
@@ -22,7 +22,7 @@ from gsbench.analysis.differences import (
 from gsbench.analysis.notes import Note
 from gsbench.analysis.pairs import pair_trials
 from gsbench.analysis.quantities import COSTS, Reader, relative_change
-from gsbench.analysis.results import Arm, TrialResult, group_by, read_experiment, trials_of
+from gsbench.analysis.results import Arm, TrialResult, group_by, trials_of
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.analysis.trial_settings import canonical
 from gsbench.gaussians.paper_values import PAPER_CAP
@@ -32,6 +32,8 @@ from gsbench.runs.experiments import SearchPoint, TuningRecord
 from gsbench.runs.layout import EVENTS, TUNING
 from gsbench.words import counted, listed
 
+CAP, LIMIT = "densify.cap", "densify.max_gaussians"
+DIGITS = 3  # significant digits of a number of Gaussians
 LONGEST = 60  # the most characters of a value that are shown
 UNKNOWN, NONE = "not recorded", "–"
 ALIKE, UNLIKE = "", "≠"
@@ -56,11 +58,10 @@ def caveats(
 def counts_notes(
     trials: Sequence[TrialResult],
     pairs: Iterable[tuple[Arm, Arm]],
-    advise: Advice = equal_counts_settings,
 ) -> list[Note]:
     """A note for each baseline on the arms that have more Gaussians over common scenes, or fewer.
 
-    ``advise`` says how to compare all of these at equal counts.
+    It says how to compare all of these at equal counts.
     """
     by_arm, notes = group_by(trials, lambda trial: trial.arm), []
     for first, own in group_by(pairs, lambda pair: pair[0]).items():
@@ -72,14 +73,38 @@ def counts_notes(
         if not unequal:
             continue
         others = [trial for arm in unequal for trial in by_arm[arm]]
-        both = [*baseline, *others]
-        how = start_smaller(both) or train_longer(both) or advise(baseline, others)
         texts = [
             f"{arm} {100 * abs(more):.0f} % {'more' if more > 0 else 'fewer'}"
             for arm, more in unequal.items()
         ]
-        notes.append(Note.of("unequal counts", arms=texts, baseline=first, advice=how))
+        notes.append(
+            Note.of(
+                "unequal counts",
+                arms=texts,
+                baseline=first,
+                advice=equal_counts_advice([*baseline, *others]),
+            )
+        )
     return notes
+
+
+def equal_counts_advice(trials: Sequence[TrialResult]) -> str:
+    """The advice that gives arms equal numbers of Gaussians; "" if counts are unknown."""
+    records = [trial.record for trial in trials]
+    points = max(record.num_init_points or 0 for record in records)
+    counts = [record.num_gaussians for record in records if record.num_gaussians]
+    if not counts:
+        return ""
+    if min(counts) <= points:
+        return f"start all arms with fewer than {points:,} points, as no limit can be below these"
+    aims = {(trial.config.get(CAP), trial.config.get(LIMIT)) for trial in trials}
+    if len(aims) == 1 and {cap for cap, _ in aims} == {"governor"}:
+        return (
+            "train longer, since the governor (densify.cap) had too few rounds to reach its count"
+        )
+    unit = 10 ** max(0, math.floor(math.log10(min(counts))) + 1 - DIGITS)
+    words = f"{CAP}=governor {LIMIT}={min(counts) // unit * unit}"
+    return f"give all arms {words} and another name"
 
 
 def limit_notes(trials: Sequence[TrialResult], pairs: Iterable[tuple[Arm, Arm]]) -> list[Note]:
@@ -329,7 +354,7 @@ def searches_of(trial: TrialResult) -> dict[str, TuningRecord]:
 
 
 def _search_note(own: Sequence[TrialResult], experiment: str, search: TuningRecord) -> Note:
-    """Say what a search tried and chose, and whether its arm's trials ``own`` came later."""
+    """Say what a search tried and chose, and whether its arm's trials ``own`` have that."""
     best = search.best
     if best is None:
         return Note.of("vain search", arm=search.arm, experiment=experiment)
@@ -348,25 +373,9 @@ def _search_note(own: Sequence[TrialResult], experiment: str, search: TuningReco
         scenes=search.scenes,
         seeds=search.seeds,
         experiment=experiment,
-        when=_when(own, experiment),
         tried=tried,
         more=max(0, len(search.points) - MAX_VALUES),
         others="" if _has_settings(own[0], best) else " These trials have other values.",
-    )
-
-
-def _when(own: Sequence[TrialResult], experiment: str) -> str:
-    """Say whether the search ended before these trials, so that no result guided it."""
-    times = [
-        trial.measured for trial in read_experiment(own[0].path.parents[3] / experiment).trials
-    ]
-    if not times:
-        return "whose own trials are missing"
-    later = sum(trial.measured < max(times) for trial in own)
-    return (
-        f"ended when {later} of these {len(own)} trials had been measured"
-        if later
-        else "before any of these trials"
     )
 
 

@@ -37,15 +37,19 @@ DIRECTIONS = {"": 0, "higher": 1, "lower": -1}
 
 
 class Declared(Record):
-    """A question that was written before the training: ``methods`` against ``baseline``."""
+    """A question about a table: is a method better than ``baseline`` in ``metric``?
+
+    One that was written before the training names ``methods``, scenes and seeds; any other one is
+    about all in the table.
+    """
 
     baseline: Text
-    methods: tuple[Text, ...]
     metric: Text
-    better: str
-    least: Text | None
-    scenes: tuple[Text, ...]
-    seeds: tuple[Count, ...]
+    better: str = ""
+    least: Text | None = None
+    methods: tuple[Text, ...] = ()
+    scenes: tuple[Text, ...] = ()
+    seeds: tuple[Count, ...] = ()
 
     def write(self, file: Path) -> None:
         """Write it; raises InputError if the file is there, since a question is never changed."""
@@ -88,75 +92,58 @@ def judge(
         >>> judge(frame, "base", "psnr")["mine"].outcome
         'supported'
     """
-    answers = compare_methods(frame, baseline, metric, least, direction).answers
+    better = next(word for word, sign in DIRECTIONS.items() if sign == direction)
+    size = None if least is None else str(least)
+    asked = Declared(baseline=baseline, metric=metric, better=better, least=size)
+    answers = compare_methods(frame, asked).answers
     return {answer.arm.densify: answer.verdict for answer in answers}
 
 
-def compare_methods(
-    frame: pd.DataFrame,
-    baseline: str,
-    metric: str,
-    least: float | str | None = None,
-    direction: int = 0,
-    declared: Declared | None = None,
-    name: str = "results",
-) -> Comparison:
-    """The answers on all methods of a table, as `judge` gives them, or to a ``declared`` question.
+def compare_methods(frame: pd.DataFrame, asked: Declared, name: str = "results") -> Comparison:
+    """The answers on the methods of a table, as `judge` gives them.
 
     Raises InputError for a table or question that cannot be judged.
     """
-    trials = _trials(frame, metric, direction, name)
+    metric, baseline = asked.metric, asked.baseline
+    trials = _trials(frame, metric, DIRECTIONS[asked.better], name)
     methods = list(dict.fromkeys(trial.densify for trial in trials))
     if baseline not in methods:
         raise InputError(
             f"no method {baseline!r}{did_you_mean(baseline, methods)} (there are {listed(methods)})"
         )
-    ideas = [method for method in methods if method != baseline]
-    if declared is not None:
-        ideas = list(declared.methods)
+    ideas = asked.methods or [method for method in methods if method != baseline]
     if not ideas:
         raise InputError(f"the table has one method, {baseline}: nothing to compare")
-    sign = asked_quantity(metric, trials).direction
-    if not sign:
+    quantity = asked_quantity(metric, trials)
+    if not quantity.direction:
         raise InputError(
             f"{metric}: say whether more is better (--better higher, direction 1) or less"
         )
-    size = _least(metric, trials, least)
+    least = asked.least or quantity.worthwhile
+    size = None if least is None else read_least(least, "--least")
     questions = [
-        _question(trials, baseline, idea, metric, sign, size, declared).with_id(TABLE)
-        for idea in ideas
+        _question(trials, asked, idea, quantity.direction, size).with_id(TABLE) for idea in ideas
     ]
     folder = Path(name)
     command = Command(words=(), cwd="", time=0.0, questions=tuple(questions))
     return compare(Experiment(name, folder, tuple(trials), (), history=History(folder, (command,))))
 
 
-def _least(
-    metric: str, trials: Sequence[TrialResult], least: float | str | None
-) -> LeastEffect | None:
-    if least is not None:
-        return read_least(least, "--least")
-    usual = asked_quantity(metric, trials).worthwhile
-    return None if usual is None else LeastEffect(usual, relative=False)
-
-
 def _question(
     trials: Sequence[TrialResult],
-    baseline: str,
+    asked: Declared,
     idea: str,
-    metric: str,
     sign: int,
     least: LeastEffect | None,
-    declared: Declared | None,
 ) -> Question:
     """The question about all trials of a method, or about those that were declared."""
     places: dict[tuple[str, str], list[int]] = {}
     for trial in trials:
         places.setdefault((trial.densify, trial.scene), []).append(trial.seed)
     seeds = {scene: tuple(sorted(own)) for (method, scene), own in places.items() if method == idea}
-    untested = ""
-    if declared is not None:
-        seeds = dict.fromkeys(declared.scenes, declared.seeds)
+    untested, baseline = "", asked.baseline
+    if asked.methods:
+        seeds = dict.fromkeys(asked.scenes, asked.seeds)
     else:
         for scene, own in seeds.items():
             first = sorted(places.get((baseline, scene), []))[: len(own)]
@@ -165,13 +152,13 @@ def _question(
     return Question(
         idea=Arm("", idea),
         baseline=Arm("", baseline),
-        metric=metric,
+        metric=asked.metric,
         sign=sign,  # type: ignore[arg-type]
         least=None if least is None else least.size,
         relative=least is not None and least.relative,
         digests={scene: (_digest(baseline), _digest(idea)) for scene in seeds},
         seeds=seeds,
-        rule=TABLE if declared is None else DECLARED_TABLE,
+        rule=DECLARED_TABLE if asked.methods else TABLE,
         untested=untested,
     )
 

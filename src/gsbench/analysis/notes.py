@@ -50,7 +50,6 @@ SENTENCES: dict[str, str] = {
         "{least:n seed} of each scene can count: there are no more of {scenes:few} (others have up "
         "to {most})"
     ),
-    "no value": "{reason}",
     # ---- questions that cannot be tested
     "equal": (
         "both arms of {pairs:n pair} of trials are equal to the last bit: the settings that differ "
@@ -59,7 +58,6 @@ SENTENCES: dict[str, str] = {
     # ---- arms and trials in no verdict
     "no partner": "{arm} is not compared: nothing was trained to compare it with.",
     "unused": "Not in the verdict on {arm}, whose question did not name them: {trials:few}.",
-    "waits": "a look waits for all of its trials",
     # ---- arms that are unlike in more than was asked
     "scenes differ": "Scenes of {arms:all} differ in more than the scene: {differences}.",
     "unequal counts": (
@@ -82,7 +80,7 @@ SENTENCES: dict[str, str] = {
     "vain search": "{arm}: the search {experiment} found nothing.",
     "search": (
         "{arm}: the best of {points:n point} by {metric} of validation views ({scenes:all}; seed "
-        "{seeds:list}; the search {experiment}) is {chosen:all}, {when}. Tried: "
+        "{seeds:list}; the search {experiment}) is {chosen:all}. Tried: "
         "{tried:list}{more:if: and % more}.{others}"
     ),
     "varied": (
@@ -94,8 +92,7 @@ SENTENCES: dict[str, str] = {
         "The same bits in all trials of one scene and seed: {arms:all}. The settings in which they "
         "differ had no effect, so there is nothing to compare."
     ),
-    # ---- claims, gates and ledgers of ideas
-    "failed": "failed: {reasons:few}",
+    # ---- gates
     "other machine": (
         "deviation: the baseline ran on another kind of machine ({baseline:all}) than the new "
         "trials ({new:all}); this alone changes last digits and, after long training, results"
@@ -103,9 +100,6 @@ SENTENCES: dict[str, str] = {
     "other library": (
         "deviation: the baseline was made with {library} {baseline:all}, the new trials with "
         "{new:all}"
-    ),
-    "contradiction": (
-        "{idea}: the ledger says {recorded}, but its trials say {now}: one of them was edited"
     ),
     # ---- how to read a table
     "one trial": "One trial per cell, so there is no deviation. Protocol {protocols:list}.{bold}",

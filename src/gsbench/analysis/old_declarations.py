@@ -11,7 +11,7 @@ from dataclasses import field, replace
 
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.quantities import asked_quantity
-from gsbench.analysis.questions import Asked, choose_pairs, level_of, rows_of
+from gsbench.analysis.questions import Asked, choose_pairs, draft, level_of
 from gsbench.analysis.results import Experiment, TrialResult
 from gsbench.parsing import Amount, Count, Record
 from gsbench.runs.commands import ERROR_RATE, Question, code_in
@@ -20,6 +20,7 @@ from gsbench.runs.layout import DECLARED
 from gsbench.runs.rows import read_rows
 
 OLD = "declaration"  # the rule of these questions
+LATE = "it was declared after the first result"
 
 
 class _OldQuestion(Record):
@@ -74,13 +75,12 @@ def _named(
     asked: _OldQuestion, declaration: _OldDeclaration, trials: Sequence[TrialResult]
 ) -> Question:
     """A question that names its trials, as of a file of claims or of planned looks."""
-    digests = {trial.key: trial.digest for trial in trials}
-    known = [trial for trial in trials if trial.digest in digests.values()]
+    of_key = {trial.key: trial for trial in trials}
+    digests = {key: trial.digest for key, trial in of_key.items()}
     sides: list[Arm] = []
     for side, arm in enumerate((asked.baseline, asked.arm)):
-        keys = {both[side] for both in asked.scenes.values()}
-        of_side = next((trial.arm for trial in known if trial.key in keys), None)
-        sides.append(of_side or arm or Arm("", asked.name))
+        own = [of_key[both[side]].arm for both in asked.scenes.values() if both[side] in of_key]
+        sides.append((*own, arm or Arm("", asked.name))[0])
     return Question(
         idea=sides[1],
         baseline=sides[0],
@@ -112,38 +112,23 @@ def _of_sweep(
         and asked.about in ("", trial.question)
     ]
     metric = asked_quantity(asked.metric, own)
-    pairs = choose_pairs(rows_of(own), Asked(metric=asked.metric)) if own else []
+    if not (own and metric.direction):
+        return []
+    terms = Asked(metric=asked.metric, sign=metric.direction, least=metric.worthwhile)
+    pairs = choose_pairs(own, terms)
     known, moment = {trial.arm for trial in own}, unix_time(declaration.time) or 0
     questions = []
     for baseline, idea in pairs:
-        if not metric.direction or not known.issuperset((baseline, idea)):
+        if not known.issuperset((baseline, idea)):
             continue
-        sides = [[trial for trial in own if trial.arm == arm] for arm in (baseline, idea)]
-        first = {trial.scene: trial.digest for trial in sides[0]}
-        second = {trial.scene: trial.digest for trial in sides[1] if trial.scene in first}
-        late = min(trial.measured for trial in sides[1]) < moment
-        questions.append(
-            Question(
-                idea=idea,
-                baseline=baseline,
-                metric=asked.metric,
-                sign=metric.direction,  # type: ignore[arg-type]
-                least=metric.worthwhile,
-                digests={scene: (first[scene], digest) for scene, digest in second.items()},
-                seeds={
-                    scene: tuple(
-                        planned[key]
-                        if planned is not None
-                        else sorted({t.seed for t in sides[1] if t.scene == scene})
-                    )
-                    for scene in second
-                    for key in [next(t.key for t in sides[1] if t.scene == scene)]
-                },
-                level=declaration.error_rate / len(pairs),
-                rule=OLD,
-                untested="it was declared after the first result" if late else "",
-            )
-        )
+        question = draft(baseline, idea, own, terms)
+        of_idea = [trial for trial in own if trial.arm == idea]
+        seeds = dict(question.seeds)
+        if planned is not None:  # failed ones, too
+            seeds |= {one.scene: planned[one.key] for one in of_idea if one.scene in seeds}
+        late = min(trial.measured for trial in of_idea) < moment
+        level, why = declaration.error_rate / len(pairs), LATE if late else ""
+        questions.append(replace(question, seeds=seeds, level=level, rule=OLD, untested=why))
     return questions
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -114,36 +114,38 @@ class Pairs:
         )
 
 
-def pair(trials: Sequence[TrialResult], question: Question) -> Pairs:
-    """Pair the trials of a question by scene and seed.
+def pair(
+    trials: Sequence[TrialResult],
+    question: Question,
+    name: Callable[[TrialResult], str] = lambda trial: trial.digest,
+) -> Pairs:
+    """Pair the trials of a question, which has this ``name`` of a trial, by scene and seed.
 
     The result also says which trials cannot be compared. Trials are compared only under equal
     conditions. If seeds come in looks, those after the first missing one do not count: a seed that
     comes late cannot change what an earlier look saw. One capture under two names is one scene: its
     trainings would count twice.
     """
-    return pair_sides(_sides(trials, question), question)
-
-
-def pair_sides(
-    sides_by_scene: Mapping[str, tuple[Sequence[TrialResult], Sequence[TrialResult]]],
-    question: Question,
-) -> Pairs:
-    """The same, for the trials of baseline and idea by scene."""
+    by_side = group_by(trials, lambda trial: (trial.scene, name(trial)))
     rows, left_out = [], list[Note]()
     captures: dict[object, str] = {}
-    for scene, sides in sides_by_scene.items():
+    for scene, names in question.digests.items():
+        seeds = question.seeds[scene]
+        first, second = (
+            [trial for trial in by_side.get((scene, side), []) if trial.seed in seeds]
+            for side in names
+        )
         try:
-            row, faults = _pair_scene(scene, *sides, question)
+            row, faults = _pair_scene(scene, first, second, question)
         except InputError as error:
             left_out.append(Note.of("unlike", text=str(error)))
             continue
         left_out += faults
         if not row.seeds:
             continue
-        first = row.trials[0][0]
-        data = first.record.hashes.get("data")
-        known = captures.setdefault((data, first.split) if data else scene, scene)
+        trial = row.trials[0][0]
+        data = trial.record.hashes.get("data")
+        known = captures.setdefault((data, trial.split) if data else scene, scene)
         if known == scene:
             rows.append(row)
         else:
@@ -155,22 +157,6 @@ def pair_sides(
         few = [row.scene for row in rows if len(row.seeds) == least]
         left_out.append(Note.of("uneven", least=least, scenes=few, most=max(uneven)))
     return Pairs(tuple(rows), tuple(left_out), question.relative)
-
-
-def _sides(
-    trials: Sequence[TrialResult], question: Question
-) -> dict[str, tuple[list[TrialResult], list[TrialResult]]]:
-    """The trials of the baseline and of the idea, by scene."""
-    by_scene = group_by(trials, lambda trial: (trial.scene, trial.digest))
-
-    def side(scene: str, digest: str) -> list[TrialResult]:
-        own = by_scene.get((scene, digest), [])
-        return [trial for trial in own if trial.seed in question.seeds[scene]]
-
-    return {
-        scene: (side(scene, first), side(scene, second))
-        for scene, (first, second) in question.digests.items()
-    }
 
 
 def pair_trials(trials: Sequence[TrialResult], baseline: Arm, arm: Arm) -> list[TrialPair]:

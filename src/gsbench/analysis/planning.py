@@ -1,38 +1,161 @@
-"""Numbers of scenes and seeds that a command needs to show a difference.
+"""Numbers of scenes and seeds that a command needs to show a difference of two arms.
 
-The commands differ in their error rate and in their looks, so the same trials have other chances.
+The paired difference of scene s and seed k is ``mean + scene effect + noise``. The scene
+effect has one deviation between scenes, the noise another one between trainings of a scene. Both
+are estimated from pilot trials by the analysis of variance (Searle, Casella and McCulloch 1992,
+*Variance components*, section 3.6). More seeds shrink only the noise; a statement about scenes like
+these needs more scenes.
+
+Commands differ in their error rate and in their looks, so the same trials have other chances.
 Trainings are simulated with the shares of noise that the pilot's scenes have, and decided by the
 thresholds of the judge.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from gsbench.analysis.designs import (
-    DESIGN_DRAWS,
-    MAX_SCENES,
-    MAX_SEEDS,
-    POWER,
-    Components,
-    Design,
-    designs_needed,
-    power_of_mean,
-)
 from gsbench.analysis.questions import look_shares, plan_looks
-from gsbench.analysis.statistics import ALPHA
+from gsbench.analysis.statistics import ALPHA, MIN_SCENES, sign_test_needs
 from gsbench.analysis.thresholds import Region, evenness
+from gsbench.errors import InputError
 
 COMMANDS = ("sweep", "looks", "gate", "ledger")
+POWER = 0.8  # of planned designs: that of the two-sided tests with the error rate ``ALPHA``
+MAX_SCENES, MAX_SEEDS = 30, 40  # the largest designs that are considered
+ALL_SCENES = range(1, MAX_SCENES + 1)
 # seeds and scenes of designs with looks
 LOOK_SEEDS, LOOK_SCENES = 12, (1, 2, 3, 4, 5, 6, 8, 10, 13)
+DRAWS = 2000  # simulated variances of a design; they give its power to about 0.005
 UNSURE = 0.8  # of pilots have the real deviation within the stated range
+
+
+@dataclass(frozen=True)
+class Components:
+    """Deviations of paired differences, ``between`` scenes and ``within`` a scene.
+
+    ``between`` is the deviation of the effect over scenes: None for a single scene, 0 if scenes
+    differ by no more than trainings explain. ``within`` is the deviation over trainings of a
+    scene, in the root mean square of the scenes; ``shares`` are the parts of its square that each
+    scene has, with a mean of 1.
+    """
+
+    between: float | None
+    within: float
+    scenes: int
+    trials: int  # pairs
+    shares: tuple[float, ...] = (1.0,)
+
+    def shares_of(self, scenes: int) -> tuple[float, ...]:
+        """The shares of so many scenes like the pilot's: evenly spaced quantiles of its own."""
+        middles = (np.arange(scenes) + 0.5) / scenes
+        found = np.quantile(self.shares, middles, method="inverted_cdf")
+        return tuple(map(float, found / found.mean()))
+
+
+@dataclass(frozen=True)
+class Design:
+    """A design of two arms on ``scenes`` scenes, with ``seeds`` seeds each."""
+
+    scenes: int
+    seeds: int
+
+    @property
+    def trials(self) -> int:
+        return 2 * self.scenes * self.seeds
+
+
+def estimate_components(differences: Sequence[NDArray[np.float64]]) -> Components:
+    """Estimate the two deviations from pilot trials' paired differences, an array per scene.
+
+    Raises InputError if no scene has two pairs.
+    """
+    counts = np.array([len(values) for values in differences], dtype=float)
+    total, repeated = int(counts.sum()), [values for values in differences if len(values) > 1]
+    if not repeated:
+        raise InputError("planning needs pilot trials with at least two seeds of one scene")
+    squares = sum(float(((values - values.mean()) ** 2).sum()) for values in repeated)
+    within = math.sqrt(squares / (total - len(counts)))
+    if len(counts) == 1:
+        return Components(None, within, 1, total)
+    means = np.array([values.mean() for values in differences])
+    overall = float(np.concatenate(list(differences)).mean())
+    # n_0 of unbalanced data
+    pairs_per_scene = (total - float((counts**2).sum()) / total) / (len(counts) - 1)
+    square = float((counts * (means - overall) ** 2).sum()) / (len(counts) - 1)
+    between = math.sqrt(max(0.0, (square - within**2) / pairs_per_scene))
+    variances = np.array([values.var(ddof=1) for values in repeated])
+    mean = variances.mean()
+    shares = tuple(map(float, variances / mean)) if mean else (1.0,)
+    return Components(between, within, len(counts), total, shares)
+
+
+def deviation_range(components: Components) -> tuple[float, float]:
+    """The deviations between which that of trainings lies in `UNSURE` of such pilots."""
+    degrees = components.trials - components.scenes
+    tails = (1 - (1 - UNSURE) / 2, (1 - UNSURE) / 2)
+    low, high = (math.sqrt(degrees / special.chdtri(degrees, 1 - tail)) for tail in tails)
+    return components.within * low, components.within * high
+
+
+# ---- the power of a design
+
+
+def power_like_these(design: Design, difference: float, components: Components) -> float:
+    """The chance that the sign test shows ``difference`` on scenes like these.
+
+    Raises InputError if the pilot had only one scene.
+    """
+    if components.between is None:
+        raise InputError(
+            "one scene cannot show how an effect differs between scenes: run pilot trials on two"
+        )
+    needed = sign_test_needs(design.scenes, ALPHA)
+    if needed is None:
+        return 0.0
+    spread = math.hypot(components.between, components.within / math.sqrt(design.seeds))
+    # that one scene's mean has the sign
+    chance = float(special.ndtr(abs(difference) / spread)) if spread else 1.0
+    return float(special.bdtrc(needed - 1, design.scenes, chance))
+
+
+def power_of_mean(
+    deviation: float,
+    design: Design,
+    difference: float,
+    level: float = ALPHA,
+    shares: tuple[float, ...] = (),
+) -> float:
+    """The chance that the t test of these scenes sees ``difference`` at ``level``.
+
+    Trainings differ by ``deviation``, in the root mean square of the scenes, which have these
+    ``shares`` of its square (equal ones by default). The test estimates each scene's variance and
+    its own degrees of freedom. Given these, the power is that of a normal mean; the result is its
+    average over simulated variances. The far tail of the wrong sign is left out.
+    """
+    if deviation == 0:
+        return 1.0 if difference else 0.0
+    shift = abs(difference) / deviation * math.sqrt(design.scenes * design.seeds)
+    return float(special.ndtr(shift - _thresholds(design, level, shares)).mean())
+
+
+@cache
+def _thresholds(design: Design, level: float, shares: tuple[float, ...]) -> NDArray[np.float64]:
+    """The smallest means [DRAWS] that are significant, in true standard errors.
+
+    Each belongs to one draw of simulated variances of the scenes.
+    """
+    freedom = design.seeds - 1
+    variances = np.random.default_rng(0).chisquare(freedom, (DRAWS, design.scenes)) / freedom
+    variances *= shares or 1.0
+    error = np.sqrt(variances.mean(axis=1))
+    return Region(design.scenes, design.seeds, evenness(variances)).limits(level) * error
 
 
 @dataclass(frozen=True)
@@ -59,7 +182,7 @@ class Purpose:
             return math.prod(test.power(design, difference, noise) for test in (first, then))
         if not self.looks:
             return power_of_mean(deviation, design, difference, self.rate, shares)
-        shown = np.zeros(DESIGN_DRAWS, dtype=bool)
+        shown = np.zeros(DRAWS, dtype=bool)
         open_ = ~shown
         size = abs(difference) / deviation
         for mean, error, region, level in _looks(design, self.rate, shares):
@@ -73,24 +196,59 @@ class Purpose:
         return float(shown.mean())
 
     def designs(self, difference: float, noise: Components) -> list[Design]:
-        """The designs with a power of `POWER`, one per number of scenes, with the fewest seeds.
+        """The designs with a power of `POWER`, one per number of scenes, with the fewest seeds."""
+        scenes, most = (LOOK_SCENES, LOOK_SEEDS) if self.looks else (ALL_SCENES, MAX_SEEDS)
+        power = partial(self.power, difference=difference, noise=noise)
+        return fewest_seeds(power, scenes, most)
 
-        A number of scenes is left out if it needs no fewer seeds than fewer scenes do.
-        """
-        chosen: list[Design] = []
-        for scenes in LOOK_SCENES if self.looks else range(1, MAX_SCENES + 1):
-            low, high = (
-                2,
-                chosen[-1].seeds - 1 if chosen else LOOK_SEEDS if self.looks else MAX_SEEDS,
-            )
-            if high < 2 or self.power(Design(scenes, high), difference, noise) < POWER:
-                continue
-            while low < high:  # the power rises with the number of seeds
-                middle = (low + high) // 2
-                enough = self.power(Design(scenes, middle), difference, noise) >= POWER
-                low, high = (low, middle) if enough else (middle + 1, high)
-            chosen.append(Design(scenes, high))
-        return chosen
+
+def _looks(
+    design: Design, rate: float, shares: tuple[float, ...]
+) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64], Region, float]]:
+    """Means and standard errors [DRAWS] at each look, thresholds, and the level."""
+    looks = plan_looks(design.seeds)
+    levels = [rate * share for share in look_shares(len(looks))]
+    draws = np.random.default_rng(0).standard_normal((DRAWS, design.scenes, design.seeds))
+    draws *= np.sqrt(shares)[:, None]
+    for seeds, level in zip(looks, levels, strict=True):
+        pairs = draws[:, :, :seeds]
+        variances = pairs.var(axis=2, ddof=1)
+        error = np.sqrt(variances.sum(axis=1) / seeds) / design.scenes
+        region = Region(design.scenes, seeds, evenness(variances))
+        yield pairs.mean(axis=(1, 2)), error, region, level
+
+
+# ---- the designs that suffice
+
+
+def fewest_seeds(
+    power: Callable[[Design], float], scenes: Iterable[int], most: int = MAX_SEEDS
+) -> list[Design]:
+    """The designs with a power of `POWER`, one per number of ``scenes``, with the fewest seeds.
+
+    A number of scenes is left out if it needs more than ``most`` seeds, or no fewer seeds than
+    fewer scenes do. The power rises with the number of seeds.
+    """
+    chosen: list[Design] = []
+    for count in scenes:
+        low, high = 2, chosen[-1].seeds - 1 if chosen else most
+        if high < low or power(Design(count, high)) < POWER:
+            continue
+        while low < high:
+            middle = (low + high) // 2
+            enough = power(Design(count, middle)) >= POWER
+            low, high = (low, middle) if enough else (middle + 1, high)
+        chosen.append(Design(count, high))
+    return chosen
+
+
+def seeds_needed(deviation: float, scenes: int, difference: float) -> int | None:
+    """The seeds of each arm that see ``difference`` on these ``scenes`` with a power of `POWER`.
+
+    None above `MAX_SEEDS`.
+    """
+    power = partial(power_of_mean, deviation, difference=difference)
+    return next((one.seeds for one in fewest_seeds(power, [scenes])), None)
 
 
 @dataclass(frozen=True)
@@ -125,47 +283,22 @@ class Plan:
 
 
 def make_plan(components: Components, difference: float, purpose: Purpose, most: int) -> Plan:
-    """The plan to show ``difference``, with at most ``most`` designs for each statement."""
+    """The plan to show ``difference``, with at most ``most`` designs for each statement.
 
-    def fewest(designs: Sequence[Design]) -> tuple[Design, ...]:
+    Statements about scenes like these start at `MIN_SCENES`.
+    """
+
+    def cheapest(designs: Sequence[Design]) -> tuple[Design, ...]:
         return tuple(sorted(designs, key=lambda design: (design.trials, design.scenes))[:most])
 
-    these, like_these = fewest(purpose.designs(difference, components)), None
+    these, like_these = cheapest(purpose.designs(difference, components)), None
     if components.between is not None:
-        like_these = fewest(designs_needed(difference, components, like_these=True))
+        power = partial(power_like_these, difference=difference, components=components)
+        like_these = cheapest(fewest_seeds(power, range(MIN_SCENES, MAX_SCENES + 1)))
     low, high = deviation_range(replace(components, within=1.0))
     powers = None
     if these:
-        of_first = partial(purpose.power, these[0], difference)
         ends = [replace(components, within=one * components.within) for one in (high, low)]
-        powers = of_first(ends[0]), of_first(ends[1])
-    factors = low, high
-    return Plan(components, these, like_these, factors, powers)
-
-
-def deviation_range(components: Components) -> tuple[float, float]:
-    """The deviations between which that of trainings lies in `UNSURE` of such pilots."""
-    degrees = components.trials - components.scenes
-    tails = (1 - (1 - UNSURE) / 2, (1 - UNSURE) / 2)
-    low, high = (math.sqrt(degrees / special.chdtri(degrees, 1 - tail)) for tail in tails)
-    return components.within * low, components.within * high
-
-
-def _looks(
-    design: Design, rate: float, shares: tuple[float, ...]
-) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64], Region, float]]:
-    """Means and standard errors [DESIGN_DRAWS] at each look, thresholds, and the level."""
-    looks = plan_looks(design.seeds)
-    levels = [rate * share for share in look_shares(len(looks))]
-    draws = np.random.default_rng(0).standard_normal((DESIGN_DRAWS, design.scenes, design.seeds))
-    draws *= np.sqrt(shares)[:, None]
-    for seeds, level in zip(looks, levels, strict=True):
-        pairs = draws[:, :, :seeds]
-        variances = pairs.var(axis=2, ddof=1)
-        error = np.sqrt(variances.sum(axis=1) / seeds) / design.scenes
-        yield (
-            pairs.mean(axis=(1, 2)),
-            error,
-            Region(design.scenes, seeds, evenness(variances)),
-            level,
-        )
+        worst, best = (purpose.power(these[0], difference, one) for one in ends)
+        powers = worst, best
+    return Plan(components, these, like_these, (low, high), powers)

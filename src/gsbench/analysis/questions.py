@@ -24,6 +24,7 @@ from typing import Any, Literal
 
 from gsbench.analysis.addresses import ArmName
 from gsbench.analysis.statistics import ALPHA, MIN_SCENES, sign_test_needs
+from gsbench.analysis.trial_result import Trained
 from gsbench.analysis.trial_settings import canonical
 from gsbench.errors import InputError
 from gsbench.runs.commands import Digest, History, Place, Question, code_in
@@ -120,56 +121,18 @@ def read_least(value: float | str, where: str) -> LeastEffect:
 # ---- the trials of a command, and of earlier ones
 
 
-@dataclass(frozen=True)
-class Row:
-    """A planned or finished trial as far as questions depend on it.
-
-    ``config`` has the settings with dotted keys, ``variant`` those that were swept.
-    """
-
-    scene: str
-    init: str
-    densify: str
-    config_hash: str
-    seed: int
-    config: Mapping[str, Any] = field(repr=False)
-    digest: Digest
-    variant: tuple[tuple[str, str], ...] = ()
-
-    @property
-    def key(self) -> str:
-        return f"{self.scene}/{self.init}-{self.densify}/{self.config_hash}"
-
-    @property
-    def arm(self) -> Arm:
-        return Arm(self.init, self.densify, self.variant)
-
-    @property
-    def place(self) -> Place:
-        return self.scene, self.seed
-
-    @property
-    def recipe(self) -> str:
-        """The settings and the code, equal for trials that differ in scene and seed alone."""
-        kept = {
-            key: value
-            for key, value in self.config.items()
-            if value is not None and not is_ignored(key) and not is_of_scene(key)
-        }
-        return f"{self.init}-{self.densify} {code_in(self.digest)} {canonical(kept)}"
+def place_of(row: Trained) -> Place:
+    return row.scene, row.seed
 
 
-def rows_of(trials: Iterable[Any]) -> list[Row]:
-    """Finished trials, with their variants, as rows."""
-    return [
-        Row(
-            *(trial.scene, trial.init, trial.densify, trial.config_hash, trial.seed),
-            config=trial.config,
-            digest=trial.digest,
-            variant=trial.variant,
-        )
-        for trial in trials
-    ]
+def recipe_of(row: Trained) -> str:
+    """The settings and the code, equal for trials that differ in scene and seed alone."""
+    kept = {
+        key: value
+        for key, value in row.config.items()
+        if value is not None and not is_ignored(key) and not is_of_scene(key)
+    }
+    return f"{row.init}-{row.densify} {code_in(row.digest)} {canonical(kept)}"
 
 
 @dataclass(frozen=True)
@@ -191,7 +154,7 @@ class NamedQuestion:
     says: str = ""
     where: str = ""
 
-    def rows(self, word: str, planned: Sequence[Row]) -> list[Row]:
+    def rows(self, word: str, planned: Sequence[Trained]) -> list[Trained]:
         """The planned trials of the arm called ``word``; raises InputError unless it is one."""
         name = ArmName.read(word)
         found = [
@@ -231,7 +194,7 @@ class Asked:
 
 
 def ask(
-    planned: Sequence[Row], asked: Asked, measured: Sequence[Row], history: History
+    planned: Sequence[Trained], asked: Asked, measured: Sequence[Trained], history: History
 ) -> tuple[list[Question], list[str]]:
     """The new questions of a command, and the ids of earlier ones that cover its trials.
 
@@ -248,7 +211,7 @@ def ask(
         ]
     else:
         pairs = choose_pairs(planned, asked, measured)
-        drafts = [_about(*pair, planned, asked, measured) for pair in pairs]
+        drafts = [draft(*pair, planned, asked, measured) for pair in pairs]
     return _with_levels(drafts, planned, asked, measured, history)
 
 
@@ -257,14 +220,14 @@ def _named_draft(
     named: NamedQuestion,
     sign: int,
     least: LeastEffect | None,
-    planned: Sequence[Row],
+    planned: Sequence[Trained],
     asked: Asked,
-    measured: Sequence[Row],
+    measured: Sequence[Trained],
 ) -> Question:
     ideas, baselines = (named.rows(word, planned) for word in (named.idea, named.baseline))
-    draft = _about(baselines[0].arm, ideas[0].arm, [*baselines, *ideas], asked, measured)
+    question = draft(baselines[0].arm, ideas[0].arm, [*baselines, *ideas], asked, measured)
     return replace(
-        draft,
+        question,
         metric=named.metric or asked.metric,
         sign=sign,  # type: ignore[arg-type]
         least=None if least is None else least.size,
@@ -276,7 +239,7 @@ def _named_draft(
 
 
 def choose_pairs(
-    planned: Sequence[Row], asked: Asked, measured: Sequence[Row] = ()
+    planned: Sequence[Trained], asked: Asked, measured: Sequence[Trained] = ()
 ) -> list[tuple[Arm, Arm]]:
     """The pairs (baseline, idea) of arms that a command asks about.
 
@@ -328,9 +291,9 @@ def _unlike(arm: Arm, other: Arm, configs: Mapping[Arm, Mapping[str, str]]) -> i
 
 def _with_levels(
     drafts: Sequence[Question],
-    planned: Sequence[Row],
+    planned: Sequence[Trained],
     asked: Asked,
-    measured: Sequence[Row],
+    measured: Sequence[Trained],
     history: History,
 ) -> tuple[list[Question], list[str]]:
     """The ``drafts`` that no earlier question covers, with levels, and the ids of those that do."""
@@ -356,9 +319,14 @@ def _with_levels(
     return levelled, list(dict.fromkeys(shown))
 
 
-def _about(
-    baseline: Arm, idea: Arm, planned: Sequence[Row], asked: Asked, measured: Sequence[Row]
+def draft(
+    baseline: Arm,
+    idea: Arm,
+    planned: Sequence[Trained],
+    asked: Asked,
+    measured: Sequence[Trained] = (),
 ) -> Question:
+    """The question about an idea's trials, without a level."""
     digests: dict[str, tuple[Digest, Digest]] = {}
     seeds: dict[str, tuple[int, ...]] = {}
     for row in planned:
@@ -398,11 +366,11 @@ def _texts(config: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _with_doubt(
-    question: Question, planned: Sequence[Row], measured: Sequence[Row], history: History
+    question: Question, planned: Sequence[Trained], measured: Sequence[Trained], history: History
 ) -> Question:
     """The question, with the reason if results could have chosen its trials."""
-    own = {row.recipe for row in planned if row.digest in _ideas(question)}
-    seen = {row.place for row in measured if row.recipe in own}
+    own = {recipe_of(row) for row in planned if row.digest in _ideas(question)}
+    seen = {place_of(row) for row in measured if recipe_of(row) in own}
     if seen & question.places and (gone := seen - question.places):
         return replace(question, untested=f"it leaves out measured trials: {places_text(gone)}")
     earlier = [one for one in history.questions if one.idea.name == question.idea.name]
@@ -442,12 +410,12 @@ def places_text(places: Iterable[Place]) -> str:
     return "; ".join(texts)
 
 
-def _earlier(name: str, measured: Sequence[Row], history: History) -> list[set[Place]]:
+def _earlier(name: str, measured: Sequence[Trained], history: History) -> list[set[Place]]:
     """The places of each earlier command about the idea called ``name`` that gave a result.
 
     Results of which no command asked count as those of a command for each version.
     """
-    done = history.results | {(row.digest, row.place) for row in measured}
+    done = history.results | {(row.digest, place_of(row)) for row in measured}
     found, asked = list[set[Place]](), set[tuple[Digest, Place]]()
     for command in history.commands:
         own = [one for one in command.questions if one.idea.name == name]
@@ -455,7 +423,7 @@ def _earlier(name: str, measured: Sequence[Row], history: History) -> list[set[P
         asked |= trials
         if trials & done:
             found.append({place for _, place in trials})
-    recipes = {row.digest: row.recipe for row in measured}
+    recipes = {row.digest: recipe_of(row) for row in measured}
     rest: dict[str, set[Place]] = {}
     for digest, place in done - asked:
         if digest.partition("/")[0] == name:

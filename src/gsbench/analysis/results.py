@@ -67,11 +67,6 @@ class Unfinished:
     def label(self) -> str:
         return "/".join(self.path.parts[-4:])
 
-    @property
-    def by_key(self) -> "Unfinished":
-        """The same, with the trial's key in place of its digest, as a ledger names trials."""
-        return replace(self, digest=f"{self.scene}/{self.digest.partition('+')[0]}")
-
     def is_of(self, question: Question, side: int | None = None) -> bool:
         """Return whether a question is about it, as a trial of this side (1: the idea)."""
         sides = question.digests.get(self.scene, ())

@@ -9,7 +9,6 @@ from gsbench.analysis.statistics import (
     SUPPORTED,
     TOO_SMALL,
     UNDECIDED,
-    Interval,
     Outcome,
     exact_for,
 )
@@ -19,8 +18,9 @@ from gsbench.analysis.verdicts import (
     NOT_TESTED,
     RUNNING,
     STOPPED,
-    SceneEstimate,
     Verdict,
+    gives_up,
+    passes,
 )
 from gsbench.words import command, counted, least_text, some_of
 
@@ -32,12 +32,6 @@ WORDS: dict[Outcome, str] = {
     "refuted": "worse",
     "too small to matter": "too small to matter",
     "undecided": "undecided",
-}
-SYMBOLS: dict[Outcome, str] = {
-    "supported": "▲",
-    "refuted": "▼",
-    "too small to matter": "≈",
-    "undecided": "●",
 }
 
 
@@ -129,6 +123,10 @@ def reason(verdict: Verdict) -> str:
         return f"undecided, since {lacking_words(verdict.lacking)}"
     if verdict.interval is None:
         return "undecided: one pair of trainings has no test"
+    if gives_up(verdict):
+        return f"a gain of {least_words(verdict)} is unlikely"
+    if passes(verdict):
+        return f"not worse by {least_words(verdict)}"
     return f"undecided{'' if verdict.final else ' so far'}"
 
 
@@ -248,18 +246,6 @@ def lacking_words(lacking: Sequence[Unfinished]) -> str:
         f"{counted(len(lacking), 'trial')} of one arm alone failed, stopped, went missing or gave "
         f"no value, perhaps its bad ones: {some_of([one.label for one in lacking])}"
     )
-
-
-def p_text(p: float) -> str:
-    """``below 0.001``, or p with three decimals."""
-    return "below 0.001" if p < 0.001 else f"{p:.3f}"
-
-
-def scene_words(verdict: Verdict, scene: SceneEstimate) -> str:
-    """``garden: +0.30 (95 % interval +0.10 to +0.50), not tested``"""
-    interval: Interval | None = scene.interval
-    shown = "" if interval is None else f" (95 % interval {verdict.shown_interval(interval)})"
-    return f"{scene.scene}: {verdict.shown(scene.mean)}{shown}, not tested"
 
 
 def risk(verdicts: Sequence[Verdict]) -> str:

@@ -138,18 +138,12 @@ class LikeThese:
     """A statement about scenes like the given ``scenes``.
 
     In ``helped`` of them the difference has the asked sign. In ``beyond`` of them it is at
-    least the least that matters; None if that is not known. ``share`` is the exact interval
-    (Clopper and Pearson 1934) of the share of such scenes with the sign. ``median`` is the
-    interval of the median of such means, from order statistics; None with too few scenes for
-    ``level``. ``p`` is that of the sign test.
+    least the least that matters; None if that is not known.
     """
 
     scenes: int
     helped: int
     beyond: int | None
-    share: Interval
-    median: Interval | None
-    p: float
     level: float
     outcome: Outcome
 
@@ -158,20 +152,11 @@ class LikeThese:
         """The number of scenes that must agree in sign to decide; None if all would not suffice."""
         return sign_test_needs(self.scenes, self.level)
 
-    def power(self, share: float = 0.9) -> float:
-        """The chance to decide if this share of scenes like these gains."""
-        if self.needed is None:
-            return 0.0
-        return float(special.bdtrc(self.needed - 1, self.scenes, share))
-
 
 def exact_for(seeds: int) -> str:
     """The meaning of "better" about scenes like these, in words; "worse" says the opposite."""
     mean = "one training" if seeds == 1 else f"the mean of {seeds} trainings"
     return f"on a new scene like these, {mean} of the arm would more often be better"
-
-
-EXACT_FOR_PEOPLE = "a new person, asked the same pairs, would more often prefer it"
 
 
 def judge_like_these(
@@ -185,15 +170,11 @@ def judge_like_these(
     if count < MIN_SCENES:
         return None
     toward = means * (sign or 1)
-    helped, hurt = int((toward > 0).sum()), int((toward < 0).sum())
     median = median_interval(means, level)
     return LikeThese(
         count,
-        helped,
+        int((toward > 0).sum()),
         None if least is None else int((toward >= least).sum()),
-        _share_interval(helped, count, level),
-        median,
-        _sign_p(max(helped, hurt), count),
         level,
         "undecided" if median is None else outcome_of(median, sign, least),
     )
@@ -220,13 +201,3 @@ def sign_test_needs(scenes: int, level: float) -> int | None:
 def _sign_p(agree: int, count: int) -> float:
     """The two-sided p of the sign test if ``agree`` of ``count`` have the same sign."""
     return min(1.0, 2 * float(special.bdtrc(agree - 1, count, 0.5))) if agree else 1.0
-
-
-def _share_interval(helped: int, count: int, level: float) -> Interval:
-    low = float(special.betaincinv(helped, count - helped + 1, level / 2)) if helped else 0.0
-    high = (
-        float(special.betaincinv(helped + 1, count - helped, 1 - level / 2))
-        if helped < count
-        else 1.0
-    )
-    return Interval(low, high)

@@ -124,7 +124,7 @@ def build_table(
         tuple(headings),
         tuple(shown),
         tuple(map(str, by_weight(notes))),
-        verdicts=tuple(filter(None, [*comparison.lines, comparison.risk])),
+        verdicts=tuple(filter(None, [*(one.line for one in comparison.answers), comparison.risk])),
     )
 
 

@@ -226,3 +226,31 @@ class TrialResult:
             or budget.seconds is not None
             or events.get("blocked_by_cap") != 0
         )
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A planned trial as far as questions depend on it.
+
+    ``config`` has the settings with dotted keys, ``variant`` those that were swept.
+    """
+
+    scene: str
+    init: str
+    densify: str
+    config_hash: str
+    seed: int
+    config: Mapping[str, Any] = field(repr=False)
+    digest: Digest
+    variant: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def key(self) -> str:
+        return f"{self.scene}/{self.init}-{self.densify}/{self.config_hash}"
+
+    @property
+    def arm(self) -> Arm:
+        return Arm(self.init, self.densify, self.variant)
+
+
+Trained = Planned | TrialResult  # or to be trained

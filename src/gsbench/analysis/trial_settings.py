@@ -4,7 +4,7 @@ import json
 import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any
 
 from gsbench.parsing import DamagedError, lines_in
 from gsbench.runs.config_hash import is_hashed, is_ignored
@@ -87,22 +87,3 @@ def settings_text(config: Mapping[str, Any]) -> str:
     return canonical(
         {key: value for key, value in config.items() if value is not None and not is_ignored(key)}
     )
-
-
-class Configured(Protocol):
-    """A trial with its place and its settings, finished or only planned."""
-
-    __dataclass_fields__: ClassVar[dict[str, Any]]
-
-    @property
-    def scene(self) -> str: ...
-    @property
-    def init(self) -> str: ...
-    @property
-    def densify(self) -> str: ...
-    @property
-    def config_hash(self) -> str: ...
-    @property
-    def config(self) -> Mapping[str, Any]: ...
-    @property
-    def key(self) -> str: ...

@@ -13,10 +13,10 @@ import numpy as np
 
 from gsbench.analysis.differences import between_scenes_notes
 from gsbench.analysis.notes import Note
-from gsbench.analysis.pairs import SAME_CAPTURE, Pairs, are_equal, pair, pair_sides
+from gsbench.analysis.pairs import SAME_CAPTURE, Pairs, are_equal, pair
 from gsbench.analysis.quantities import Quantity, asked_quantity
 from gsbench.analysis.questions import look_shares
-from gsbench.analysis.results import TrialResult, Unfinished, group_by
+from gsbench.analysis.results import TrialResult, Unfinished, group_by, trials_of
 from gsbench.analysis.statistics import (
     ALPHA,
     UNDECIDED,
@@ -29,7 +29,7 @@ from gsbench.analysis.statistics import (
     outcome_of,
     t_test,
 )
-from gsbench.runs.commands import BY_COMMAND, Question
+from gsbench.runs.commands import BY_COMMAND, LOND, SCREENING, Question
 from gsbench.runs.experiments import Arm
 from gsbench.words import signed
 
@@ -38,6 +38,11 @@ OUTLYING = 5.0
 LEAST_OTHERS = 2  # the fewest other trials that this needs
 # corrects the median sample deviation of three trials, which is too small: 1 / sqrt(ln 2)
 FEW = 1.2
+
+# The chance, at each look, that an idea of a ledger that is as good as the least difference that
+# matters is given up. It costs power and cannot make a false discovery.
+GIVE_UP = 0.05
+GATE = "gate"  # the rule of a gate's question
 
 State = Literal["answered", "running", "stopped", "not tested", "not asked beforehand"]
 ANSWERED: State = "answered"
@@ -248,10 +253,22 @@ def _at_looks(asked: Verdict) -> Verdict:
             break
         at_look = replace(asked, pairs=asked.pairs.first(seeds), level=rate * share)
         verdict = replace(_decide(at_look), state=ANSWERED)
-        verdict = replace(verdict, final=verdict.outcome != UNDECIDED or seeds == looks[-1])
+        decided = verdict.outcome != UNDECIDED or passes(verdict) or gives_up(verdict)
+        verdict = replace(verdict, final=decided or seeds == looks[-1])
         if verdict.final:
             return verdict
     return replace(verdict, state=RUNNING if asked.state == ANSWERED else asked.state)
+
+
+def passes(verdict: Verdict) -> bool:
+    """Return whether an undecided gate ends: its version is not worse by the least difference."""
+    return verdict.question.rule == GATE and verdict.outcome == UNDECIDED and verdict.loss_excluded
+
+
+def gives_up(verdict: Verdict) -> bool:
+    """Return whether an undecided idea of a ledger ends: a gain is unlikely (`GIVE_UP`)."""
+    in_ledger = verdict.question.rule in (SCREENING, LOND) and verdict.outcome == UNDECIDED
+    return in_ledger and verdict.gain_excluded(GIVE_UP)
 
 
 def _measure(verdict: Verdict) -> Verdict:
@@ -355,25 +372,25 @@ def interval_of(
     """Mean and 95 % interval of all trials of two arms in any metric; it is no verdict."""
     own = [trial for trial in trials if trial.arm in (baseline, idea)]
     quantity = asked_quantity(metric, own)
-    sides = {
-        scene: ([t for t in of_scene if t.arm == baseline], [t for t in of_scene if t.arm == idea])
-        for scene, of_scene in group_by(own, lambda trial: trial.scene).items()
+    seeds = {
+        arm: {
+            scene: {trial.seed for trial in of_scene}
+            for scene, of_scene in group_by(trials_of(own, arm), lambda trial: trial.scene).items()
+        }
+        for arm in (baseline, idea)
     }
-    sides = {scene: both for scene, both in sides.items() if all(both)}
+    scenes = [scene for scene in seeds[baseline] if scene in seeds[idea]]
     question = Question(
         idea=idea,
         baseline=baseline,
         metric=metric,
         sign=quantity.direction,  # type: ignore[arg-type]
         least=quantity.worthwhile,
-        digests={scene: (one[0].digest, two[0].digest) for scene, (one, two) in sides.items()},
-        seeds={
-            scene: tuple(sorted({t.seed for t in one} & {t.seed for t in two}))
-            for scene, (one, two) in sides.items()
-        },
+        digests=dict.fromkeys(scenes, (str(baseline), str(idea))),
+        seeds={one: tuple(sorted(seeds[baseline][one] & seeds[idea][one])) for one in scenes},
         untested=why or state,
     )
-    pairs = pair_sides(sides, question)
+    pairs = pair(own, question, lambda trial: str(trial.arm))
     notes = (*pairs.left_out, *between_scenes_notes(pairs.of_baseline, pairs.of_arm))
     verdict = Verdict(question, quantity, pairs, state, ALPHA, done=len(own), notes=notes)
     verdict = _measure(verdict)

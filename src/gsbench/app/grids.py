@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from hydra.core.override_parser.types import Override
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 
-from gsbench.analysis.advice import GRIDS
 from gsbench.analysis.questions import plan_looks
 from gsbench.analysis.results import read_experiment
 from gsbench.app.sweep import Run, Sweep
@@ -21,15 +20,20 @@ from gsbench.app.tuning import tuned_jobs
 from gsbench.claims.stopping import Needed, SequentialTest, log_verdicts
 from gsbench.config.command_words import grid_points, is_interval
 from gsbench.config.compose import Trial
-from gsbench.config.groups import GROUPS
-from gsbench.config.overrides import bare_key, key_of, value_text
+from gsbench.config.overrides import bare_key, is_sweep, key_of, value_text
 from gsbench.errors import InputError
 from gsbench.files import checked_runs_folder, make_runs_folder
 from gsbench.launch.record import check_looks, planned_rows, record
 from gsbench.runs.layout import RESULTS
-from gsbench.words import listed
 
+GRIDS = "hydra.sweeper.grids"
 log = logging.getLogger(__name__)
+
+# for a setting that only some of the listed choices may have
+GRIDS_ADVICE = (
+    f"give each choice its own settings, as '{GRIDS}=[{{densify: adc}}, {{densify: volumetric, "
+    'densify.volume_threshold: "0.01,0.03"}]\''
+)
 
 
 def run_sweep(sweep: Sweep, run: Run) -> None:
@@ -66,12 +70,11 @@ def planned_trials(sweep: Sweep, run: Run | None) -> tuple[list[Trial], bool]:
         jobs, are_known = tuned_jobs(sweep, tune or {}, jobs, intervals, run)
         trials = sweep.composer.trials(jobs)
     except InputError as error:
-        # A setting that only some of the listed choices have is the usual cause, and grids are its
-        # remedy: the message writes them out.
-        typed = {bare_key(word.get_key_element()): word for word in sweep.parse(sweep.task_words)}
-        if grids or not (advice := _advise_grids(sweep, typed)):
+        keys = [key_of(word) for word in sweep.task_words]
+        groups = {key_of(word) for word in sweep.task_words if is_sweep(word)}
+        if grids or not any("." in key and key.partition(".")[0] in groups for key in keys):
             raise
-        raise InputError(advice) from error
+        raise InputError(f"{error}; {GRIDS_ADVICE}") from error
     if run is None and any(trial.values["launch"]["stop_when_decided"] for trial in trials):
         seeds = check_looks(trials, planned_rows(trials))
         print(f"stops when decided: looks at {', '.join(map(str, plan_looks(len(seeds))))} seeds")
@@ -170,56 +173,6 @@ def words_of_grids(
 def _signed(word: str, sign: str) -> str:
     """A word that sets a value, with the ``sign`` (``+``) if it has none."""
     return word if word.startswith(("+", "~")) else f"{sign}{word}"
-
-
-def _advise_grids(sweep: Sweep, typed: Mapping[str, Override]) -> str:
-    """The grids for choices of which only some have a typed setting; "" if that is no fault here.
-
-    ``typed`` are the typed words by their keys.
-    """
-    for group in GROUPS:
-        choices = typed.get(group)
-        keys_of_group = [
-            key
-            for key, word in typed.items()
-            if key.startswith(f"{group}.") and not word.is_add() and not word.is_delete()
-        ]
-        if choices is None or not choices.is_discrete_sweep() or not keys_of_group:
-            continue
-        lacking: dict[tuple[str, ...], list[str]] = {}  # {settings: the choices that lack them}
-        for choice in map(str, choices.sweep_string_iterator()):
-            node = sweep.composer.settings([f"{group}={choice}"])
-            lacking.setdefault(
-                tuple(key for key in keys_of_group if not _has(node, key)), []
-            ).append(choice)
-        words = [choices.input_line, *(typed[key].input_line for key in keys_of_group)]
-        if len(lacking) == 1 or any(mark in str(word) for word in words for mark in "'\""):
-            continue
-        arms = []
-        for missing, names in lacking.items():
-            values = {group: ",".join(names)}
-            values |= {
-                key: str(typed[key].input_line).partition("=")[2]
-                for key in keys_of_group
-                if key not in missing
-            }
-            arms.append(", ".join(f'{key}: "{value}"' for key, value in values.items()))
-        faults = [
-            f"{listed(names)} {'has' if len(names) == 1 else 'have'} no {listed(keys)}"
-            for keys, names in lacking.items()
-            if keys
-        ]
-        return (
-            f"{'; '.join(faults)}: in place of {' '.join(map(str, words))} give "
-            f"'{GRIDS}=[{', '.join(f'{{{arm}}}' for arm in arms)}]'"
-        )
-    return ""
-
-
-def _has(config: DictConfig, key: str) -> bool:
-    parent, _, name = key.rpartition(".")
-    node = OmegaConf.select(config, parent)
-    return OmegaConf.is_dict(node) and name in node
 
 
 def _text(key: object, value: object) -> str:

@@ -1,65 +1,40 @@
 """Hydra's path: other sweepers and launchers than gsbench's own, callbacks, Hydra's files and logs.
 
 `hydra.main` starts the chosen sweeper. Its launcher is always gsbench's, which composes and checks
-the jobs that the sweeper proposes, and runs them itself or by the chosen launcher. A sweeper that
-searches gets the values of validation views, in an experiment of its own.
-
-Below the runs folder, which may be a stranger's, Hydra's files lie in `FOLDER`: no link there is
-followed, and no result of a job is read from a place that somebody could have prepared.
+the jobs that the sweeper proposes, and runs them itself or by the chosen launcher.
 """
 
 import logging
 import os
-import secrets
-import shlex
-import statistics
-import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext, redirect_stderr
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import hydra
-import hydra.utils
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.plugins import Plugins
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.types import HydraContext
 from omegaconf import DictConfig, OmegaConf, read_write
 
-from gsbench.analysis.advice import GRIDS
-from gsbench.app.grids import run_sweep
-from gsbench.app.sweep import DEFAULT_METRIC, HYDRA_ERRORS, OWN, Ended, Sweep, better_direction
-from gsbench.config.command_words import grid_points
+from gsbench.app.arm_search import Goal, goal_of
+from gsbench.app.grids import GRIDS, run_sweep
+from gsbench.app.hydra_main import FOLDER, run_main, words_for_files, words_for_new_folder
+from gsbench.app.sweep import BASIC, HYDRA_ERRORS, OWN, Ended, Sweep
 from gsbench.config.compose import Trial, check_permitted, trial_of_job
-from gsbench.config.hydra_setup import CONFIG_NAME, VERSION_BASE, installed_nodes
-from gsbench.config.overrides import bare_key, is_sweep, key_of, parse_word, task_words
-from gsbench.config.schema import register_schemas
-from gsbench.config.trust import HYDRAS_CALLBACKS, load_callbacks
+from gsbench.config.hydra_setup import installed_nodes
+from gsbench.config.overrides import is_sweep, key_of, task_words
 from gsbench.errors import GsbenchError, InputError
 from gsbench.files import checked_runs_folder
 from gsbench.launch.batch import begin_for_another_launcher
 from gsbench.launch.jobs import check_job_links
 from gsbench.launch.outcomes import Outcome, outcome_of_error
 from gsbench.logs import set_up_logging
-from gsbench.runs.experiments import metric_and_question
-from gsbench.runs.nested import targets_in
-from gsbench.system.install import conf_dir
-from gsbench.system.own_modules import allow_modules
-from gsbench.words import command, counted
+from gsbench.system.programs import allow_modules
+from gsbench.words import command
 
-BASIC = "basic"  # Hydra's own sweeper, which expands lists, and its launcher
 MODE = "hydra.mode"
-FOLDER = ".hydra"  # below the runs folder
-HYDRAS_FILES = ("run", "sweep", "output_subdir")  # settings of Hydra's own files
-SWEEP_DIR = "hydra.sweep.dir"
-HYDRAS_LINE = "Error executing job with overrides"
-# Within this context, Hydra 1.4 and later instantiates only the named classes (``mine.*``: all of a
-# module).
-WHITELIST: Callable[[Sequence[str]], AbstractContextManager[Any]] = getattr(
-    hydra.utils, "execution_whitelist", lambda names: nullcontext()
-)
+LAUNCHER = ("hydra/launcher", "hydra.launcher.")
 RunBatch = Callable[..., list[Outcome]]  # `gsbench.launch.batch.run_batch`
 
 log = logging.getLogger(__name__)
@@ -112,7 +87,8 @@ class HydraApp:
 
     sweep: Sweep
     run: RunBatch
-    goal: "Goal | None" = None  # of a sweeper that searches
+    launcher: str  # its name
+    goal: Goal | None = None  # of a sweeper that searches
     ended: Ended = field(default_factory=Ended)
 
     @property
@@ -158,19 +134,18 @@ class HydraApp:
         self, trials: Sequence[Trial], context: HydraContext, config: DictConfig, asks: bool
     ) -> list[Outcome]:
         """Run trials, which are checked, by the chosen launcher."""
-        name = chosen_launcher(self.sweep)
-        if name == OWN:
+        if self.launcher == OWN:
             outcomes = self.run(trials, asks=asks)
         else:
             begin_for_another_launcher(trials, asks)
-            outcomes = self._by(name, trials, context, config)
+            outcomes = self._by_launcher(trials, context, config)
         self.ended.add(trials, outcomes)
         return outcomes
 
-    def _by(
-        self, name: str, trials: Sequence[Trial], context: HydraContext, config: DictConfig
+    def _by_launcher(
+        self, trials: Sequence[Trial], context: HydraContext, config: DictConfig
     ) -> list[Outcome]:
-        own = self.sweep.config.hydra
+        own, name = self.sweep.config.hydra, self.launcher
         is_typed = own.runtime.choices["hydra/launcher"] == name
         files = own if is_typed else installed_nodes((f"hydra/launcher={name}",))
         # A sweeper of others was started with gsbench's launcher. The launcher composes each job by
@@ -221,13 +196,15 @@ def run_by_hydra(sweep: Sweep, run: RunBatch) -> Ended | None:
         return None
     files = words_for_files(config, sweep.words, sweep.multirun)
     has_plugins = config.hydra.callbacks or config.hydra.hydra_logging.get("root")
-    launcher = config.hydra.runtime.choices["hydra/launcher"]
+    launcher = str(config.hydra.runtime.choices["hydra/launcher"])
     if not (sweep.other_sweeper or files or launcher != OWN or has_plugins):
         return None
     # First the folder itself, since Hydra would follow a link in its place.
     runs = checked_runs_folder(config.runs)
     check_job_links(runs, runs / FOLDER)
-    app = HydraApp(sweep, run)
+    # Hydra's own files are written by its launchers alone.
+    is_serial = launcher == OWN and files and config.launch.name == "serial"
+    app = HydraApp(sweep, run, BASIC if is_serial else launcher)
     words = [*sweep.words, *files, *words_for_new_folder(sweep)]
     words.append(f"{MODE}={config.hydra.mode.name}")
     if not sweep.other_sweeper:
@@ -238,15 +215,11 @@ def run_by_hydra(sweep: Sweep, run: RunBatch) -> Ended | None:
     app.goal = goal_of(sweep)
     if app.goal:  # its seeds are no part of the search
         words = [word for word in words if key_of(word) != "seed" or not is_sweep(word)]
-        words += ["~hydra.sweeper.params.seed"] * (
-            "seed" in (config.hydra.sweeper.get("params") or {})
-        )
+        params = config.hydra.sweeper.get("params") or {}
+        words += ["~hydra.sweeper.params.seed"] * ("seed" in params)
     kept = [word for word in words if not _is_of_launcher(word)]
     _search(app, [*kept, f"hydra/launcher={OWN}"])
     return app.ended
-
-
-LAUNCHER = ("hydra/launcher", "hydra.launcher.")
 
 
 def _is_of_launcher(word: str) -> bool:
@@ -276,13 +249,6 @@ def _search(app: HydraApp, words: Sequence[str]) -> None:
         log.info("hydra/sweeper=%s: %s", name, best)
 
 
-def chosen_launcher(sweep: Sweep) -> str:
-    """The launcher of a sweep: for Hydra's own files one after the other, Hydra's basic one."""
-    name = str(sweep.config.hydra.runtime.choices["hydra/launcher"])
-    files = words_for_files(sweep.config, sweep.words, sweep.multirun)
-    return BASIC if name == OWN and files and sweep.config.launch.name == "serial" else name
-
-
 def words_without_sweeper(sweep: Sweep) -> tuple[list[str], bool]:
     """The words of a dry run of another sweeper, and whether they are a sweep."""
     kept = [
@@ -299,210 +265,3 @@ def words_without_sweeper(sweep: Sweep) -> tuple[list[str], bool]:
         "they are not known yet"
     )
     return [*(word for word in kept if not is_sweep(word)), f"hydra/sweeper={OWN}"], False
-
-
-# ---- a search by another sweeper
-
-
-@dataclass
-class Goal:
-    """The space that another sweeper searches, and the trials of its points, which lie in ``home``.
-
-    A point's value is the mean of a metric over the ``seeds`` (words; none: the job's own seed) on
-    validation views. ``sign`` says what the sweeper looks for: the largest value (1) or the least
-    (-1). A metric whose better ``direction`` is the other one is negated.
-    """
-
-    home: str
-    metric: str
-    direction: int
-    sign: int
-    seeds: tuple[str, ...] = ()
-    values: dict[tuple[str, ...], float] = field(default_factory=dict)  # of the jobs
-
-    def jobs_of(self, job: Sequence[str]) -> list[list[str]]:
-        """The words of a point's trials."""
-        words = [*job, f"name={self.home}", "scene.validation=true", "eval.primary=null"]
-        return [[*words, *seed] for seed in ([word] for word in self.seeds)] or [words]
-
-    def value(self, job: Sequence[str], trials: Sequence[Trial]) -> float:
-        """The value of a job with its ``trials``, which are done.
-
-        Raises GsbenchError if one lacks the metric.
-        """
-        records = [trial.files.sound_record() for trial in trials]
-        values = [record.metrics.get(self.metric) for record in records if record is not None]
-        found = [value for value in values if value is not None]
-        if len(found) < len(trials):
-            raise GsbenchError(
-                f"{trials[0].files.label} has no {self.metric}, which the sweeper needs"
-            )
-        value = statistics.fmean(found) * self.direction * self.sign
-        self.values[tuple(job)] = value
-        return value
-
-    def best_line(self) -> str:
-        """The best values, with the command that trains them; "" if no point has a value."""
-        if not self.values:
-            return ""
-        best = max(self.values, key=lambda job: self.values[job] * self.sign)
-        swept = [word for word in best if not all(word in job for job in self.values)]
-        value = self.values[best] * self.direction * self.sign
-        seeds = ",".join(word.partition("=")[2] for word in self.seeds)
-        words = [*best, *[f"seed={seeds}"] * bool(seeds)]
-        words = ["-m", *words] if len(self.seeds) > 1 else words
-        return (
-            f"best: {' '.join(swept) or 'the only point'}, {self.metric} {value:.4g} of validation "
-            f"views ({counted(max(1, len(self.seeds)), 'seed')}, in {self.home}); to train it: "
-            f"gsbench {shlex.join(words)}"
-        )
-
-
-def goal_of(sweep: Sweep) -> Goal | None:
-    """The space that the chosen sweeper searches; None for Hydra's grid."""
-    if sweep.other_sweeper == BASIC:
-        return None
-    node = sweep.config.hydra.sweeper
-    lists = {
-        bare_key(str(key)): f"{key}={value}" for key, value in (node.get("params") or {}).items()
-    }
-    lists |= {key_of(word): word for word in sweep.words if is_sweep(word)}
-    seeds = grid_points([parse_word(lists["seed"])]) if "seed" in lists else []
-    values = sweep.composer.trial([word for word in sweep.words if not is_sweep(word)]).values
-    metric = metric_and_question(str(values["eval"].get("primary") or ""))[0] or DEFAULT_METRIC
-    direction, sign = better_direction(metric, values, "eval.primary"), _sign(node)
-    log.info(
-        "hydra/sweeper=%s gets %s%s of validation views, %s",
-        sweep.other_sweeper,
-        "-" if sign != direction else "",
-        metric,
-        "maximized" if sign > 0 else "minimized",
-    )
-    words = tuple(word for (word,) in seeds)
-    return Goal(f"{values['name']}-tune", metric, direction, sign, words)
-
-
-def _sign(sweeper: DictConfig) -> int:
-    """1 for a sweeper (Optuna, Nevergrad, Ax) that looks for the largest value, else -1."""
-    direction = sweeper.get("direction")
-    name = str(getattr(direction, "name", direction)).lower()
-    nevergrad, ax = (
-        OmegaConf.select(sweeper, key)
-        for key in ("optim.maximize", "ax_config.experiment.minimize")
-    )
-    return 1 if name == "maximize" or nevergrad is True or ax is False else -1
-
-
-# ---- Hydra's own files
-
-
-def words_for_files(config: DictConfig, words: Sequence[str], multirun: bool) -> list[str]:
-    """The words by which Hydra writes its own files as in any app, if one of them was asked for.
-
-    Otherwise Hydra writes nothing, since each trial's folder has its configuration and log.
-    """
-    node, usual = (OmegaConf.to_container(config.hydra, resolve=False), installed_nodes(()))
-    assert isinstance(node, dict)
-    logs = node["job_logging"].get("root")
-    if not logs and all(node[key] == usual[key] for key in HYDRAS_FILES):
-        return []
-    typed = {key_of(word) for word in words}
-    added = {}
-    if node["output_subdir"] is None and "hydra.output_subdir" not in typed:
-        added["hydra.output_subdir"] = ".hydra"
-    if not logs and "hydra/job_logging" not in typed:
-        added |= {"hydra/job_logging": "default", "hydra.job_logging.root.handlers": "[file]"}
-    if node["run"] == usual["run"]:
-        added["hydra.run.dir"] = f"${{runs}}/{FOLDER}"
-    if multirun and node["sweep"]["subdir"] == usual["sweep"]["subdir"]:
-        added["hydra.sweep.subdir"] = "${hydra.job.num}"
-    if (
-        multirun
-        and config.hydra.runtime.choices["hydra/launcher"] == OWN
-        and (config.launch.name != "serial")
-    ):
-        log.info(
-            "launch=%s writes no files of Hydra's: each trial's folder has them",
-            config.launch.name,
-        )
-    return [f"{key}={value}" for key, value in added.items()]
-
-
-def words_for_new_folder(sweep: Sweep) -> list[str]:
-    """The word that gives another launcher a new folder, whose name nobody could guess.
-
-    Its jobs' results are unpickled from there (submitit: the first file with the number of a
-    process), and somebody's runs folder could have such files for all numbers. Raises InputError
-    if a folder that the user typed has some already.
-    """
-    config = sweep.config
-    if config.hydra.runtime.choices["hydra/launcher"] in (OWN, BASIC):  # read no files
-        return []
-    if SWEEP_DIR not in map(key_of, sweep.words):
-        return [f"{SWEEP_DIR}=${{runs}}/{FOLDER}/{secrets.token_hex(8)}"]
-    launcher = OmegaConf.to_container(config.hydra.launcher, resolve=False)
-    for value in launcher.values() if isinstance(launcher, dict) else ():
-        start, found, rest = str(value).partition(f"${{{SWEEP_DIR}}}/")
-        place = Path(config.hydra.sweep.dir, rest.partition("%")[0])
-        if found and not start and place.exists():
-            raise InputError(
-                f"{place} is there already, and results of jobs would be unpickled from it: remove "
-                f"it, or leave {SWEEP_DIR} out"
-            )
-    return []
-
-
-# ---- hydra.main
-
-
-def run_main(
-    task: Callable[[Any], Any], argv: Sequence[str], config: DictConfig | None = None
-) -> None:
-    """Run ``task`` as an app of ``hydra.main`` with the words ``argv``; raises what it raises.
-
-    Hydra may instantiate its own callbacks, the plug-ins that the checked ``config`` chooses, and
-    the classes that it allows.
-    """
-    names: list[str] = []
-    if config is not None:
-        load_callbacks(config.hydra.callbacks, config.allow_targets)
-        plugins = [config.hydra.launcher, config.hydra.sweeper]
-        nodes = [OmegaConf.to_container(node, resolve=False) for node in plugins]
-        own = [f"hydra_plugins.gsbench.Gsbench{plugin}" for plugin in ("Launcher", "Sweeper")]
-        names = [*own, *config.allow_targets, *(target for _, target in targets_in(nodes))]
-    names = [name for name in names if all(part.isidentifier() for part in name.split("."))]
-    register_schemas()
-    with (
-        WHITELIST([*HYDRAS_CALLBACKS, *names, *(f"{name}.*" for name in names)]),
-        redirect_stderr(_WithoutHydrasLine(sys.stderr)),
-        _as_program(["gsbench", *argv]),
-    ):
-        hydra.main(**VERSION_BASE, config_path=str(conf_dir()), config_name=CONFIG_NAME)(task)()
-
-
-@contextmanager
-def _as_program(argv: list[str]) -> Iterator[None]:
-    """Let Hydra read ``argv``, and raise errors instead of printing them and ending the process."""
-    saved = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
-    sys.argv, os.environ["HYDRA_FULL_ERROR"] = argv, "1"
-    try:
-        yield
-    finally:
-        sys.argv = saved[0]
-        os.environ.pop("HYDRA_FULL_ERROR")
-        if saved[1] is not None:
-            os.environ["HYDRA_FULL_ERROR"] = saved[1]
-        HydraConfig.instance().cfg = None
-
-
-class _WithoutHydrasLine:
-    """Standard error without Hydra's line about a job's error, which gsbench prints itself."""
-
-    def __init__(self, stream: Any) -> None:
-        self._stream = stream
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._stream, name)
-
-    def write(self, text: str) -> int:
-        return len(text) if text.startswith(HYDRAS_LINE) else int(self._stream.write(text))

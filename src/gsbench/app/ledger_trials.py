@@ -8,7 +8,8 @@ from gsbench.config.command_words import typed_permissions
 from gsbench.config.compose import Trial
 from gsbench.config.overrides import key_of
 from gsbench.errors import InputError
-from gsbench.runs.ledger import Ledger
+from gsbench.launch.record import planned_rows
+from gsbench.runs.commands import Digest, Idea
 from gsbench.words import listed
 
 GIVEN = ("name", "runs", "eval.primary")  # settings that the ledger sets itself
@@ -24,11 +25,11 @@ OF_IDEAS = (
     "threads",
     "tracking",
 )
-Trials = dict[tuple[str, int], Trial]  # by key (scene, arm and hash) and seed
+Trials = dict[tuple[str, Digest, int], Trial]  # by scene, digest and seed
 
 
 def compose_words(name: str, words: Sequence[str], typed: Sequence[str]) -> Trials:
-    """The trials of words by key and seed; only the ``typed`` ones give permissions.
+    """The trials of words; only the ``typed`` ones give permissions.
 
     Raises InputError for settings that the ledger sets.
     """
@@ -37,37 +38,36 @@ def compose_words(name: str, words: Sequence[str], typed: Sequence[str]) -> Tria
             raise InputError(f"ledger: {key_of(word)} follows from the ledger: leave it out")
     trials = compose_trials([*words, f"name={name}"], multirun=True, typed=typed)
     require_waiting("ledger", trials)
-    return {(trial.files.key, trial.values["seed"]): trial for trial in trials}
+    rows = planned_rows(trials)
+    return {(row.scene, row.digest, row.seed): one for row, one in zip(rows, trials, strict=True)}
 
 
-def keys_by_scene(trials: Trials, name: str) -> dict[str, str]:
-    """The key of the trials on each scene; raises InputError for several arms."""
-    keys: dict[str, set[str]] = {}
-    for (key, _), trial in trials.items():
-        keys.setdefault(trial.values["scene"]["name"], set()).add(key)
-    if any(len(on_scene) > 1 for on_scene in keys.values()):
+def digests_of(trials: Trials, name: str) -> dict[str, Digest]:
+    """The digest on each scene; raises InputError for several arms."""
+    digests = {scene: digest for scene, digest, _ in trials}
+    if any(digests[scene] != digest for scene, digest, _ in trials):
         raise InputError(f"{name} compares one arm at a time: only scene and seed may list values")
-    return {scene: on_scene.pop() for scene, on_scene in keys.items()}
+    return digests
 
 
 def seeds_of(trials: Trials) -> tuple[int, ...]:
-    seeds = tuple(dict.fromkeys(seed for _, seed in trials))
+    seeds = tuple(dict.fromkeys(seed for _, _, seed in trials))
     if len(seeds) < FIRST_LOOK:
         raise InputError(f"a ledger needs at least {FIRST_LOOK} seeds, such as seed=0,1,2,3,4,5")
     return seeds
 
 
-def permitted_words(book: Ledger, idea: str, typed: Sequence[str]) -> tuple[str, ...]:
-    """The recorded settings of an idea, or of the baseline, with what is typed about tracking.
+def permitted_words(idea: Idea, typed: Sequence[str]) -> tuple[str, ...]:
+    """The recorded settings of an idea, with what is typed about tracking.
 
     Raises InputError if they would run code that the ``typed`` words do not allow: the ledger is a
     file, and may be somebody else's.
     """
-    words = book.words_of(idea)
+    words = idea.words
     needed = set(typed_permissions(words)) - set(typed_permissions(typed))
     if needed:
         names = ",".join(sorted(needed | set(typed_permissions(typed))))
-        raise InputError(f"{idea} runs code of yours: add allow_targets=[{names}]")
+        raise InputError(f"{idea.name} runs code of yours: add allow_targets=[{names}]")
     tracking = [word for word in typed if key_of(word).partition(".")[0] == "tracking"]
     if any(key_of(word) == "tracking" for word in tracking):  # settings of another tracker
         words = tuple(word for word in words if not key_of(word).startswith("tracking"))

@@ -22,7 +22,7 @@ from gsbench.launch.outcomes import Outcome
 from gsbench.pipeline.metric_facts import facts_for
 
 OWN = "gsbench"  # the name of the launcher and of the sweeper in Hydra
-DEFAULT_METRIC = "psnr"
+BASIC = "basic"  # Hydra's own sweeper, which expands lists, and its launcher
 # the errors of Hydra for a user's words and files
 HYDRA_ERRORS = (HydraException, OmegaConfBaseException, OSError)
 

@@ -12,11 +12,11 @@ their folders.
 
 from __future__ import annotations
 
-import importlib.util
 import itertools
 import logging
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 from hydra.core.override_parser.types import Override
 
@@ -29,7 +29,7 @@ from gsbench.app.arm_search import (
     own_values,
     words_of_values,
 )
-from gsbench.app.sweep import DEFAULT_METRIC, Run, Sweep, better_direction
+from gsbench.app.sweep import Run, Sweep, better_direction
 from gsbench.config.command_words import grid_points
 from gsbench.config.compose import Composer, Trial
 from gsbench.config.overrides import bare_key, key_of, parse_word
@@ -37,19 +37,21 @@ from gsbench.config.schema import TUNE, TuneSettings
 from gsbench.errors import GsbenchError, InputError
 from gsbench.eval.facts import known_keys
 from gsbench.files import checked_runs_folder, make_runs_folder, write_json
-from gsbench.runs.experiments import TuningRecord, make_home, metric_and_question
+from gsbench.runs.experiments import (
+    DEFAULT_METRIC,
+    TuningRecord,
+    make_home,
+    metric_and_question,
+)
 from gsbench.runs.layout import TUNING
 from gsbench.settings import check_values
-from gsbench.system.install import install_command
+from gsbench.system.install import require_package
 from gsbench.words import command, counted, did_you_mean, listed
 
 if TYPE_CHECKING:
     from optuna.trial import Trial as Proposal
 
 log = logging.getLogger(__name__)
-
-# the metric of all searches, its better direction, and the seeds of a point's trials
-Goal = tuple[str, Literal[-1, 1], list[int]]
 
 
 def tuned_jobs(
@@ -186,8 +188,7 @@ def _plan(
 
     Raises InputError for what cannot be searched.
     """
-    if importlib.util.find_spec("optuna") is None:
-        raise InputError(f"a search needs Optuna: {install_command('search')}")
+    require_package("optuna", "search", "a search")
     homes = {trial.files.home for trial in trials}
     if len(homes) > 1:
         raise InputError(
@@ -198,23 +199,22 @@ def _plan(
         raise InputError(
             f"{TUNE} searches on validation views by itself: leave scene.validation out"
         )
-    goal = _goal(tune, trials)
-    scenes = list(dict.fromkeys(trial.values["scene"]["name"] for trial in trials))
+    asked = _asked(tune, trials)
     by_arm = group_by(
         zip(trials, jobs, intervals, strict=True), lambda job: job[0].folder.parent.name
     )
-    return [_arm_search(tune, arm, goal, scenes, of_arm) for arm, of_arm in by_arm.items()]
+    return [
+        _arm_search(replace(asked, arm=arm, points=[]), tune.at_once, of_arm)
+        for arm, of_arm in by_arm.items()
+    ]
 
 
 def _arm_search(
-    tune: TuneSettings,
-    arm: str,
-    goal: Goal,
-    scenes: list[str],
+    record: TuningRecord,
+    at_once: int,
     jobs: Sequence[tuple[Trial, Sequence[str], Mapping[str, Override]]],
 ) -> ArmSearch:
     """The search of an arm with these ``jobs``: each a trial, its words, and its intervals."""
-    metric, direction, seeds = goal
     found: dict[str, Override] = {}
     for _, _, of_job in jobs:
         found |= of_job
@@ -223,36 +223,25 @@ def _arm_search(
     fixed = set(map(key_of, itertools.chain(*kept)))
     if both := next((key for key in intervals if bare_key(key) in fixed), None):
         raise InputError(
-            f"{both} of {arm} is searched in one grid and given in another: leave one of them out"
+            f"{both} of {record.arm} is searched in one grid and given in another: leave one of "
+            "them out"
         )
     ranges = {key: distribution(interval) for key, interval in intervals.items()}
     first, home = jobs[0][0], jobs[0][0].files.home
-    record = TuningRecord(
-        sweep=home.name,
-        arm=arm,
-        metric=metric,
-        direction=direction,
-        wanted=tune.points,
-        seeds=seeds,
-        scenes=scenes,
-        ranges={
-            key: str(interval.input_line).partition("=")[2] for key, interval in intervals.items()
-        },
-        log=[key for key, values in ranges.items() if getattr(values, "log", False)],
-        points=[],
-    )
+    texts = {key: str(one.input_line).partition("=")[2] for key, one in intervals.items()}
+    log_scaled = [key for key, values in ranges.items() if getattr(values, "log", False)]
     return ArmSearch(
-        record,
-        home.with_name(f"{home.name}-tune-{arm}"),
-        tune.at_once,
+        replace(record, ranges=texts, log=log_scaled),
+        home.with_name(f"{home.name}-tune-{record.arm}"),
+        at_once,
         ranges,
         list(dict.fromkeys(kept)),
         own_values(first.values, ranges),
     )
 
 
-def _goal(tune: TuneSettings, trials: Sequence[Trial]) -> Goal:
-    """The metric of all searches, its better direction, and the seeds of a point's trials.
+def _asked(tune: TuneSettings, trials: Sequence[Trial]) -> TuningRecord:
+    """The record of the searches, without arms.
 
     Raises InputError for an unknown metric, and for one without a better direction.
     """
@@ -280,7 +269,15 @@ def _goal(tune: TuneSettings, trials: Sequence[Trial]) -> Goal:
             f"{TUNE}.seed: {listed(list(map(str, both)))} is a seed of the sweep, too: tune with "
             "others"
         )
-    return metric, direction, seeds
-
-
-# ---- ranges
+    return TuningRecord(
+        sweep=trials[0].files.home.name,
+        arm="",
+        metric=metric,
+        direction=direction,
+        wanted=tune.points,
+        seeds=seeds,
+        scenes=list(dict.fromkeys(trial.values["scene"]["name"] for trial in trials)),
+        ranges={},
+        log=[],
+        points=[],
+    )

@@ -3,10 +3,8 @@
 An archive is a zip file of a runs folder's files as they are (`gsbench.claims.export` writes it):
 each trial's ``results.json``, ``config.yaml``, ``per_view.csv`` and errors of regions, the
 experiment's commands or ledger, records of searches, and pictures if they were asked for.
-``archive.json`` has the version of this form and the sha256 of each file;
-``ro-crate-metadata.json`` describes the archive to other tools (w3id.org/ro/crate/1.2). The folder
-of a trial without a usable result has its configuration alone: no verdict favours an arm that lacks
-results.
+``archive.json`` has the version of this form and the sha256 of each file. The folder of a trial
+without a usable result has its configuration alone: no verdict favours an arm that lacks results.
 
 Archives may come from strangers, so sizes, names, checksums and contents are checked. Those of the
 first version have other files (`gsbench.claims.old_archive`).
@@ -45,7 +43,7 @@ from gsbench.settings import ARM_BYTES, is_folder_name
 from gsbench.words import readable_bytes
 
 FORMAT, VERSION, FIRST_VERSION = "gsbench results", 2, 1
-MANIFEST, CRATE = "archive.json", "ro-crate-metadata.json"
+MANIFEST = "archive.json"
 PICTURES = (RENDERS, GROUND_TRUTH)
 OF_EXPERIMENT = (COMMANDS, DECLARED, LEDGER)  # the second in archives of the first version
 OF_TRIAL = (RESULTS, CONFIG, PER_VIEW, FROM_PIXELS, REGIONS, FAILED)

@@ -27,7 +27,6 @@ from gsbench.analysis.quantities import TEXTURED
 from gsbench.analysis.results import Experiment, TrialResult, group_by, newest_code, read_views
 from gsbench.analysis.verdicts import RUNNING, STOPPED
 from gsbench.claims.archive import (
-    CRATE,
     FORMAT,
     MANIFEST,
     NO_CONFIGURATION,
@@ -47,13 +46,11 @@ from gsbench.runs.layout import (
     DECLARED,
     FAILED,
     FROM_PIXELS,
-    LEDGER,
     PER_VIEW,
     REGIONS,
     RESULTS,
     TUNING,
 )
-from gsbench.runs.ledger import as_json, chained, read_ledger
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.words import without_folders
 
@@ -63,7 +60,6 @@ PRIVATE = ("runs", "tracking")  # settings that only name the user's folders and
 PASSWORD = re.compile(r"(?<=://)[^/@\s]*@")  # user and password in a URL
 FOLDERS = re.compile(r"(?<=:)///+\S*/")  # folders in a file's URL, such as sqlite:////home/me/a.db
 ITEM = re.compile(r"[^=,\[\]{}'\"]+")  # one value in a word such as scene=[a,b]
-SPECIFICATION = "https://w3id.org/ro/crate/1.2"
 
 
 def write_archive(
@@ -96,7 +92,7 @@ def write_archive(
                 files[f"{_folder(trial.path)}/{FROM_PIXELS}"] = _page(measures)
     files |= _searches(experiment.folder, kept)
     check_size(sum(map(len, files.values())))
-    _write_zip(out, experiment.name, kept, dict(sorted(files.items())))
+    _write_zip(out, experiment.name, dict(sorted(files.items())))
     return left_out, _open(experiment)
 
 
@@ -107,17 +103,13 @@ def _open(experiment: Experiment) -> str:
     return f"open: {still_open} of {len(states)}" if still_open else ""
 
 
-def _write_zip(
-    out: Path, name: str, trials: Sequence[TrialResult], files: Mapping[str, bytes]
-) -> None:
-    """Write the archive of these ``files`` by place, with its manifest and its description."""
+def _write_zip(out: Path, name: str, files: Mapping[str, bytes]) -> None:
+    """Write the archive of these ``files`` by place, with its manifest."""
     digests = {place: hashlib.sha256(content).hexdigest() for place, content in files.items()}
     manifest = {"format": FORMAT, "version": VERSION, "experiment": name}
     manifest |= {"gsbench": __version__, "sha256": digests}
-    # The description of the crate comes first, where other programs look for it.
-    own = {CRATE: _page(crate_metadata(name, trials)), MANIFEST: _page(manifest)}
     with atomic(out, sync=False) as temporary, zipfile.ZipFile(temporary, "w") as archive:
-        for place, content in (own | dict(files)).items():
+        for place, content in ({MANIFEST: _page(manifest)} | dict(files)).items():
             info = zipfile.ZipInfo(place, FIXED_DATE)
             archive.writestr(info, content, zipfile.ZIP_DEFLATED, compresslevel=9)
 
@@ -155,7 +147,6 @@ def _of_experiment(home: Path) -> dict[str, bytes]:
     """The experiment's own records."""
     shared: dict[str, Callable[[Path], bytes]] = {
         COMMANDS: _shared_commands,
-        LEDGER: _shared_ledger,
         DECLARED: lambda home: read_bytes(home / DECLARED),
     }
     return {
@@ -180,16 +171,6 @@ def _searches(home: Path, trials: Sequence[TrialResult]) -> dict[str, bytes]:
     }
 
 
-def _shared_ledger(home: Path) -> bytes:
-    """The ledger for others, without folders and servers of this machine, and so chained anew."""
-    entries = []
-    for entry in map(as_json, read_ledger(home).entries):
-        if "words" in entry:
-            entry["words"] = without_private_words(entry["words"])
-        entries.append(without_paths(entry))
-    return chained(entries).encode()
-
-
 def _shared_commands(home: Path) -> bytes:
     """The commands for others, without folders and servers of this machine, and so linked anew."""
     lines = []
@@ -201,6 +182,9 @@ def _shared_commands(home: Path) -> bytes:
             }
             words = tuple(without_private_words(line.words))
             line = replace(line, words=words, cwd="", trials=trials)
+            if line.idea:
+                shared = tuple(without_private_words(line.idea.words))
+                line = replace(line, idea=replace(line.idea, words=shared))
         lines.append(line)
     return chained_commands(lines).encode()
 
@@ -261,30 +245,3 @@ def without_paths(value: Any) -> Any:
             return PurePath(value).name
         return without_folders(FOLDERS.sub("///", PASSWORD.sub("", value)))
     return value
-
-
-def crate_metadata(name: str, trials: Sequence[TrialResult]) -> dict[str, Any]:
-    """The archive in the terms of RO-Crate; the manifest lists its files."""
-    scenes = sorted({trial.scene for trial in trials})
-    arms = sorted({str(trial.arm) for trial in trials})
-    protocols = sorted({trial.record.protocol for trial in trials})
-    day = time.strftime("%Y-%m-%d", time.gmtime(max(trial.measured for trial in trials)))
-    root = {
-        "@id": "./",
-        "@type": "Dataset",
-        "name": f"{name}: results of gsbench",
-        "description": f"{len(trials)} trainings of 3D Gaussian Splatting: {', '.join(arms)} on "
-        f"{', '.join(scenes)}, measured by {', '.join(protocols)}. No models.",
-        "datePublished": day,
-        "hasPart": [{"@id": MANIFEST}],
-    }
-    manifest = {
-        "@id": MANIFEST,
-        "@type": "File",
-        "name": MANIFEST,
-        "description": "Version of the archive, and the sha256 of its files",
-        "encodingFormat": "application/json",
-    }
-    about = {"conformsTo": {"@id": SPECIFICATION}, "about": {"@id": "./"}}
-    descriptor = {"@id": CRATE, "@type": "CreativeWork"} | about
-    return {"@context": f"{SPECIFICATION}/context", "@graph": [descriptor, root, manifest]}

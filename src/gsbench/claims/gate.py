@@ -13,9 +13,9 @@ from gsbench.analysis.notes import Note
 from gsbench.analysis.quantities import COSTS, NO_DIRECTION
 from gsbench.analysis.questions import FIRST_LOOK, LeastEffect, plan_looks, read_least
 from gsbench.analysis.results import Arm, TrialResult
-from gsbench.analysis.sentences import in_words, least_words, with_notes
-from gsbench.analysis.statistics import REFUTED, SUPPORTED, TOO_SMALL, UNDECIDED
-from gsbench.analysis.verdicts import Verdict
+from gsbench.analysis.sentences import in_words, reason, with_notes
+from gsbench.analysis.statistics import REFUTED, SUPPORTED, TOO_SMALL
+from gsbench.analysis.verdicts import GATE, Verdict, passes
 from gsbench.claims.stopping import SequentialTest
 from gsbench.errors import InputError
 from gsbench.eval.facts import known_keys
@@ -33,17 +33,14 @@ ReadTrials = Callable[[], Iterable[TrialResult]]
 def ask_gate(question: Question, baseline: ReadTrials, new: ReadTrials) -> SequentialTest:
     """The question of a gate, with functions that read each version's finished trials.
 
-    It ends also as soon as the new version is shown not to be worse: a gate asks no more.
+    The versions are the digests of their trials.
     """
-    read = _versions({BASELINE: baseline, NEW: new})
-    return SequentialTest((question,), read, lambda verdicts: result_of(verdicts[0]) != NOT_DECIDED)
+    sides = {BASELINE: baseline, NEW: new}
 
+    def read() -> list[TrialResult]:
+        return [replace(one, alias=version) for version, own in sides.items() for one in own()]
 
-def _versions(sides: Mapping[str, ReadTrials]) -> ReadTrials:
-    """A function that reads the trials of all versions, with the versions as their digests."""
-    return lambda: [
-        replace(trial, alias=version) for version, read in sides.items() for trial in read()
-    ]
+    return SequentialTest((question,), read)
 
 
 def declare_gate(
@@ -74,7 +71,7 @@ def declare_gate(
         digests=dict.fromkeys(names, (BASELINE, NEW)),
         seeds=dict.fromkeys(names, tuple(seeds)),
         looks=plan_looks(len(seeds)),
-        rule="gate",
+        rule=GATE,
         versions=True,
         name="gate",
     )
@@ -113,16 +110,10 @@ def asked_difference(
 
 def result_of(verdict: Verdict) -> str:
     """``passed``, ``worse``, or ``undecided``; the result may change until the verdict is final."""
-    if verdict.equal or _not_worse(verdict):
+    if verdict.equal or passes(verdict):
         return PASSED
     results = {SUPPORTED: PASSED, TOO_SMALL: PASSED, REFUTED: WORSE}
     return results.get(verdict.outcome, NOT_DECIDED)
-
-
-def _not_worse(verdict: Verdict) -> str:
-    """The reason why an undecided version passes; "" if it does not."""
-    passes = verdict.outcome == UNDECIDED and verdict.loss_excluded
-    return f"not worse by {least_words(verdict)}" if passes else ""
 
 
 def describe(verdict: Verdict) -> str:
@@ -130,7 +121,7 @@ def describe(verdict: Verdict) -> str:
 
     For example ``worse: worse in PSNR (dB) on this scene: −1.20 (interval −1.50 to −0.90), …``.
     """
-    sentence = _not_worse(verdict) or in_words(verdict)
+    sentence = reason(verdict) if passes(verdict) else in_words(verdict)
     return with_notes(f"{result_of(verdict)}: {sentence}", verdict)
 
 

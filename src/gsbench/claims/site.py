@@ -13,10 +13,7 @@ from typing import Any
 
 from gsbench.analysis.cells import swept_settings
 from gsbench.analysis.comparison import compare
-from gsbench.analysis.quantities import choose_quantities
-from gsbench.analysis.ranks import rank_all
 from gsbench.analysis.report.build import build_report
-from gsbench.analysis.report.charts import rank_plot
 from gsbench.analysis.results import Experiment
 from gsbench.analysis.table_formats import Table, fill
 from gsbench.analysis.tables import build_table
@@ -86,16 +83,14 @@ def _section(experiment: Experiment, key: str) -> dict[str, Any]:
             sorted({trial.record.versions.get("gsbench", "unknown") for trial in trials})
         ),
     }
-    arms = comparison.trials
-    ranks = [rank_plot(ranking) for ranking in rank_all(arms, choose_quantities(arms))]
-    shown = {
+    return {
+        "name": experiment.name,
+        "key": key,
         "facts": list(facts.items()),
         "lines": comparison.sentences,
         "tables": tables,
         "notes": [*notes, *comparison.remarks, *experiment.warnings],
     }
-    ranks = ranks if comparison.pairs else []
-    return {"name": experiment.name, "key": key, "ranks": ranks} | shown
 
 
 def _by_quantity(table: Table) -> Iterator[Table]:

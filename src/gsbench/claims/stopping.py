@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from gsbench.analysis.comparison import compare
 from gsbench.analysis.fairness import counts_notes, limit_notes
@@ -11,7 +11,6 @@ from gsbench.analysis.results import TrialResult, newest_code, read_experiment
 from gsbench.analysis.verdicts import Verdict, judge
 from gsbench.config.compose import Trial
 from gsbench.runs.commands import Digest, Question
-from gsbench.runs.layout import LEDGER
 from gsbench.words import counted
 
 log = logging.getLogger(__name__)
@@ -32,21 +31,15 @@ def trials_of_look(questions: Sequence[Question], seeds: int) -> list[Needed]:
 
 @dataclass(frozen=True)
 class SequentialTest:
-    """The test of questions by the trials so far, which ``read`` gives.
-
-    ``ends`` tells if verdicts give a result although a question is undecided.
-    """
+    """The test of questions by the trials so far, which ``read`` gives."""
 
     questions: tuple[Question, ...]
     read: Callable[[], Iterable[TrialResult]]
-    ends: Callable[[Sequence[Verdict]], bool] = lambda verdicts: False
 
     def verdicts(self) -> list[Verdict]:
-        """The verdicts so far; all are final as soon as they give a result."""
+        """The verdicts so far."""
         trials = list(self.read())
-        verdicts = [judge(trials, question) for question in self.questions]
-        ended = self.ends(verdicts)
-        return [replace(verdict, final=verdict.final or ended) for verdict in verdicts]
+        return [judge(trials, question) for question in self.questions]
 
     def answer(self, run: Callable[[list[Needed]], object]) -> list[Verdict]:
         """Add seeds look by look until all questions are decided; returns the verdicts.
@@ -94,10 +87,12 @@ def log_verdicts(trials: Iterable[Trial]) -> None:
     of a sweep does not fit its ideas.
     """
     for home in dict.fromkeys(trial.files.home for trial in trials):
-        if (home / LEDGER).exists():
+        experiment = read_experiment(home)
+        if experiment.history.ledger is not None:
             continue
-        comparison = compare(newest_code(read_experiment(home)))
+        comparison = compare(newest_code(experiment))
         both = comparison.trials, comparison.pairs
         before = [*counts_notes(*both), *limit_notes(*both)]
-        for line in [*texts(before), *comparison.headlines, *comparison.experiment.versions]:
+        headlines = [answer.headline for answer in comparison.answers]
+        for line in [*texts(before), *headlines, *comparison.experiment.versions]:
             log.info("%s", line)

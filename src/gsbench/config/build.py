@@ -10,8 +10,13 @@ import sys
 from typing import Any
 
 from gsbench.config.groups import REMOVABLE
-from gsbench.config.permissions import check_target, load_class, packages_allowed_at
-from gsbench.config.programs import check_program, is_external
+from gsbench.config.permissions import (
+    check_program,
+    check_target,
+    is_external,
+    load_class,
+    packages_allowed_at,
+)
 from gsbench.errors import InputError
 from gsbench.external.settings import External
 from gsbench.runs.nested import GSBENCH, targets_in

@@ -28,8 +28,8 @@ from gsbench.config.hydra_setup import (
     hydra_ready,
     installed_nodes,
 )
-from gsbench.config.interpolations import check_texts
 from gsbench.config.overrides import bare_key, is_sweep, key_of, parse_word, task_words
+from gsbench.config.permissions import check_texts
 from gsbench.config.schema import ROOT_SETTINGS, Config, check, checked_values, plain
 from gsbench.config.search_path import check_search_path, read_by_gsbench, searched_folders
 from gsbench.config.strange_files import check_choice, check_places, permitted_to_files
@@ -38,7 +38,7 @@ from gsbench.errors import InputError
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.user_code import PERMISSIONS
 from gsbench.settings import check_values
-from gsbench.system.own_modules import allow_modules
+from gsbench.system.programs import allow_modules
 
 MADE_GROUPS = tuple(f"hydra/{name}" for name in MADE_NODES)
 # stands for the seed while settings are resolved that all seeds share: reading it is an error
@@ -105,7 +105,6 @@ class Composer:
         self._check_words(self.hydra_words)
         self._chosen: dict[tuple[str, ...], DictConfig] = {}
         self._times: dict[str, Any] = {}  # what ${now:…} stands for, the same in all trials
-        self._own_choices = _choices(own)
         # The settings of a group whose choices are listed, here or in a file, are checked with each
         # choice.
         listed = set(map(key_of, words)) - set(map(key_of, single))
@@ -210,12 +209,7 @@ class Composer:
 
     def _choose(self, words: Sequence[str]) -> DictConfig:
         """Hydra's composition of the choices among ``words``, checked; do not change it."""
-        choices = _choices(words)
-        # A list often repeats what the files choose anyway (densify=adc,volumetric): composing
-        # takes 0.1 s, so equal choices share a composition.
-        if self._are_own(choices):
-            choices = self._own_choices
-        key = tuple(choices.values())
+        key = tuple(_choices(words).values())  # composing takes 0.1 s
         if key not in self._chosen:
             with hydra_ready():
                 self._chosen[key] = self._compose(key, words)
@@ -260,18 +254,6 @@ class Composer:
             if "${" in word:
                 override = parse_word(word)
                 check_texts({override.key_or_group: override.value()}, self.allowed)
-
-    def _are_own(self, choices: Mapping[str, str]) -> bool:
-        """Return whether ``choices`` give the files of the command's own composition."""
-        own = self._chosen.get(tuple(self._own_choices.values()))
-        return (
-            own is not None
-            and choices.keys() >= self._own_choices.keys()
-            and all(
-                str(own.hydra.runtime.choices.get(bare_key(key))) == word.partition("=")[2]
-                for key, word in choices.items()
-            )
-        )
 
 
 def _swept_groups(sweeper: DictConfig) -> set[str]:

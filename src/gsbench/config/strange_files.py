@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from gsbench.config.explain import explained
-from gsbench.config.interpolations import check_texts
+from gsbench.config.permissions import check_texts
 from gsbench.errors import InputError
 from gsbench.parsing import SafeLoader, read_yaml, resolved
 

@@ -12,20 +12,18 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from gsbench.config.interpolations import check_texts
 from gsbench.config.permissions import (
     PACKAGE,
-    check_target,
-    is_allowed,
-    load_class,
-    packages_allowed_at,
-    permission_advice,
-)
-from gsbench.config.programs import (
     SBATCH_RESOURCES,
     check_launch,
     check_program,
+    check_target,
+    check_texts,
+    is_allowed,
     is_external,
+    load_class,
+    packages_allowed_at,
+    permission_advice,
 )
 from gsbench.errors import InputError
 from gsbench.runs.nested import TARGET, entries_of, targets_in

@@ -18,7 +18,7 @@ from typing import IO
 from gsbench.datasets.catalog import SceneFiles
 from gsbench.downloads import USER_AGENT, FetchError, RetryPolicy, with_retries
 from gsbench.errors import InputError
-from gsbench.files import CHUNK, MAX_NAME_BYTES, atomic, require_regular
+from gsbench.files import CHUNK, MAX_NAME_BYTES, atomic, is_safe_member, require_regular
 from gsbench.logs import Progress
 from gsbench.words import counted, readable_bytes
 
@@ -112,15 +112,15 @@ def wanted_members(
         name = info.filename[len(folder) + 1 :]
         if not any(name.startswith(f"{part}/") for part in wanted) or "/." in f"/{name}":
             continue  # hidden files, including "..", are never wanted
-        if "\\" in name or "//" in name or ":" in name or PurePosixPath(name).is_absolute():
-            raise InputError(
-                f"{where}: the member {info.filename!r} has an unsafe name: give another --mirror"
-            )
         # A damaged name may decode to surrogates.
         if len(name.encode("utf-8", "surrogatepass")) > MAX_NAME_BYTES or not name.isprintable():
             raise InputError(
                 f"{where}: the member {name!r:.80} has a name that no file can have: give another "
                 "--mirror"
+            )
+        if "//" in name or ":" in name or not is_safe_member(name):
+            raise InputError(
+                f"{where}: the member {info.filename!r} has an unsafe name: give another --mirror"
             )
         members[name] = info
     for name in members:

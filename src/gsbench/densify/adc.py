@@ -15,6 +15,7 @@ from gsbench.densify.budget import Budgeted, admit
 from gsbench.densify.formulas import revised_logits
 from gsbench.densify.scores import draw
 from gsbench.events import Cause
+from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import RenderOutput
 from gsbench.settings import OpenFraction, Switch
 
@@ -23,6 +24,9 @@ MAX_CHILDREN = 64
 OPACITY_RESET = Switch(
     {"opacity_reset_interval": NEVER},
     "opacity resets, and the pruning by size that follows the first",
+)
+ABSOLUTE_GRADIENT = Switch(
+    {"gradient": "signed"}, "the absolute gradient, in which pixels do not cancel"
 )
 # rounds after an opacity reset in which the governor does not raise ``cull``; our choice
 LOCKED_ROUNDS = 5
@@ -34,6 +38,17 @@ class Grown(NamedTuple):
     number: Tensor  # [N] number of Gaussians that take its place, itself included
     log_scales: Tensor  # [N, 3] log scales of each of these
     opacity_logits: Tensor  # [N] opacity logit of each of these
+
+    @classmethod
+    def halved(
+        cls, values: Gaussians, over: Tensor, log_scales: Tensor, opacity_logits: Tensor
+    ) -> "Grown":
+        """Two with these parameters for each Gaussian at the mask ``over`` [N]."""
+        return cls(
+            torch.where(over, 2, 1),
+            torch.where(over.unsqueeze(-1), log_scales, values.log_scales),
+            torch.where(over, opacity_logits, values.opacity_logits),
+        )
 
 
 @dataclass
@@ -63,9 +78,7 @@ class ADC(Budgeted):
 
     SWITCHES: ClassVar[Mapping[str, Switch]] = {
         "opacity_reset": OPACITY_RESET,
-        "absolute_gradient": Switch(
-            {"gradient": "signed"}, "the absolute gradient, in which pixels do not cancel"
-        ),
+        "absolute_gradient": ABSOLUTE_GRADIENT,
         "revised_opacity": Switch(
             {"revised_opacity": False}, "children that share their parent's opacity"
         ),
@@ -126,12 +139,13 @@ class ADC(Budgeted):
             rules.append(self.reset_opacity)
         return rules
 
-    def mean_gradient(self) -> Tensor:
-        """Mean gradient [N] NDC over the iterations in which a Gaussian was visible.
+    def mean(self, total: str, count: str = "visible_count") -> Tensor:
+        """One statistic over another, [N]; 0 where both are."""
+        return self.statistics[total] / self.statistics[count].clamp_min(1)
 
-        It is 0 for a Gaussian that was never visible.
-        """
-        return self.statistics["gradient_sum"] / self.statistics["visible_count"].clamp_min(1)
+    def mean_gradient(self) -> Tensor:
+        """Mean gradient [N] NDC over the iterations in which a Gaussian was visible."""
+        return self.mean("gradient_sum")
 
     def candidates(self, refinement: Refinement) -> tuple[Tensor, Tensor]:
         """Return two masks [N]: the Gaussians to grow, and all large Gaussians.
@@ -141,14 +155,11 @@ class ADC(Budgeted):
         """
         log_scales = refinement.gaussians.values.log_scales
         large = log_scales.amax(-1) > math.log(self.split_size * self.context.extent)
-        return self.reaches(self.mean_gradient(), self.gradient_threshold), large
+        limit = self.gradient_threshold * refinement.strictness
+        return self.reaches(self.mean_gradient(), limit), large
 
-    def reaches(self, mean: Tensor, threshold: float) -> Tensor:
-        """Mask [N] of the Gaussians whose ``mean`` gradient [N] reaches a growth ``threshold``.
-
-        ``strictness`` multiplies the threshold.
-        """
-        limit = threshold * self.strictness
+    def reaches(self, mean: Tensor, limit: float) -> Tensor:
+        """Mask [N] of the Gaussians whose ``mean`` gradient [N] reaches ``limit``."""
         return mean >= limit if self.threshold_inclusive else mean > limit
 
     def choose(self, refinement: Refinement, candidates: Tensor, gain: int) -> tuple[Tensor, int]:
@@ -172,7 +183,8 @@ class ADC(Budgeted):
 
     def forecast(self, refinement: Refinement) -> int:
         grown = self.grown(refinement)
-        pruned = self.faint(grown.opacity_logits) | self.huge(refinement.step, grown.log_scales)
+        faint = self.faint(grown.opacity_logits, refinement.cull)
+        pruned = faint | self.huge(refinement.step, grown.log_scales)
         return int(grown.number[~pruned].sum())
 
     def grow_by_gradient(self, refinement: Refinement) -> None:
@@ -197,9 +209,9 @@ class ADC(Budgeted):
             self.revised_opacity,
         )
 
-    def faint(self, opacity_logits: Tensor) -> Tensor:
+    def faint(self, opacity_logits: Tensor, cull: float) -> Tensor:
         """Mask [N] of the Gaussians to prune by opacity."""
-        return opacity_logits.sigmoid() < self.prune_opacity * self.cull
+        return opacity_logits.sigmoid() < self.prune_opacity * cull
 
     def huge(self, step: int, log_scales: Tensor) -> Tensor:
         """Mask [N] of the Gaussians to prune by size; all False until the first opacity reset."""
@@ -221,7 +233,8 @@ class ADC(Budgeted):
     def to_prune(self, refinement: Refinement) -> tuple[Tensor, Tensor]:
         """Masks [N] of the faint and, after the first opacity reset, of the huge Gaussians."""
         values = refinement.gaussians.values
-        return self.faint(values.opacity_logits), self.huge(refinement.step, values.log_scales)
+        faint = self.faint(values.opacity_logits, refinement.cull)
+        return faint, self.huge(refinement.step, values.log_scales)
 
     def prune(self, refinement: Refinement) -> None:
         """Remove the Gaussians that `to_prune` selects."""

@@ -54,11 +54,8 @@ class AbsGS(ADC):
             )
 
     def mean_absolute_gradient(self) -> Tensor:
-        """Absolute mean gradient [N] NDC over the iterations in which a Gaussian was visible.
-
-        It is 0 for a Gaussian that was never visible.
-        """
-        return self.statistics["absolute_sum"] / self.statistics["visible_count"].clamp_min(1)
+        """Absolute mean gradient [N] NDC over the iterations in which a Gaussian was visible."""
+        return self.mean("absolute_sum")
 
     def rules(self, refinement: Refinement) -> list[Rule]:
         """The rules of ADC, with the ceiling inserted before the opacity reset."""
@@ -69,7 +66,8 @@ class AbsGS(ADC):
 
     def candidates(self, refinement: Refinement) -> tuple[Tensor, Tensor]:
         over, large = super().candidates(refinement)
-        split = self.reaches(self.mean_absolute_gradient(), self.split_threshold)
+        limit = self.split_threshold * refinement.strictness
+        split = self.reaches(self.mean_absolute_gradient(), limit)
         return torch.where(large, split, over), large
 
     def choose(self, refinement: Refinement, candidates: Tensor, gain: int) -> tuple[Tensor, int]:
@@ -125,11 +123,8 @@ class PixelGS(ADC):
         return (depths / (self.near_fraction * self.context.extent)).square().clamp_max(1)
 
     def mean_gradient(self) -> Tensor:
-        """Mean gradient [N] NDC over the views since the last refinement, weighted by pixels.
-
-        It is 0 for a Gaussian that was blended into no pixel.
-        """
-        return self.statistics["weighted_gradient_sum"] / self.statistics["pixel_sum"].clamp_min(1)
+        """Mean gradient [N] NDC over the views since the last refinement, weighted by pixels."""
+        return self.mean("weighted_gradient_sum", "pixel_sum")
 
 
 @dataclass
@@ -149,7 +144,9 @@ class QuantileADC(ADC):
     def candidates(self, refinement: Refinement) -> tuple[Tensor, Tensor]:
         _, large = super().candidates(refinement)
         mean = self.mean_gradient()
-        count = int(self.growth_rate / self.strictness * len(mean)) // (self.split_children - 1)
+        count = int(self.growth_rate / refinement.strictness * len(mean)) // (
+            self.split_children - 1
+        )
         largest = torch.zeros_like(large)
         largest[mean.sort(descending=True, stable=True).indices[:count]] = True
         return largest & (mean > 0), large
@@ -159,12 +156,12 @@ class QuantileADC(ADC):
         # its own entry.
         grown = self.grown(refinement)
         index = torch.repeat_interleave(grown.number)  # [after growth] each child's parent
-        faint = self.faint(grown.opacity_logits[index])
+        faint = self.faint(grown.opacity_logits[index], refinement.cull)
         pruned = faint | self.huge(refinement.step, grown.log_scales)[index]
         return len(index) - int(pruned.sum())
 
-    def faint(self, opacity_logits: Tensor) -> Tensor:
+    def faint(self, opacity_logits: Tensor, cull: float) -> Tensor:
         if len(opacity_logits) == 0:
             return torch.zeros_like(opacity_logits, dtype=torch.bool)
-        share = min(self.prune_share * self.cull, 1.0)
+        share = min(self.prune_share * cull, 1.0)
         return opacity_logits < quantile(opacity_logits.detach().sort().values, share)

@@ -48,6 +48,10 @@ class Refinement(NamesAttributes):
     gaussians: TrainableGaussians
     rng: torch.Generator
     event: RefineEvent
+    # ``cap=governor`` (`Budgeted`) sets both: factors on the growth thresholds, and on the opacity
+    # below which Gaussians are pruned
+    strictness: float = 1.0
+    cull: float = 1.0
 
 
 Rule = Callable[[Refinement], None]
@@ -118,9 +122,6 @@ class Densifier:
     context: DensifyContext
     lineage: Lineage
     statistics: dict[str, Tensor]
-    strictness: float = 1.0  # factor on the growth thresholds, set by ``cap=governor`` (`Budgeted`)
-    # factor on the opacity below which Gaussians are pruned, set by ``cap=governor``
-    cull: float = 1.0
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)

@@ -2,7 +2,8 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal
 
 import torch
@@ -92,8 +93,8 @@ class Budgeted(Densifier):
       (`govern`).
 
     A subclass calls `allowance` before it adds Gaussians. To support ``freeze`` and ``governor``,
-    it also overrides `forecast`, and multiplies its growth thresholds by ``strictness`` and its
-    opacity for pruning by ``cull``.
+    it also overrides `forecast`, and multiplies its growth thresholds by the refinement's
+    ``strictness`` and its opacity for pruning by the refinement's ``cull``.
 
     Examples:
         A densifier that clones opaque Gaussians, under any cap:
@@ -101,7 +102,7 @@ class Budgeted(Densifier):
         >>> @dataclass
         ... class CloneOpaque(Budgeted):
         ...     def opaque(self, refinement):
-        ...         return refinement.gaussians.values.opacities > 0.5 * self.strictness
+        ...         return refinement.gaussians.values.opacities > 0.5 * refinement.strictness
         ...
         ...     def forecast(self, refinement):
         ...         return len(refinement.gaussians) + int(self.opaque(refinement).sum())
@@ -172,7 +173,7 @@ class Budgeted(Densifier):
         return allowance(len(refinement.gaussians), self.limit(refinement.step), self.cap)
 
     def forecast(self, refinement: Refinement) -> int:
-        """The count after a round with the present ``strictness`` and ``cull``, without a cap."""
+        """The count after a round with this ``strictness`` and ``cull``, without a cap."""
         raise NotImplementedError
 
     def frozen(self, refinement: Refinement) -> bool:
@@ -188,11 +189,11 @@ class Budgeted(Densifier):
         """Record how many Gaussians this round would have added; a frozen round does only this."""
         # With infinite strictness nothing grows: the difference is growth alone, without the effect
         # of pruning.
-        without_growth = self._forecast_at(refinement, math.inf)
-        refinement.event.blocked_by_cap += self._forecast_at(refinement) - without_growth
+        without_growth = self.forecast(replace(refinement, strictness=math.inf))
+        refinement.event.blocked_by_cap += self.forecast(refinement) - without_growth
 
     def govern(self, refinement: Refinement) -> None:
-        """Set ``strictness`` and ``cull`` so that the round ends at the target count.
+        """Set the refinement's ``strictness`` and ``cull``, so that it ends at the target count.
 
         This is the first rule of a governed round. From Bisht and Kolb, "Smart Target Point Control
         for Gaussian Splatting Methods" (arXiv 2605.16158):
@@ -211,19 +212,19 @@ class Budgeted(Densifier):
           Bisection finds the factor for which ``forecast`` meets the target, so short windows also
           work (10 rounds instead of 144).
         """
-        event = refinement.event
-        target = self.target(refinement)
-        ungoverned = self._forecast_at(refinement)
-        self.strictness = find_factor(
-            lambda s: self._forecast_at(refinement, s), target, *STRICTNESS_LIMITS
-        )
-        reached = self._forecast_at(refinement, self.strictness)
+
+        def count(strictness: float, cull: float = 1.0) -> int:
+            return self.forecast(replace(refinement, strictness=strictness, cull=cull))
+
+        event, target = refinement.event, self.target(refinement)
+        strictness, cull = find_factor(count, target, *STRICTNESS_LIMITS), 1.0
+        reached = count(strictness)
         if reached > (1 + DEADBAND) * target and self.may_cull(refinement.step):
-            self.cull = find_factor(
-                lambda c: self._forecast_at(refinement, self.strictness, c), target, *CULL_LIMITS
-            )
-        event.target, event.strictness, event.cull = target, self.strictness, self.cull
-        event.blocked_by_cap += max(0, ungoverned - reached)
+            cull = find_factor(partial(count, strictness), target, *CULL_LIMITS)
+        event.target = target
+        event.strictness = refinement.strictness = strictness
+        event.cull = refinement.cull = cull
+        event.blocked_by_cap += max(0, count(1.0) - reached)
 
     def target(self, refinement: Refinement) -> int:
         """The count at which a governed round should end; ``max_gaussians`` in the last round.
@@ -243,9 +244,3 @@ class Budgeted(Densifier):
     def may_cull(self, step: int) -> bool:
         """Return whether the governor may raise ``cull`` at iteration ``step``."""
         return True
-
-    def _forecast_at(
-        self, refinement: Refinement, strictness: float = 1.0, cull: float = 1.0
-    ) -> int:
-        self.strictness, self.cull = strictness, cull
-        return self.forecast(refinement)

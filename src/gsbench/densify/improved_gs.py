@@ -11,7 +11,7 @@ from annotated_types import Interval
 from pydantic import PositiveFloat, PositiveInt
 from torch import Tensor
 
-from gsbench.densify.adc import ADC, OPACITY_RESET, Grown
+from gsbench.densify.adc import ABSOLUTE_GRADIENT, ADC, OPACITY_RESET, Grown
 from gsbench.densify.base import Refinement, Rule
 from gsbench.densify.formulas import faded, quantile
 from gsbench.densify.scores import by_mean, draw, draw_views, edge_scores
@@ -19,6 +19,7 @@ from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import RenderOutput
 from gsbench.settings import Fraction, OpenFraction, Switch
 
+FADING = Switch({"opacity_factor": 1.0}, "children fainter than their parent")
 REACH = 3.0  # the assumed extent of a Gaussian, in standard deviations
 
 
@@ -34,7 +35,7 @@ class LongAxis(ADC):
     """
 
     SWITCHES: ClassVar[Mapping[str, Switch]] = {
-        "fading": Switch({"opacity_factor": 1.0}, "children fainter than their parent"),
+        "fading": FADING,
         "opacity_reset": OPACITY_RESET,
     }
 
@@ -49,11 +50,8 @@ class LongAxis(ADC):
         values = refinement.gaussians.values
         over, _ = self.candidates(refinement)
         log_scales = shrunk(values.log_scales, *self._factors)
-        logits = faded(values.opacity_logits, self.opacity_factor)
-        return Grown(
-            torch.where(over, 2, 1),
-            torch.where(over.unsqueeze(-1), log_scales, values.log_scales),
-            torch.where(over, logits, values.opacity_logits),
+        return Grown.halved(
+            values, over, log_scales, faded(values.opacity_logits, self.opacity_factor)
         )
 
     def grow_by_gradient(self, refinement: Refinement) -> None:
@@ -133,10 +131,8 @@ class EdgeAware(LongAxis):
     """
 
     SWITCHES: ClassVar[Mapping[str, Switch]] = {
-        "absolute_gradient": Switch(
-            {"gradient": "signed"}, "the absolute gradient, in which pixels do not cancel"
-        ),
-        "fading": Switch({"opacity_factor": 1.0}, "children fainter than their parent"),
+        "absolute_gradient": ABSOLUTE_GRADIENT,
+        "fading": FADING,
         "early_prune": Switch(
             {"early_prune_opacity": 0.0}, "the pruning of the faint before the first round"
         ),

@@ -25,8 +25,22 @@ BINOMIALS = 51  # rows of the authors' table of binomials; their code allows one
 GATE_STEEPNESS = 100.0  # of the sigmoid that suppresses noise on opaque Gaussians
 
 
+NOISE = Switch({"noise_rate": 0.0}, "noise on the means")
+
+
 @dataclass
-class MCMC(Budgeted):
+class SpreadOut(Budgeted):
+    """Base of densifiers that start with small Gaussians of one opacity."""
+
+    initial_opacity: OpenFraction = 0.5
+    initial_scale: PositiveFloat = 0.1  # of the distance to the neighbours
+
+    def prepare(self, gaussians: Gaussians) -> Gaussians:
+        return spread_out(gaussians, self.initial_opacity, self.initial_scale)
+
+
+@dataclass
+class MCMC(SpreadOut):
     """3DGS-MCMC: each round moves dead Gaussians to living ones and adds copies.
 
     A dead Gaussian has an opacity of at most ``min_opacity``. A Gaussian and its copies get a
@@ -35,7 +49,7 @@ class MCMC(Budgeted):
     """
 
     SWITCHES: ClassVar[Mapping[str, Switch]] = {
-        "noise": Switch({"noise_rate": 0.0}, "noise on the means"),
+        "noise": NOISE,
         "opacity_term": Switch({"opacity_weight": 0.0}, "the opacities' term of the loss"),
         "scale_term": Switch({"scale_weight": 0.0}, "the scales' term of the loss"),
     }
@@ -49,13 +63,8 @@ class MCMC(Budgeted):
     noise_rate: NonNegativeFloat = 5e5  # times the learning rate of the means
     opacity_weight: NonNegativeFloat = 0.01  # of the mean opacity, in the loss
     scale_weight: NonNegativeFloat = 0.01  # of the mean scale, in the loss
-    initial_opacity: OpenFraction = 0.5
-    initial_scale: PositiveFloat = 0.1  # of the distance to the neighbours
     # that share opacity, the Gaussian included
     max_copies: Annotated[int, Interval(ge=1, le=BINOMIALS)] = 50
-
-    def prepare(self, gaussians: Gaussians) -> Gaussians:
-        return spread_out(gaussians, self.initial_opacity, self.initial_scale)
 
     def regularizer(self, gaussians: Gaussians) -> Tensor:
         opacity, scale = gaussians.opacities.mean(), gaussians.scales.mean()
@@ -66,7 +75,7 @@ class MCMC(Budgeted):
 
     def forecast(self, refinement: Refinement) -> int:
         """The count after a round without the cap; ``strictness`` divides the growth."""
-        return int((1 + self.growth / self.strictness) * len(refinement.gaussians))
+        return int((1 + self.growth / refinement.strictness) * len(refinement.gaussians))
 
     def may_cull(self, step: int) -> bool:
         """Return False: dead Gaussians are moved, not pruned."""
@@ -187,7 +196,7 @@ MIN_DECAYED = 1e-12  # of opacities and scales after decay
 
 
 @dataclass
-class MRNF(Budgeted):
+class MRNF(SpreadOut):
     """MRNF of LichtFeld Studio: long-axis splits replace pruned Gaussians and add a small share.
 
     Opacities and scales decay. The refine weight of a Gaussian is the largest sum over pixels of e
@@ -208,7 +217,7 @@ class MRNF(Budgeted):
     STATISTICS: ClassVar[dict[str, torch.dtype]] = {"seen": torch.bool}  # since the last round
 
     SWITCHES: ClassVar[Mapping[str, Switch]] = {
-        "noise": Switch({"noise_rate": 0.0}, "noise on the means"),
+        "noise": NOISE,
         "opacity_decay": Switch({"opacity_decay": 0.0}, "opacities that decay"),
         "scale_decay": Switch({"scale_decay": 0.0}, "scales that decay"),
     }
@@ -229,11 +238,6 @@ class MRNF(Budgeted):
     scale_decay: Annotated[float, Interval(ge=0, lt=1)] = 0.002
     decay_until: PositiveInt = 30_000  # iterations; the length of the training
     noise_rate: NonNegativeFloat = 50.0  # times the learning rate of the means
-    initial_opacity: OpenFraction = 0.5
-    initial_scale: PositiveFloat = 0.1  # of the distance to the neighbours
-
-    def prepare(self, gaussians: Gaussians) -> Gaussians:
-        return spread_out(gaussians, self.initial_opacity, self.initial_scale)
 
     def observe(self, step: int, render: RenderOutput) -> None:
         self.statistics["seen"] |= render.visible

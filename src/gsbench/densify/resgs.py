@@ -10,7 +10,7 @@ from annotated_types import Ge, Interval
 from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor
 
-from gsbench.densify.adc import ADC
+from gsbench.densify.adc import ABSOLUTE_GRADIENT, ADC
 from gsbench.densify.base import Refinement, Rule
 from gsbench.densify.formulas import faded
 from gsbench.errors import InputError
@@ -44,9 +44,7 @@ class ResGS(ADC):
     STATISTICS: ClassVar[dict[str, torch.dtype]] = {"level": torch.int32}
 
     SWITCHES: ClassVar[Mapping[str, Switch]] = {
-        "absolute_gradient": Switch(
-            {"gradient": "signed"}, "the absolute gradient, in which pixels do not cancel"
-        ),
+        "absolute_gradient": ABSOLUTE_GRADIENT,
         "fading": Switch({"fade": 1.0}, "opacities that fade"),
         "levels": Switch(
             {"level_factor": 1.0}, "lower thresholds for those that earlier stages passed over"
@@ -116,14 +114,14 @@ class ResGS(ADC):
         behind = (self.stage(refinement.step) - self.statistics["level"]).clamp_min(0)  # [N] levels
         # a higher mean instead of a lower threshold
         mean = self.mean_gradient() * self.level_factor ** behind.to(torch.float64)
-        return self.reaches(mean, self.gradient_threshold), large
+        return self.reaches(mean, self.gradient_threshold * refinement.strictness), large
 
     def forecast(self, refinement: Refinement) -> int:
-        logits = refinement.gaussians.values.opacity_logits
+        logits, cull = refinement.gaussians.values.opacity_logits, refinement.cull
         over, _ = self.candidates(refinement)
         parents = torch.where(over, faded(logits, self.parent_opacity), logits)
-        children = over & ~self.faint(logits)
-        return int((~self.faint(parents)).sum()) + int(children.sum())
+        children = over & ~self.faint(logits, cull)
+        return int((~self.faint(parents, cull)).sum()) + int(children.sum())
 
     def grow_by_gradient(self, refinement: Refinement) -> None:
         """Add a child for each candidate, then lower the candidate's opacity."""

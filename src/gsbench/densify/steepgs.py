@@ -99,12 +99,9 @@ class SteepGS(ADC):
     def grown(self, refinement: Refinement) -> Grown:
         values = refinement.gaussians.values
         over, large = self.candidates(refinement)
-        return Grown(
-            torch.where(over, 2, 1),
-            values.log_scales - math.log(self.split_shrink) * (over & large).unsqueeze(-1),
-            torch.where(
-                over, faded(values.opacity_logits, self.opacity_factor), values.opacity_logits
-            ),
+        log_scales = values.log_scales - math.log(self.split_shrink) * large.unsqueeze(-1)
+        return Grown.halved(
+            values, over, log_scales, faded(values.opacity_logits, self.opacity_factor)
         )
 
     def grow_by_gradient(self, refinement: Refinement) -> None:

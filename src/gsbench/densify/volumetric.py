@@ -148,10 +148,10 @@ class Volumetric(ADC):
         """The number of Gaussians that one split by volume adds."""
         return self.volume_children - (0 if self.keep_parent else 1)
 
-    def selected_by_volume(self, log_scales: Tensor) -> Tensor:
+    def selected_by_volume(self, log_scales: Tensor, strictness: float) -> Tensor:
         """Mask [N] of the Gaussians to split by volume."""
         volumes = log_volume(log_scales)
-        threshold = self.log_threshold(volumes)
+        threshold = self.log_threshold(volumes, strictness)
         if self.split_isotropic:
             return volumes > threshold
         children = log_volume(self.child_log_scales(log_scales))
@@ -166,11 +166,11 @@ class Volumetric(ADC):
         # children of the volume rule have no gradients, so they do not grow
         if self.volume_order == "before_adc":
             before = refinement.gaussians.values.log_scales
-            large = self.selected_by_volume(before)
+            large = self.selected_by_volume(before, refinement.strictness)
             number = torch.where(large, 1, number)
             log_scales = torch.where(large.unsqueeze(-1), before, log_scales)
         else:
-            large = self.selected_by_volume(log_scales)
+            large = self.selected_by_volume(log_scales, refinement.strictness)
         number = torch.where(large, (1 + self.volume_gain) * number, number)
         # After pruning, the forecast of pruning must still see the parents' scales.
         if self.volume_order != "after_prune":
@@ -180,12 +180,12 @@ class Volumetric(ADC):
 
     def split_by_volume(self, refinement: Refinement) -> None:
         """Split every Gaussian with V > V_th (eq. 5 to 7)."""
-        event = refinement.event
+        event, strictness = refinement.event, refinement.strictness
         log_scales = refinement.gaussians.values.log_scales.detach()
         volumes = log_volume(log_scales)  # [N]
-        threshold = self.log_threshold(volumes)
+        threshold = self.log_threshold(volumes, strictness)
         children = self.child_log_scales(log_scales)  # [N, 3]
-        candidates = self.selected_by_volume(log_scales)
+        candidates = self.selected_by_volume(log_scales, strictness)
         selected, blocked = admit(candidates, volumes, self.volume_gain, self.allowance(refinement))
         split_again = log_volume(children) > threshold  # [N] the next round would split them, too
         vanishing = children.amax(-1) < math.log(VANISHING_SIZE * self.context.extent)  # [N]
@@ -203,9 +203,9 @@ class Volumetric(ADC):
             sampled=self.placement == "sampled",
         )
 
-    def log_threshold(self, volumes: Tensor) -> float:
+    def log_threshold(self, volumes: Tensor, strictness: float = 1.0) -> float:
         """log V_th for Gaussians with log volumes [N], ``strictness`` of the governor included."""
-        governed = self.governor_dimension * math.log(self.strictness)
+        governed = self.governor_dimension * math.log(strictness)
         return self._ungoverned_log_threshold(volumes) + governed
 
     def _ungoverned_log_threshold(self, volumes: Tensor) -> float:

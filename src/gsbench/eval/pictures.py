@@ -19,7 +19,7 @@ from gsbench.logs import Progress, no_progress
 from gsbench.runs.trial_record import Oddity
 from gsbench.scene.images import EXIF_ORIENTATION, open_image, read_image
 from gsbench.scene.masks import read_mask
-from gsbench.scene.rules import ANY, Finding, Rule, at_most, settle
+from gsbench.scene.rules import Finding, Rule, at_most, settle
 
 # A view of so many pixels takes half a minute; a file of some kB may claim more.
 MAX_PIXELS = 64_000_000
@@ -94,7 +94,7 @@ def _where(applies: Callable[[Look, Look], bool]) -> Callable[[Looks], Iterable[
 
 
 def _row(id: str, applies: Callable[[Look, Look], bool], say: str, mend: str) -> Rule:
-    return Rule(id, "pictures", _where(applies), at_most(0), ANY, f"{say} ({{names:few}})", mend)
+    return Rule(id, "pictures", _where(applies), at_most(0), f"{say} ({{names:few}})", mend)
 
 
 # Rows of the table of rules (`gsbench.scene.rules`) about pictures; all may be measured.

@@ -8,7 +8,6 @@ import numpy as np
 from PIL import Image
 
 from gsbench.errors import InputError, TrainingError
-from gsbench.eval.matching import match_by_order, match_pictures
 from gsbench.eval.pictures import Look, find_odd_pictures, look_at, read_picture
 from gsbench.files import write_json
 from gsbench.gaussians.model import Gaussians
@@ -17,6 +16,7 @@ from gsbench.init.base import MODEL_FOLDER, PointCloud
 from gsbench.normalization import IDENTITY, Normalization
 from gsbench.scene.colmap import write_model
 from gsbench.scene.images import check_picture_names, png_name
+from gsbench.scene.names import match_by_order, match_pictures
 from gsbench.scene.types import Camera, View
 from gsbench.words import counted, some_of
 

@@ -14,9 +14,14 @@ from plyfile import PlyData, PlyElement
 
 from gsbench.errors import InputError
 from gsbench.files import DAMAGE, atomic, require_regular
-from gsbench.gaussians.foreign_columns import check_columns, report_header, with_filter_applied
 from gsbench.gaussians.model import MAX_SH_DEGREE, NUM_SH_REST, Gaussians
-from gsbench.gaussians.ply_files import read_header, read_ply_data
+from gsbench.gaussians.ply_files import (
+    check_columns,
+    read_header,
+    read_ply_data,
+    report_header,
+    with_filter_applied,
+)
 from gsbench.normalization import IDENTITY, Normalization
 from gsbench.words import counted
 
@@ -198,7 +203,7 @@ def read_ply(
 
     ``normalization`` is applied to positions, before they become float32, and to scales.
     Mip-Splatting's filter is applied, other columns that gsbench does not know are named
-    (`foreign_columns`).
+    (`gsbench.gaussians.ply_files`).
 
     Raises InputError if the file is not a PLY, lacks a property, or has invalid values.
     """

@@ -1,15 +1,24 @@
-"""Read PLY files of other programs, and recognise formats of Gaussians that are not plain PLY."""
+"""PLY files of other programs: how they are read, formats that are no PLY, and unknown columns."""
 
 import codecs
 import io
+import logging
 import re
 import zipfile
 import zlib
+from collections.abc import Collection, Sequence
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from plyfile import PlyData, PlyParseError
 
+from gsbench.errors import InputError
 from gsbench.files import DAMAGE, GIT_LFS, LFS_REMEDY
+from gsbench.words import some_of
+
+log = logging.getLogger(__name__)
 
 MAX_HEADER = 1 << 16  # bytes
 END = b"end_header"
@@ -114,3 +123,104 @@ def read_ply_data(path: Path) -> PlyData:
         return PlyData.read(io.BytesIO(NOT_ASCII.sub(b"?", header) + content[len(header) :]))
     except PlyParseError as error:
         raise ValueError(str(error)) from error
+
+
+FILTER = "filter_3D"
+MOVING = "its Gaussians move with time"
+# Names of columns in lower case, and why a model with them is no set of 3D Gaussians that stand
+# still.
+REFUSED = {
+    r"betas?(_\d+)?|sb_params_\d+": "Beta Splatting's kernels are no Gaussians",
+    r"nu_degree|nu": "kernels of Student Splatting are no Gaussians",
+    r"shapes?(_\d+)?": "generalised exponentials (GES) are no Gaussians",
+    r"t|time|t_\w+|scale_t|rot_[rt]_\d|trbf_\w+|motion_\d+|omega_\d+|velocity_\w+": MOVING,
+    r"f_anchor_feat_\d+|f_offset_\d+": "Scaffold-GS computes its Gaussians by networks",
+    r"f_asg_\d+": "Spec-Gaussian computes its colours by networks",
+}
+# Found so in exports, and without effect on a render of f_dc and f_rest.
+HARMLESS = re.compile("red|green|blue")
+
+
+# Comments in a PLY's header. Brush writes SplatRenderMode, Postshot antialiased.
+ANTIALIASED = re.compile(r"SplatRenderMode:\s*mip|(antialiased|anti.?aliasing)\W*(1|true)", re.I)
+USUAL = re.compile(
+    r"\s*|(written|generated|exported|created|made|converted|saved|edited)\b.*|vertical axis.*"
+    r"|SplatRenderMode:\s*default|(antialiased|anti.?aliasing)\W*(0|false)|.*https?://.*",
+    re.I,
+)
+
+
+def report_header(comments: Sequence[str], elements: Collection[str], path: Path) -> None:
+    """Log what the header says beyond the columns: a render mode, unknown comments and elements."""
+    for comment in comments:
+        if ANTIALIASED.search(comment):
+            log.warning(
+                "%s: %r: its opacities belong to an antialiased rasterizer (Mip-Splatting); "
+                "gsbench draws them without it, and thin Gaussians come out too opaque",
+                path,
+                comment,
+            )
+    unknown = [text for text in comments if not (ANTIALIASED.search(text) or USUAL.fullmatch(text))]
+    unknown += [f"element {name}" for name in elements if name != "vertex"]
+    if unknown:
+        log.warning(
+            "%s: not known and not used: %s", path, some_of([repr(text[:60]) for text in unknown])
+        )
+
+
+def check_columns(names: Collection[str], known: Collection[str], path: Path) -> None:
+    """Raise InputError for a column that changes what is drawn; log those that are not known."""
+    unknown = [
+        name
+        for name in names
+        if name not in known and not HARMLESS.fullmatch(name) and not is_filter(name)
+    ]
+    for name in unknown:
+        if reason := next(
+            (REFUSED[key] for key in REFUSED if re.fullmatch(key, name.lower())), None
+        ):
+            raise InputError(
+                f"{path}: it has the column {name}: {reason}, and gsbench draws Gaussians alone"
+            )
+    if unknown:
+        noun, verb = ("column", "is") if len(unknown) == 1 else ("columns", "are")
+        listed = ", ".join(unknown)
+        log.warning("%s: the %s %s %s not known and not used", path, noun, listed, verb)
+
+
+def is_filter(name: str) -> bool:
+    """Return whether a column holds the sizes of Mip-Splatting's 3D filter."""
+    return name.lower() == FILTER.lower()
+
+
+def with_filter_applied(vertices: NDArray[Any], path: Path, largest_logit: float) -> NDArray[Any]:
+    """Apply Mip-Splatting's 3D filter, if there is one: to scales and opacities, with a log line.
+
+    As its ``create_fused_ply.py``: each scale s becomes sqrt(s² + f²), and the opacity is
+    multiplied by the ratio of the volumes before and after (Yu et al. 2024, equation 7). Logits
+    are limited to ``largest_logit``.
+    """
+    column = next(filter(is_filter, vertices.dtype.names or ()), None)
+    if column is None:
+        return vertices
+    sizes = vertices[column].astype(np.float64)  # [N]
+    if not (np.isfinite(sizes) & (sizes >= 0)).all():
+        raise InputError(f"{path}: {FILTER} is negative or not a finite number: export it again")
+    log.warning("%s: Mip-Splatting's %s is applied to scales and opacities", path, FILTER)
+    names = [f"scale_{axis}" for axis in range(3)]
+    logs = np.stack([vertices[name] for name in names]).astype(np.float64)  # [3, N]
+    with np.errstate(divide="ignore"):
+        fused = 0.5 * np.logaddexp(2 * logs, 2 * np.log(sizes))  # log sqrt(s² + f²)
+    logits = vertices["opacity"].astype(np.float64)
+    # log of the new opacity, then its logit: log p - log(1 - p)
+    log_opacity = -np.logaddexp(0.0, -logits) + (logs - fused).sum(axis=0)
+    with np.errstate(divide="ignore"):
+        new_logits = log_opacity - np.log(-np.expm1(np.minimum(log_opacity, 0.0)))
+    kinds = [(name, vertices.dtype[name]) for name in vertices.dtype.names or ()]
+    changed = vertices.astype(
+        [(name, "f8" if name in (*names, "opacity") else kind) for name, kind in kinds]
+    )
+    for name, values in zip(names, fused, strict=True):
+        changed[name] = values
+    changed["opacity"] = new_logits.clip(-largest_logit, largest_logit)
+    return changed

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
-from torch.optim.adam import adam
 
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
 from gsbench.gaussians.paper_values import ADAM_BETAS, ADAM_EPSILON, LearningRates
@@ -140,7 +139,7 @@ class TrainableGaussians:
     optimiser step of that iteration skips it.
 
     `torch.optim.Adam` is not used, because the first object of that class imports torch's compiler,
-    which takes 1.5 CPU-seconds in each process. The function `adam` does the same arithmetic.
+    which takes 1.5 CPU-seconds in each process.
     """
 
     def __init__(
@@ -151,7 +150,7 @@ class TrainableGaussians:
         step_all: StepAll | None = None,
         optimizer: Optimizer | None = None,
     ) -> None:
-        """``step_all`` applies Adam to whole parameters (None: torch's fused kernel).
+        """``step_all`` applies Adam to whole parameters (None: `torch_adam`).
 
         ``optimizer`` steps the parameters in its ``groups`` (all, if it has none) instead.
         """
@@ -327,51 +326,22 @@ class TrainableGaussians:
 def torch_adam(
     updates: Sequence[Update], seen: Tensor | None = None, visible: Tensor | None = None
 ) -> None:
-    """Apply Adam (Kingma and Ba 2015), to whole parameters by torch's fused kernel.
+    """Apply Adam (Kingma and Ba 2015, algorithm 1) in torch, on any device and in any precision.
 
-    Gradients must be defined everywhere, as autograd's are.
+    Gradients must be defined everywhere, as autograd's are. As in torch, epsilon is outside the
+    root.
     """
-    index = None if visible is None else visible.nonzero().squeeze(-1)  # [V]
-    for update in updates:
-        parameter, gradient, state, _, further = update
+    beta1, beta2 = ADAM_BETAS
+    rows = slice(None) if visible is None else visible.nonzero().squeeze(-1)
+    for parameter, gradients, state, _, further in updates:
         if seen is not None or further is not None:
             raise NotImplementedError("torch_adam: a gradient is one tensor, defined everywhere")
-        if index is not None:
-            _step_rows(update, index)
-            continue
-        fused = parameter.device.type in ("cpu", "cuda")
-        # torch counts the step itself. `full` makes the number on the device, without an upload.
-        step = torch.full((), state.step - 1.0, device=parameter.device if fused else "cpu")
-        adam(
-            [parameter],
-            [gradient],
-            [state.first],
-            [state.second],
-            [],
-            [step],
-            fused=fused,
-            amsgrad=False,
-            beta1=ADAM_BETAS[0],
-            beta2=ADAM_BETAS[1],
-            lr=state.rate,
-            weight_decay=0.0,
-            eps=ADAM_EPSILON,
-            maximize=False,
-        )
-
-
-def _step_rows(update: Update, index: Tensor) -> None:
-    """Apply Adam to the rows ``index`` [V] only. All rows share one step count."""
-    beta1, beta2 = ADAM_BETAS
-    parameter, gradients, state, *_ = update
-    step, gradient = state.step, gradients[index]
-    # m = b1 m + (1 - b1) g and v = b2 v + (1 - b2) g^2, then p -= rate m' / (sqrt(v') + eps) with
-    # m' = m / (1 - b1^step) and v' = v / (1 - b2^step). As in torch, eps is outside the root.
-    first = state.first[index].lerp_(gradient, 1 - beta1)
-    second = state.second[index].mul_(beta2).addcmul_(gradient, gradient, value=1 - beta2)
-    state.first[index], state.second[index] = first, second
-    denominator = (second / (1 - beta2**step)).sqrt_().add_(ADAM_EPSILON)
-    parameter[index] -= state.rate / (1 - beta1**step) * first / denominator
+        gradient = gradients[rows]
+        first = state.first[rows].lerp_(gradient, 1 - beta1)
+        second = state.second[rows].mul_(beta2).addcmul_(gradient, gradient, value=1 - beta2)
+        state.first[rows], state.second[rows] = first, second
+        denominator = (second / (1 - beta2**state.step)).sqrt_().add_(ADAM_EPSILON)
+        parameter[rows] -= state.rate / (1 - beta1**state.step) * first / denominator
 
 
 def _edited(old: Tensor, keep: Tensor | None, added: Tensor | None) -> Tensor:

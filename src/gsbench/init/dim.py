@@ -188,7 +188,7 @@ def match_stored_features(
 ) -> dict[str, int]:
     """Write the stored features and matches into the database, and verify them."""
     from gsbench.init.colmap.database import write_keypoints, write_matches
-    from gsbench.init.colmap.geometry import verification_options, verify_pairs
+    from gsbench.init.colmap.matches import verification_options, verify_pairs
     from gsbench.init.networks.extract_and_match import choose_pairs, open_store
 
     networks = _network_job(job)

@@ -26,7 +26,7 @@ from gsbench.init.base import (
 from gsbench.init.colmap.pairs import ALL_PAIRS_UP_TO
 from gsbench.init.options import ColmapOptions
 from gsbench.logs import Progress
-from gsbench.scene.exif import lens_of
+from gsbench.scene.images import lens_of
 from gsbench.scene.rules import MIN_IMAGES
 from gsbench.scene.types import Capture
 from gsbench.system.isolate import run_with_progress

@@ -16,9 +16,8 @@ from gsbench.launch.outcomes import Outcome, outcome_of_results
 from gsbench.launch.record import asked_metrics, record
 from gsbench.launch.slurm import run_slurm
 from gsbench.runs.freshness import Change
-from gsbench.runs.keys import STAGES
+from gsbench.runs.keys import STAGES, VIEWS
 from gsbench.runs.layout import STORE
-from gsbench.runs.nested import GSBENCH
 from gsbench.runs.store import Store
 from gsbench.runs.user_code import PERMISSIONS
 from gsbench.system.stopping import stop_on_signals
@@ -66,8 +65,6 @@ def _begin(trials: Sequence[Trial], unfinished: Sequence[Trial], asks: bool = Tr
     check_parts(unfinished, on_this_machine=here)
     if here:
         check_trackers(unfinished)
-    for line in borrowed_names(unfinished):
-        log.warning("%s", line)
     try:
         make_runs_folder(runs)
     except OSError as error:
@@ -75,7 +72,7 @@ def _begin(trials: Sequence[Trial], unfinished: Sequence[Trial], asks: bool = Tr
             raise
         log.info("%s cannot be written to (%s), so its plan stays as it is", runs, error.strerror)
         return
-    Store(runs / STORE).sweep(STAGES)
+    Store(runs / STORE).sweep((*STAGES, VIEWS))
     record(trials, asks)
 
 
@@ -152,21 +149,6 @@ def check_trackers(trials: Sequence[Trial]) -> None:
     for trial in trials:
         if (options := trial.values["tracking"])["enabled"]:
             make_sink(options, trial.values.get(PERMISSIONS) or ())
-
-
-def borrowed_names(trials: Sequence[Trial]) -> list[str]:
-    """A line for each user's class whose name in tables is that of a class of gsbench."""
-    lines = []
-    for group in ("densify", "init"):
-        parts = [trial.values[group] for trial in trials]
-        classes = {(str(part.get("name")), str(part.get("_target_") or GSBENCH)) for part in parts}
-        for name, target in sorted(classes):
-            if name in options(group) and not target.startswith(GSBENCH):
-                lines.append(
-                    f"{target} is shown as {name}, like gsbench's own: "
-                    f"give it a name, {group}.name={target.rpartition('.')[2].lower()}"
-                )
-    return lines
 
 
 def need_no_check(trials: Sequence[Trial]) -> bool:

@@ -1,10 +1,10 @@
-"""The listing of a dry run: each trial with its state, what changed, and the time that is left."""
+"""The listing of a dry run: each trial with its state, and the time left. Loads no torch."""
 
 from __future__ import annotations
 
 import json
-from collections import Counter, defaultdict
-from collections.abc import Collection, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache
@@ -12,21 +12,20 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from gsbench.config.compose import Trial
-from gsbench.errors import InputError
-from gsbench.eval.facts import LPIPS
-from gsbench.launch.guess import Guess, guess_training
-from gsbench.launch.states import arm_names, ask_queue, label_of, state_in_queue
-from gsbench.parsing import DamagedError
-from gsbench.runs.config_hash import determining_settings
-from gsbench.runs.layout import RESULTS, SEED, TRIAL_GLOB
-from gsbench.runs.nested import SHOWN, flatten, sha256_of
-from gsbench.runs.trial_folder import TrialFolder
-from gsbench.runs.user_code import user_modules
-from gsbench.words import counted, readable_time, some_of
+import numpy as np
+from PIL import Image
 
-# in the order of a summary
-STATES = ("done", "partial", "missing", "running", "queued", "failed", "damaged")
+from gsbench.config.compose import Trial
+from gsbench.eval.facts import LPIPS
+from gsbench.launch.states import arm_names, ask_queue, label_of, state_in_queue, summary_of
+from gsbench.parsing import DamagedError
+from gsbench.runs.layout import RESULTS, TRIAL_GLOB
+from gsbench.runs.nested import sha256_of
+from gsbench.runs.trial_folder import TrialFolder
+from gsbench.scene.names import IMAGE_SUFFIXES
+from gsbench.scene.options import downscaled_size
+from gsbench.system.resources import available_threads, installed_gpus
+from gsbench.words import counted, readable_time
 
 
 class FinishedTrials:
@@ -83,8 +82,8 @@ def describe_plan(trials: Sequence[Trial], parallel: int = 1) -> list[str]:
     """Lines for ``--dry-run``: each trial with its state, and the time for the unfinished ones."""
     lines: list[str] = []
     remaining, without_estimate, learned_from = 0.0, 0, 0
-    guess: Guess | None = None  # of the last trial that no finished one is similar to
-    counts: Counter[str] = Counter()
+    guess = ""  # for the last trial that no finished one is similar to
+    states: list[str] = []
     finished = FinishedTrials(trials[0].files.runs)
     queue = ask_queue(trial.folder for trial in trials)
     arms = arm_names({trial.folder: trial.overrides for trial in trials})
@@ -100,33 +99,29 @@ def describe_plan(trials: Sequence[Trial], parallel: int = 1) -> list[str]:
             note = f"  as in {experiment}: nothing to compute"
         else:
             seconds, known_from = finished.estimate(trial.values)
-            # a stopped training goes on from its checkpoint
-            done = folder.stage_and_step()[1] / max(1, trial.values["train"]["iterations"])
             if not known_from and (found := guess_training(trial.values, parallel)):
-                seconds, guess = found.seconds, found
-            remaining += seconds * (1 - min(1.0, done))
+                seconds, guess = found
+            # a stopped training goes on from its checkpoint
+            remaining += seconds * (1 - folder.share_done(trial.values["train"]["iterations"]))
             learned_from = max(learned_from, known_from)
             without_estimate += seconds == 0
-        if state == "missing" and (change := _change_since_last(trial, arms)):
-            note += f"  {change}"
-        counts[state] += 1
+        states.append(state)
         lines.append(f"{state:<8} {label_of(folder.path, arms)}{note}")
-    summary = ", ".join(f"{counts[state]} {state}" for state in STATES if counts[state])
-    lines.append(f"{counted(len(trials), 'trial')}: {summary}")
-    if counts["done"] == len(trials):
+    lines.append(summary_of(states))
+    if {*states} == {"done"}:
         return lines
     if without_estimate:
         time = (
             "no estimate: no finished trial of this scene with this rasterizer tells how long "
             "one takes here"
         )
-    elif learned_from == 0 and guess is None:
+    elif not (learned_from or guess):
         time = "seconds, since other experiments have the results"
     else:
         at_once = f", {parallel} at once" if parallel > 1 else ""
         duration = readable_time(remaining / parallel)
         sources = [f"estimated from {counted(learned_from, 'finished trial')}"] * (learned_from > 0)
-        sources += [str(guess)] * (guess is not None)
+        sources += [guess] * bool(guess)
         time = f"about {duration}{at_once}, {'; '.join(sources)}"
     return [*lines, f"time: {time}"]
 
@@ -146,36 +141,6 @@ def _what_is_left(trial: Trial) -> str:
     return "" if change is None else f"  will be checked: {change}"
 
 
-def _change_since_last(trial: Trial, planned: Collection[Path]) -> str:
-    """A line on what changed since the arm's last finished trial of this scene and seed.
-
-    It is "" if there is none. A trial that is ``planned`` too is another arm of this sweep, not an
-    earlier form of this one.
-    """
-    pattern = f"*{SEED}{trial.values['seed']}/{RESULTS}"
-    earlier = [
-        path.parent for path in trial.folder.parent.glob(pattern) if path.parent not in planned
-    ]
-    if not earlier:
-        return ""
-    last = TrialFolder(max(earlier, key=lambda folder: (folder / RESULTS).stat().st_mtime))
-    record = last.sound_record()
-    try:
-        before = _determining(last.configuration(), {} if record is None else record.code.sources)
-    except (InputError, OSError):
-        return ""
-    now, hash8 = _determining(trial.values, user_modules(trial.values)), last.path.name[:SHOWN]
-    keys = [key for key in {**now, **before} if now.get(key) != before.get(key)]
-    changes = [f"{key} {before.get(key, 'unset')} → {now.get(key, 'unset')}" for key in keys]
-    return f"since {hash8} changed: {some_of(changes)}" if changes else ""
-
-
-def _determining(values: Mapping[str, Any], modules: Mapping[str, str]) -> dict[str, Any]:
-    """The settings that determine a result, with dotted keys, and the user's code."""
-    code = {f"code of {module}": digest[:SHOWN] for module, digest in modules.items()}
-    return flatten(determining_settings(values)) | code
-
-
 def unavailable_now(options: Mapping[str, Any]) -> Collection[str]:
     """The metrics that cannot be computed now, by the ``eval`` settings.
 
@@ -190,3 +155,74 @@ def _unavailable_now(options: str) -> Collection[str]:
     from gsbench.pipeline.parts import make_evaluator
 
     return make_evaluator(EvalConfig(**json.loads(options))).awaited
+
+
+# ---- a first guess from the size of pictures, as long as no finished trial tells more
+
+# Seconds of a step, measured (docs/measurements.md). On one thread of a CPU: projecting, sorting,
+# their gradients and Adam for each Gaussian, compositing, its gradient and the loss for each pixel.
+# On an H100: 100,000 and 1 million Gaussians took 1.3 and 3.0 ms.
+CPU_OF_GAUSSIAN, CPU_OF_PIXEL = 0.0241 / 100_000, 0.0294 / (500 * 375)
+GPU_OF_STEP, GPU_OF_GAUSSIAN = 0.0011, 1.9e-9
+THREADS, SPEED_UP = (1, 2, 4, 8, 16), (1, 1.9, 3.4, 5.5, 6.3)
+# A trained courtyard has 0.46 Gaussians for each pixel of a picture.
+GAUSSIANS_OF_PIXEL = 0.46
+MAX_ENTRIES = 10_000  # of a folder that are looked at for a picture
+
+
+def guess_training(values: Mapping[str, Any], parallel: int = 1) -> tuple[float, str] | None:
+    """The seconds of a training, and what they rest on; None without a picture."""
+    size = picture_size(values["scene"])
+    if size is None:
+        return None
+    pixels = size[0] * size[1]
+    gaussians = round(GAUSSIANS_OF_PIXEL * pixels)
+    gaussians = min(gaussians, values["densify"].get("max_gaussians") or gaussians)
+    on_gpu = values["device"] != "cpu" and has_gpu()
+    if on_gpu:
+        step = GPU_OF_STEP + GPU_OF_GAUSSIAN * gaussians
+    else:
+        given = values["threads"]
+        threads = available_threads(parallel) if given == "auto" else given
+        step = CPU_OF_GAUSSIAN * gaussians + CPU_OF_PIXEL * pixels
+        step /= float(np.interp(threads, THREADS, SPEED_UP))
+    text = (
+        f"a first guess for trainings on {'an H100' if on_gpu else 'this CPU'}, from pictures of "
+        f"{size[0]}×{size[1]} px and {gaussians:,} Gaussians"
+    )
+    return step * values["train"]["iterations"], text
+
+
+def picture_size(scene: Mapping[str, Any]) -> tuple[int, int] | None:
+    """The size, in px, to which the first picture of a scene is brought for the training."""
+    size = _first_size(scene.get("path") or "", scene.get("images") or "images")
+    if scene.get("kind") == "courtyard":
+        size = scene["width"], scene["height"]
+    if size is None:
+        return None
+    return downscaled_size(*size, scene.get("downscale") or 1, scene.get("max_size"))
+
+
+@cache
+def has_gpu() -> bool:
+    return bool(installed_gpus())
+
+
+@cache
+def _first_size(path: str, images: str) -> tuple[int, int] | None:
+    folder = Path(path).expanduser()
+    for place in (folder / images, folder) if path else ():
+        for file in _files(place):
+            try:
+                with Image.open(file) as picture:  # reads the header alone
+                    return picture.size
+            except (OSError, ValueError, Image.DecompressionBombError):
+                continue
+    return None
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    if folder.is_dir():
+        for _, file in zip(range(MAX_ENTRIES), folder.iterdir(), strict=False):
+            if file.suffix.lower() in IMAGE_SUFFIXES and file.is_file():
+                yield file

@@ -23,8 +23,7 @@ from typing import TYPE_CHECKING, Any
 from gsbench.config.compose import Trial
 from gsbench.errors import InputError
 from gsbench.files import DiskFullError, require_no_links
-from gsbench.launch.outcomes import Outcome, outcome_of_error, outcome_of_results
-from gsbench.launch.repeats import Repeats
+from gsbench.launch.outcomes import Outcome, Repeats, outcome_of_error, outcome_of_results
 from gsbench.launch.states import arm_names, forget_submission, label_of
 from gsbench.logs import bar, set_up_logging
 from gsbench.runs.commands import digest_of
@@ -33,7 +32,7 @@ from gsbench.runs.nested import sha256_of
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.isolate import error_tail
 from gsbench.system.locks import BusyError
-from gsbench.system.own_modules import adopt_modules, allowed_modules
+from gsbench.system.programs import adopt_modules, allowed_modules
 from gsbench.system.resources import assign_gpu, assign_threads, names_one_gpu, take_slot
 from gsbench.system.stopping import (
     SIGNALS,
@@ -196,16 +195,13 @@ def run_local(trials: Sequence[Trial], mirror: Mirror) -> list[Outcome]:
     with bar(values["name"]) as report:
 
         def show(ended: int, running: Sequence[Trial]) -> None:
-            done = ended + sum(map(share_done, running))
+            done = ended + sum(
+                trial.files.share_done(trial.values["train"]["iterations"]) for trial in running
+            )
             note = f"{ended} of {len(trials)} trials, {len(running)} running"
             report("trials", round(BAR * done), BAR * len(trials), note)
 
         return _run(trials, executor, parallel, mirror, show)
-
-
-def share_done(trial: Trial) -> float:
-    """The share of a running trial's iterations that are done."""
-    return min(1.0, trial.files.stage_and_step()[1] / max(1, trial.values["train"]["iterations"]))
 
 
 def job_folder(values: dict[str, Any]) -> Path:

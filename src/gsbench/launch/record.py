@@ -4,10 +4,7 @@ Loads no torch.
 """
 
 import logging
-import os
 import shutil
-import sys
-import time
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,28 +18,36 @@ from gsbench.analysis.questions import (
     Asked,
     LeastEffect,
     NamedQuestion,
-    Row,
     announce,
     ask,
     plan_looks,
     read_least,
-    rows_of,
 )
-from gsbench.analysis.results import group_by, read_experiment
+from gsbench.analysis.results import TrialResult, group_by, read_experiment
+from gsbench.analysis.trial_result import Planned
 from gsbench.config.compose import Trial
 from gsbench.errors import InputError
 from gsbench.files import require_no_links
 from gsbench.pipeline.metric_facts import facts_for
-from gsbench.runs.commands import Command, History, PlannedTrial, Question, append, digest_of, drop
-from gsbench.runs.experiments import QUESTIONS, metric_and_question
-from gsbench.runs.layout import LEDGER, RESULTS, SEED, TUNING
+from gsbench.runs.commands import (
+    Command,
+    History,
+    PlannedTrial,
+    Question,
+    append,
+    command_now,
+    digest_of,
+    drop,
+    read_history,
+)
+from gsbench.runs.experiments import DEFAULT_METRIC, QUESTIONS, metric_and_question
+from gsbench.runs.layout import RESULTS, SEED, TUNING
 from gsbench.runs.nested import flatten
 from gsbench.settings import check_values
 from gsbench.words import did_you_mean
 
 log = logging.getLogger(__name__)
 
-DEFAULT_METRIC = "psnr"
 DIRECTIONS = {"higher": 1, "lower": -1, "same": 0}
 
 
@@ -60,21 +65,22 @@ def record(trials: Sequence[Trial], asks: bool = True) -> list[Question]:
         if not typed:
             continue
         rows = planned_rows(typed)
-        questions = asks and not any((home / name).exists() for name in (TUNING, LEDGER))
-        asked = asked_of(typed, rows) if questions else None
-        measured = rows_of(read_experiment(home).trials) if asked and home.is_dir() else []
+        asked = None
+        if asks and not (home / TUNING).exists() and read_history(home).ledger is None:
+            asked = asked_of(typed, rows)
+        measured = read_experiment(home).trials if asked and home.is_dir() else ()
 
         def make(
             history: History,
             home: Path = home,
             typed: Sequence[Trial] = typed,
-            rows: Sequence[Row] = rows,
+            rows: Sequence[Planned] = rows,
             asked: Asked | None = asked,
-            measured: Sequence[Row] = measured,
+            measured: Sequence[TrialResult] = measured,
         ) -> Command | None:
             found, shown = ask(rows, asked, measured, history) if asked else ([], [])
             asked_now.extend([*found, *(one for one in history.questions if one.id in shown)])
-            if set(shown) <= set().union(*history.newest.values()):
+            if set(shown) <= history.last:
                 shown = []  # they are the newest ones already
             planned = {
                 trial.folder.relative_to(home).as_posix(): PlannedTrial(
@@ -90,14 +96,7 @@ def record(trials: Sequence[Trial], asks: bool = True) -> list[Question]:
             }
             if not (found or shown or changed):
                 return None
-            return Command(
-                words=tuple(sys.argv[1:]),
-                cwd=os.getcwd(),
-                time=time.time(),
-                trials=planned,
-                questions=tuple(found),
-                shows=tuple(shown),
-            )
+            return command_now(trials=planned, questions=tuple(found), shows=tuple(shown))
 
         line = append(home, make)
         for question in () if line is None else line.questions:
@@ -122,7 +121,7 @@ def asked_metrics(trials: Sequence[Trial]) -> dict[Path, str]:
     return metrics
 
 
-def planned_rows(trials: Sequence[Trial]) -> list[Row]:
+def planned_rows(trials: Sequence[Trial]) -> list[Planned]:
     """The trials, each with its variant, as far as questions depend on them."""
     configs: dict[Path, tuple[str, Mapping[str, Any]]] = {}
     rows = []
@@ -133,11 +132,11 @@ def planned_rows(trials: Sequence[Trial]) -> list[Row]:
             configs[key] = digest_of(values), flatten(yaml.safe_load(trial.yaml))
         digest, config = configs[key]
         scene, init, densify = (values[group]["name"] for group in ("scene", "init", "densify"))
-        rows.append(Row(scene, init, densify, key.name, values["seed"], config, digest))
+        rows.append(Planned(scene, init, densify, key.name, values["seed"], config, digest))
     return with_variants(rows)
 
 
-def asked_of(trials: Sequence[Trial], rows: Sequence[Row]) -> Asked | None:
+def asked_of(trials: Sequence[Trial], rows: Sequence[Planned]) -> Asked | None:
     """The questions of one experiment's trials; None if their metric has no direction."""
     values = trials[0].values
     options, launch = values["eval"], values["launch"]
@@ -164,7 +163,7 @@ def asked_of(trials: Sequence[Trial], rows: Sequence[Row]) -> Asked | None:
 
 
 def _named(
-    values: Mapping[str, Any], metric: str, rows: Sequence[Row]
+    values: Mapping[str, Any], metric: str, rows: Sequence[Planned]
 ) -> tuple[tuple[NamedQuestion, int, LeastEffect | None], ...]:
     """The questions that the experiment's file names; raises InputError for a wrong one."""
     found = []
@@ -190,7 +189,7 @@ def _named(
     return tuple(found)
 
 
-def check_looks(trials: Sequence[Trial], rows: Sequence[Row]) -> tuple[int, ...]:
+def check_looks(trials: Sequence[Trial], rows: Sequence[Planned]) -> tuple[int, ...]:
     """The seeds of a sweep in looks, in order; raises InputError if it cannot be run in looks."""
     what = "launch.stop_when_decided"
     if len({trial.files.home for trial in trials}) > 1:

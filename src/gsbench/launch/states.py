@@ -5,16 +5,16 @@ A file in a trial's folder names its Slurm job. Loads no torch.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import psutil
 from pydantic import Field
 
-from gsbench.analysis.differences import find_superseded
-from gsbench.analysis.results import read_experiment
+from gsbench.analysis.results import newest_code, read_experiment
 from gsbench.errors import InputError
 from gsbench.files import write_json
 from gsbench.parsing import Record, read_if_sound
@@ -25,15 +25,48 @@ from gsbench.runs.layout import CONFIG, FAILED, LOCK, RESULTS, SEED, SUBMITTED
 from gsbench.runs.trial_folder import State, TrialFolder
 from gsbench.system.locks import read_holder
 from gsbench.system.programs import answer_of
-from gsbench.words import as_line
+from gsbench.words import as_line, counted
+
+
+class Kind(NamedTuple):
+    """The meaning of a state for the verbs that show and repeat trials."""
+
+    column: str = "waiting"  # of `gsbench.launch.progress.progress_frame`
+    retried: bool = False  # `gsbench retry` runs it again
+    freed: bool = False  # `gsbench clean NAME` lets its results go
+    lasts: bool = False  # it began, and goes on
+
+
+# in the order of lists: what needs a look comes first
+STATES = {
+    "failed": Kind("failed", retried=True, freed=True),
+    "damaged": Kind(retried=True),
+    "running": Kind("running", lasts=True),
+    "queued": Kind(lasts=True),
+    "partial": Kind(retried=True, freed=True),
+    "missing": Kind(retried=True),
+    "superseded": Kind(freed=True),
+    "done": Kind("done"),
+}
+
+
+def summary_of(states: Iterable[str]) -> str:
+    """The number of trials in each state, in one line."""
+    counts = Counter(states)
+    texts = [f"{counts[state]} {state}" for state in reversed(STATES) if counts[state]]
+    return f"{counted(counts.total(), 'trial')}: {', '.join(texts)}"
+
+
+EARLIER_CODE = "made by earlier code"
 
 
 @dataclass(frozen=True)
 class TrialState:
     """A trial's state, the time at which it began (Unix time), a note, and its entry in the plan.
 
-    A ``queued`` trial waits in Slurm's queue. A finished trial is ``superseded`` if its code is no
-    longer the present code; a failed one if a trial of later code has the same settings.
+    A ``queued`` trial waits in Slurm's queue. A finished trial is ``superseded`` if its code is
+    earlier than that of tables (`newest_code`); a failed one if a trial of later code has the same
+    settings.
     """
 
     folder: Path
@@ -58,15 +91,12 @@ def states_of_experiment(home: Path) -> list[TrialState]:
 
 
 def states_now(home: Path) -> list[TrialState]:
-    """The same, with finished trials that older code made as ``superseded``; reads all results."""
+    """The same, with finished trials that no table counts as ``superseded``; reads all results."""
     states = states_of_experiment(home)
-    folders = {state.folder: state.planned.cwd for state in states if state.planned is not None}
-    # The user's modules are read in the folder where the trial's command was given: another may
-    # have a namesake.
-    reasons = find_superseded(read_experiment(home).trials, folders)
+    older = {trial.path for trial in newest_code(read_experiment(home)).older}
     return [
-        replace(state, state="superseded", note=str(reasons[state.folder]))
-        if state.state == "done" and state.folder in reasons
+        replace(state, state="superseded", note=EARLIER_CODE)
+        if state.state == "done" and state.folder in older
         else state
         for state in states
     ]

@@ -1,7 +1,6 @@
-"""One trial: its steps in order, and the content of its ``results.json``."""
+"""One trial: its steps in order, its files, and its failures."""
 
 import logging
-import sys
 import time
 import traceback
 from collections.abc import Iterator, Mapping
@@ -13,10 +12,8 @@ from typing import Any
 import pycolmap  # noqa: F401
 import torch
 
-from gsbench import __version__
 from gsbench.config.compose import Trial
 from gsbench.errors import GsbenchError, InputError, TrainingError
-from gsbench.events import sum_events
 from gsbench.files import (
     link_or_copy,
     remove_temporaries,
@@ -27,11 +24,12 @@ from gsbench.files import (
 )
 from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.init import Sfm
-from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER, REPORT_FILE
+from gsbench.init.base import REPORT_FILE
 from gsbench.logs import log_to
 from gsbench.normalization import Normalization
-from gsbench.parsing import read_if_sound, read_json, read_typed
+from gsbench.parsing import read_if_sound
 from gsbench.pipeline.parts import Parts
+from gsbench.pipeline.results import results_of
 from gsbench.pipeline.steps.evaluate import evaluate_step
 from gsbench.pipeline.steps.external import external_step
 from gsbench.pipeline.steps.scene import (
@@ -47,36 +45,18 @@ from gsbench.pipeline.steps.scene import (
 from gsbench.pipeline.steps.train import train_step
 from gsbench.runs import keys, layout
 from gsbench.runs.commands import digest_of, read_history
-from gsbench.runs.config_hash import arm_hash, config_hash
-from gsbench.runs.nested import flatten, sha256_of
-from gsbench.runs.rows import read_rows
-from gsbench.runs.store import Store, StoredResult, read_manifest
+from gsbench.runs.store import Store, StoredResult
 from gsbench.runs.trial_files import AskedBefore, Failure
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import (
-    FROM_MODEL,
-    FROM_RENDERS,
-    MADE_ELSEWHERE,
-    RENDERS_ALONE,
-    Budget,
-    Code,
-    Evaluation,
-    Oddity,
-    Training,
     TrialRecord,
-    TwinViews,
-    split_text,
 )
-from gsbench.runs.user_code import user_modules
 from gsbench.scene.colmap_files import model_files
-from gsbench.scene.rules import settle
-from gsbench.scene.types import Capture, Scene
-from gsbench.system.install import version_of
+from gsbench.scene.types import Capture
 from gsbench.system.locks import hold
 from gsbench.system.resources import lacks_memory
 from gsbench.system.stopping import reinstall_handlers
 from gsbench.train.kernels import compiled_beside
-from gsbench.train.proof import Proven
 
 log = logging.getLogger(__name__)
 
@@ -157,7 +137,7 @@ def run_trial(trial: Trial, wait: bool = True) -> TrialRecord:
     folder = trial.files
     with storage_errors(folder.runs):
         folder.require_no_links()
-        require_no_links(folder.runs, folder.runs / layout.STORE / layout.VIEWS)
+        require_no_links(folder.runs, folder.runs / layout.STORE / keys.VIEWS.name)
         folder.path.mkdir(parents=True, exist_ok=True)
         with hold(folder.lock, folder.label, wait), log_to(folder.path / layout.LOG):
             if not folder.why_not_done(trial.values):
@@ -316,142 +296,3 @@ def _publish(
         else:
             link_or_copy(file, link)
     return list(links)
-
-
-# ---- the content of results.json
-
-# packages on whose versions a result depends
-PACKAGES = ("torch", "numpy", "numba", "pycolmap", "kornia", "gsplat", "piq")
-# fields that results.json copies from the training and from the evaluation without changes
-OF_TRAINING = (
-    "iterations",
-    "num_init_points",
-    "num_gaussians",
-    "causes",
-    "initial_cloud",
-    "scene_extent",
-    "peak_memory_mb",
-    "machine",
-    "trained_by",
-)
-OF_EVALUATION = ("metrics", "awaited", "one_color_psnr")
-
-
-def results_of(
-    values: dict[str, Any],
-    capture: Capture,
-    scene: Scene,
-    raster: Proven,
-    entries: Mapping[str, StoredResult],
-    code: Mapping[str, str],
-    asked: list[str],
-) -> TrialRecord:
-    """The results of the trial with the configuration ``values``.
-
-    ``capture`` are the photographs, ``raster`` is the rasterizer, ``entries`` are the steps' store
-    entries by stage. ``code`` maps the parts of gsbench's source that the steps used to their
-    states. ``asked`` are the ids of the questions that covered the trial before its training.
-    """
-    stages = keys.INIT, keys.TRAIN, keys.EVALUATE
-    init, trained, evaluated = (entries[stage.name] for stage in stages)
-    training = read_typed(trained.path / layout.TRAINING, Training)
-    evaluation = read_typed(evaluated.path / layout.METRICS, Evaluation)
-    manifest = read_manifest(evaluated.path)
-    init_report = read_json(init.path / REPORT_FILE)
-    of_model = [Oddity(**odd) for odd in init_report.get("oddities", ())]
-    oddities = [*capture.oddities, *scene.oddities, *of_model, *training.oddities]
-    # A stage of the store may have been made with a rule accepted that is not accepted here.
-    refused = [odd for odd in oddities if odd.refused]
-    settle(refused, f"scene {capture.name}", capture.accept)
-    is_ready_made = training.trained_by is None and not training.iterations
-    seconds = {"init": init.seconds, "train": training.seconds, "evaluate": evaluated.seconds}
-    if is_ready_made:
-        del seconds["train"]
-    if training.compile_seconds is not None:
-        seconds["compile"] = training.compile_seconds
-    only_renders = training.evaluated_from == FROM_RENDERS
-    views = [*scene.train, *scene.test]
-    copied = {name: getattr(training, name) for name in OF_TRAINING}
-    copied |= {name: getattr(evaluation, name) for name in OF_EVALUATION}
-    return TrialRecord(
-        status="complete",
-        experiment=values["name"],
-        **{group: values[group]["name"] for group in ("scene", "init", "densify")},
-        seed=values["seed"],
-        raster="unknown" if only_renders else raster.rasterizer.name,
-        raster_proof=raster.proof,
-        raster_passed_over=[*raster.passed_over],
-        protocol=manifest.inputs["protocol"],
-        unavailable=evaluation.unavailable | _unknown_costs(training, is_ready_made),
-        measured=manifest.created,  # of an evaluation found in the store: when it was put there
-        questions=asked,
-        metric_facts=evaluation.facts,
-        metrics_at=evaluation.at,
-        oddities=oddities,
-        twins=TwinViews(
-            left_out={**capture.left_out, **scene.twins.left_out}, near=dict(scene.twins.near)
-        ),
-        seconds=seconds,
-        budget=Budget(
-            max_gaussians=values["densify"].get("max_gaussians"),
-            cap=values["densify"].get("cap"),
-            seconds=values["train"]["max_seconds"],
-        ),
-        normalization=None if capture.normalization.is_identity else capture.normalization,
-        train_views=len(scene.train),
-        test_views=len(scene.test),
-        split=split_text(flatten(values)),
-        held_out=capture.held_out,
-        resolution=max((view.camera.width, view.camera.height) for view in views),
-        events=sum_events(read_rows(trained.path / layout.EVENTS)),
-        init_report=init_report,
-        hashes={
-            "config": config_hash(values),
-            "arm": arm_hash(values),
-            "data": capture.fingerprint,
-            "cloud": cloud_hash(init.path),
-            **{stage.name: entries[stage.name].key for stage in stages},
-        },
-        code=Code(
-            sources=user_modules(values),
-            stages={stage.name: stage.version for stage in keys.STAGES},
-            packages=dict(sorted(code.items())),
-            **training.checkout,
-        ),
-        versions=versions(),
-        evaluated_from=FROM_MODEL if is_ready_made else training.evaluated_from,
-        **copied,
-    )
-
-
-def _unknown_costs(training: Training, is_ready_made: bool) -> dict[str, str]:
-    """The costs that were not measured, each with the reason, if gsbench did not train."""
-    unknown = {}
-    if training.evaluated_from == FROM_RENDERS:
-        unknown["gaussians"] = RENDERS_ALONE
-    if training.peak_memory_mb is None:
-        unknown["peak_memory_mb"] = "another program's memory of a GPU is not measured"
-    if is_ready_made:
-        reason = f"{MADE_ELSEWHERE}: not trained here"
-        unknown |= {"train_time": reason, "total_time": reason}
-    return unknown
-
-
-def cloud_hash(init: Path) -> str:
-    """The hash of what an initialiser made: cameras, poses and points, or Gaussians.
-
-    The step's key cannot replace it, because that is a hash of the inputs only.
-    """
-    files = read_manifest(init).outputs
-    model = (f"{MODEL_FOLDER.as_posix()}/", GAUSSIANS_FILE)
-    kept = {name: file.sha256 for name, file in files.items() if name.startswith(model)}
-    return sha256_of(kept)
-
-
-def versions() -> dict[str, str]:
-    """The versions of Python, gsbench and the packages on which a result depends."""
-    found = {"python": sys.version.split()[0], "gsbench": __version__}
-    for package in PACKAGES:
-        if version := version_of(package):
-            found[package] = version
-    return found

@@ -201,37 +201,23 @@ def tile_rectangles(projected: Projection, camera: Camera) -> tuple[Tensor, Tens
     return first.long(), past.long()
 
 
-def bin_gaussians(
-    depths: Tensor, tile_min: Tensor, tile_max: Tensor, tiles_x: int
-) -> list[tuple[int, Tensor]]:
-    """List all tiles with Gaussians.
-
-    Each has its row-major number and its Gaussians [K], front to back. Gaussians of equal depth are
-    in the order of their indices.
-    """
-    order = torch.sort(depths, stable=True).indices  # [M]
-    low, size = tile_min[order], (tile_max - tile_min)[order].clamp_min(0)  # [M, 2]
-    counts = size.prod(-1)  # [M]
-    owner = torch.repeat_interleave(counts)  # [pairs] indices into ``order``
-    begins = counts.cumsum(0) - counts  # [M]
-    within = torch.arange(len(owner), device=owner.device) - begins[owner]  # [pairs]
-    column, row = within % size[owner, 0], within // size[owner, 0]
-    tiles = (low[owner, 1] + row) * tiles_x + low[owner, 0] + column  # [pairs]
-    by_tile = torch.sort(tiles, stable=True)
-    numbers, lengths = torch.unique_consecutive(by_tile.values, return_counts=True)
-    members = torch.split(order[owner[by_tile.indices]], lengths.tolist())
-    return list(zip(numbers.tolist(), members, strict=True))
-
-
 def members_of_tiles(
     depths: Tensor, tile_min: Tensor, tile_max: Tensor, camera: Camera
 ) -> Iterator[tuple[Tensor, Tile]]:
-    """Yield each tile with Gaussians: the Gaussians [K], front to back, and the pixels."""
-    tile, tiles_x = CONSTANTS.tile, -(-camera.width // CONSTANTS.tile)
-    for number, members in bin_gaussians(depths, tile_min, tile_max, tiles_x):
-        x, y = number % tiles_x * tile, number // tiles_x * tile
-        rows = slice(y, min(y + tile, camera.height))
-        yield members, (rows, slice(x, min(x + tile, camera.width)))
+    """Yield each tile with Gaussians: the Gaussians [K], front to back, and the pixels.
+
+    Gaussians of equal depth are in the order of their indices.
+    """
+    tile = CONSTANTS.tile
+    order = torch.sort(depths, stable=True).indices  # [M]
+    first, past = tile_min[order], tile_max[order]  # [M, 2]
+    for y in range(0, camera.height, tile):
+        for x in range(0, camera.width, tile):
+            place = first.new_tensor([x // tile, y // tile])
+            members = order[((first <= place) & (place < past)).all(-1)]
+            if len(members):
+                rows = slice(y, min(y + tile, camera.height))
+                yield members, (rows, slice(x, min(x + tile, camera.width)))
 
 
 def composite(

@@ -18,16 +18,17 @@ from PIL import Image
 
 from gsbench.analysis.addresses import ArmName
 from gsbench.analysis.quantities import COSTS, asked_quantity
-from gsbench.analysis.questions import Asked, Row, announce, ask, rows_of
+from gsbench.analysis.questions import Asked, announce, ask
 from gsbench.analysis.results import TrialResult, read_experiment
+from gsbench.analysis.trial_result import Planned
 from gsbench.analysis.trial_settings import config_if_readable
 from gsbench.config.overrides import parse_word
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.pictures import PicturePair, read_picture
 from gsbench.files import atomic, file_sha256, write_text
+from gsbench.pipeline.results import versions
 from gsbench.pipeline.steps.evaluate import summary_of, write_per_view
-from gsbench.pipeline.trial import versions
 from gsbench.renders.truth import ReferenceImages
 from gsbench.runs.commands import (
     Command,
@@ -201,7 +202,7 @@ def ask_about(
     digest = make_digest(name, config_hash, {}, states_of(CODE_OF_STAGE[EVALUATE.name]))
     flat = flatten(config)
     planned = [
-        Row(scene, destination.init, destination.densify, config_hash, seed, flat, digest)
+        Planned(scene, destination.init, destination.densify, config_hash, seed, flat, digest)
         for scene, seed in places
     ]
     quantity = asked_quantity(primary, trials)
@@ -209,7 +210,7 @@ def ask_about(
     asked = Asked(metric=primary, sign=sign, least=least, baseline=baseline)
 
     def make(history: History) -> Command | None:
-        found, _ = ask(planned, asked, rows_of(trials), history)
+        found, _ = ask(planned, asked, trials, history)
         for question in found:
             log.info("%s: %s", home.name, announce(question))
         words, cwd = tuple(sys.argv[1:]), os.getcwd()

@@ -15,7 +15,6 @@ from gsbench.config.compose import compose_one
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator, summarize
 from gsbench.eval.facts import METRICS
-from gsbench.eval.matching import Matching, match_by_order, match_pictures
 from gsbench.eval.options import EvalConfig
 from gsbench.eval.pictures import PicturePair, check_pairs, measure
 from gsbench.files import storage_errors
@@ -31,8 +30,9 @@ from gsbench.renders.truth import (
     reference_images_of,
 )
 from gsbench.runs.user_code import PERMISSIONS
+from gsbench.scene.names import Matching, match_by_order, match_pictures
 from gsbench.system.device import select_device
-from gsbench.system.own_modules import allow_modules
+from gsbench.system.programs import allow_modules
 from gsbench.system.resources import available_threads
 from gsbench.words import counted, some_of
 

@@ -87,23 +87,28 @@ def reference_images_of(trial: TrialResult) -> ReferenceImages:
     )
 
 
-def _scene(name: str, settings: Sequence[str]) -> ReferenceImages:
-    """The test views of a scene as a trial with these settings sees them: undistorted, at its size.
+def scene_trial(words: Sequence[str]) -> TrialSteps:
+    """A trial of the scene that ``words`` choose.
 
-    If the scene comes with cameras, the fastest initialiser is used, unless the settings choose
-    one.
+    If the scene comes with cameras, the fastest initialiser is used, unless the words choose one.
     """
-    config = compose_one([f"scene={name}", *settings]).values
-    chooses = any(word.startswith("init=") for word in settings)
+    config = compose_one(words).values
+    chooses = any(word.startswith("init=") for word in words)
     if not chooses and config["scene"]["kind"] != "photos":
-        config = compose_one([f"scene={name}", *CAMERAS_ONLY, *settings]).values
+        config = compose_one([*CAMERAS_ONLY, *words]).values
     store = Store(Path(config["runs"]).expanduser().resolve() / STORE)
-    trial = TrialSteps(Parts(config), store)
+    return TrialSteps(Parts(config), store)
+
+
+def _scene(name: str, settings: Sequence[str]) -> ReferenceImages:
+    """The test views of a scene as a trial with these settings sees them."""
+    trial = scene_trial([f"scene={name}", *settings])
     for step in trial.steps():
         if step.stage in (keys.CAPTURE, keys.INIT, keys.GROUND_TRUTH):
-            entry = store.get(step)
+            entry = trial.store.get(step)
             if step.stage is keys.GROUND_TRUTH:
                 folder = entry.path
+    config = trial.parts.values
     scene = trial.views.scene
     photographs = {view.name: folder / png_name(view.name) for view in scene.test}
     sizes = [(view.camera.width, view.camera.height) for view in [*scene.train, *scene.test]]

@@ -8,6 +8,7 @@ Loads no torch.
 
 import json
 import os
+import sys
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -18,7 +19,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator
+from pydantic import AfterValidator, Field
 
 from gsbench.files import open_plain, require_no_links
 from gsbench.parsing import (
@@ -27,6 +28,7 @@ from gsbench.parsing import (
     DamagedError,
     Raw,
     Record,
+    Text,
     parse_typed,
     read_bytes,
     read_typed,
@@ -45,6 +47,8 @@ from gsbench.words import counted
 
 ERROR_RATE = 0.05
 BY_COMMAND = "command"  # the rule that gives a question its level
+SCREENING, LOND, CONFIRMATION = "screening", "lond", "confirmation"  # rules of a ledger
+BASELINE = "baseline"  # the name of a ledger's own baseline among its ideas
 ID_CHARACTERS, LINK_CHARACTERS = 12, 16
 LEVELS = 3  # folders of scene, arm and trial
 Place = tuple[str, int]  # scene and seed
@@ -177,10 +181,41 @@ class PlannedTrial(Record):
     time: Amount = 0.0
 
 
+class Idea(Record):
+    """An idea of a ledger: the settings as words, and the digest on each scene.
+
+    ``identity`` is the hash of its settings and code without names: equal ones are one idea. It is
+    compared with the idea ``against``; the ledger's `BASELINE` with none.
+    """
+
+    name: Text
+    identity: Text
+    words: tuple[Raw, ...]
+    digests: dict[str, Digest]
+    against: str = ""
+
+
+class Ledger(Record):
+    """The terms of a ledger: the metric that decides, the seeds, how many ideas share the ``rate``.
+
+    ``least`` is the least difference in ``metric`` that matters, a fraction of the baseline's value
+    if ``relative``. ``rate`` is the false discovery rate.
+    """
+
+    metric: Text
+    sign: Literal[-1, 1]
+    least: Amount
+    relative: bool
+    ideas: Annotated[int, Field(ge=1)]
+    rate: Annotated[float, Field(gt=0, lt=1)]
+    seeds: Annotated[tuple[Count, ...], Field(min_length=2)]
+
+
 class Command(Record):
     """A command: its trials by their folders, and the questions that it asked first.
 
-    ``shows`` are the ids of earlier questions that it repeats: these are its idea's newest.
+    ``shows`` are the ids of earlier questions that it repeats: these are its idea's newest. It may
+    open a ``ledger``, and begin an ``idea`` of it.
     """
 
     words: tuple[Raw, ...]
@@ -190,6 +225,8 @@ class Command(Record):
     questions: tuple[Question, ...] = ()
     shows: tuple[str, ...] = ()
     dropped: tuple[Folder, ...] = ()  # trials that are no longer planned
+    ledger: Ledger | None = None
+    idea: Idea | None = None
     previous: str = ""
 
 
@@ -209,6 +246,12 @@ class Finished(Record):
 Line = Command | Finished
 
 
+def command_now(words: Sequence[str] | None = None, **parts: Any) -> Command:
+    """A command of this process and moment; by default its words are those of the process."""
+    own = sys.argv[1:] if words is None else words
+    return Command(words=tuple(own), cwd=os.getcwd(), time=time.time(), **parts)
+
+
 class _OldTrial(Record):
     overrides: tuple[Raw, ...]
     cwd: Raw
@@ -223,13 +266,25 @@ class _OldPlan(Record):
 class History:
     """All that was asked in an experiment, and what gave results, in order.
 
-    ``faults`` name damaged lines and broken links; other lines stay valid.
+    ``faults`` name damaged lines and broken links; other lines stay valid. ``head`` is the digest
+    of the last line.
     """
 
     home: Path
     commands: tuple[Command, ...] = ()
     results: frozenset[tuple[Digest, Place]] = frozenset()
     faults: tuple[str, ...] = ()
+    head: str = ""
+
+    @property
+    def ledger(self) -> Ledger | None:
+        """The terms of its ledger of ideas; None if it is none."""
+        return next((one.ledger for one in self.commands if one.ledger), None)
+
+    @cached_property
+    def ideas(self) -> dict[str, Idea]:
+        """The ideas of its ledger in their order, the baseline first."""
+        return {one.idea.name: one.idea for one in self.commands if one.idea}
 
     @cached_property
     def planned(self) -> dict[Path, PlannedTrial]:
@@ -257,16 +312,11 @@ class History:
                     by_id[name] = by_id.pop(name)
         return tuple(by_id.values())
 
-    @cached_property
-    def newest(self) -> dict[str, set[str]]:
-        """The ids of the questions that the last command about each idea asked or repeated."""
-        ideas, found = {one.id: one.idea.name for one in self.questions}, dict[str, set[str]]()
-        for command in self.commands:
-            own: dict[str, set[str]] = {}
-            for name in (*(one.id for one in command.questions), *command.shows):
-                own.setdefault(ideas.get(name, ""), set()).add(name)
-            found |= own
-        return found
+    @property
+    def last(self) -> set[str]:
+        """The ids of the questions that the last command which asked anything asked or repeated."""
+        asked = ({*(q.id for q in one.questions), *one.shows} for one in reversed(self.commands))
+        return next(filter(None, asked), set())
 
     def _with_baseline(self, question: Question, later: Sequence[Command]) -> Question:
         if all(first for first, _ in question.digests.values()):
@@ -328,7 +378,7 @@ def read_history(home: Path) -> History:
     # a file of garbage has many lines, of which the first says enough
     found = [*unread, *(_first_of(lines) for lines in (damaged, unlinked) if lines)]
     faults = tuple(f"{home.name}: {fault}" for fault in found)
-    return History(home, tuple(commands), frozenset(results), faults)
+    return History(home, tuple(commands), frozenset(results), faults, before)
 
 
 def _first_of(lines: Sequence[str]) -> str:
@@ -407,7 +457,7 @@ def _write(path: Path, line: Line) -> None:
 def drop(home: Path, folders: Collection[Path]) -> None:
     """Plan the trials in ``folders`` no longer."""
     names = tuple(folder.relative_to(home).as_posix() for folder in folders)
-    now = Command(words=(), cwd=os.getcwd(), time=time.time(), dropped=names)
+    now = command_now((), dropped=names)
     append(home, lambda history: now if history.planned.keys() & set(folders) else None)
 
 

@@ -164,6 +164,9 @@ class Arm:
         return name == own and all(str(config.get(key)) == value for key, value in self.variant)
 
 
+DEFAULT_METRIC = "psnr"  # of questions and searches
+
+
 def metric_and_question(primary: str) -> tuple[str, str]:
     """The metric and the question that ``eval.primary`` names; the question is "" for both.
 
@@ -180,11 +183,6 @@ def metric_and_question(primary: str) -> tuple[str, str]:
 def stamp_now() -> str:
     """The present time as a time stamp (`STAMP`)."""
     return time.strftime(STAMP, time.gmtime())
-
-
-def display_time(stamp: str) -> str:
-    """A time stamp (`STAMP`) for people: ``2026-11-21 20:05 UTC``."""
-    return time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(unix_time(stamp) or 0))
 
 
 def unix_time(text: object) -> int | None:

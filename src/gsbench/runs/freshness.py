@@ -10,7 +10,6 @@ import hashlib
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,7 +23,6 @@ from gsbench.runs.package_code import state_of
 from gsbench.runs.store import read_manifest
 from gsbench.runs.trial_files import MadeOf, Stamp
 from gsbench.runs.trial_record import Code, TrialRecord
-from gsbench.runs.user_code import module_digest
 from gsbench.system.install import version_of
 from gsbench.words import as_line
 
@@ -34,7 +32,6 @@ SENTENCES = {
     "unrecorded": "{name} does not say what it was made of",
     "settings": "its results are of another configuration",
     "code": "{name} was {made:.8}, it is now {now:.8}",
-    "later code": "{name} was {made:.8}, later trials have {now:.8}",
     "file": "{name} has changed",
     "unreadable": "{name} cannot be read ({now})",
     "written": f"{{name}} was changed after {layout.RESULTS} was written",
@@ -88,26 +85,21 @@ def code_of(code: Code) -> dict[Part, str]:
     )
 
 
-def present_version(part: Part, folder: str | None) -> str | None:
-    """The version of a part now; None if that is unknown.
-
-    A user's module is found as by a command in ``folder``; without one it is unknown.
-    """
+def present_version(part: Part) -> str | None:
+    """The version of a part of gsbench now; None for a user's module."""
     if part.kind == "module":
-        return None if folder is None else module_digest(part.name, folder)
+        return None
     if part.kind == "package":
         return state_of(part.name)
     return next((str(stage.version) for stage in STAGES if stage.name == part.name), "none")
 
 
-def code_changes(
-    made: Mapping[Part, str], now: Callable[[Part], str | None], kind: str = "code"
-) -> Iterator[Change]:
+def code_changes(made: Mapping[Part, str], now: Callable[[Part], str | None]) -> Iterator[Change]:
     """The parts of the code whose version is ``now`` known to be another one."""
     for part, version in made.items():
         present = now(part)
         if present not in (None, version):
-            yield Change(kind, part.short, version, present)
+            yield Change("code", part.short, version, present)
 
 
 # ---- a trial and its files
@@ -173,7 +165,7 @@ def changes(
     code = code_of(Code(packages=record.code.packages)) | {
         Part("stage", name): str(version) for name, version in stages.items()
     }
-    yield from code_changes(code, partial(present_version, folder=None))
+    yield from code_changes(code, present_version)
     if made.pycolmap != (installed := version_of("pycolmap")):
         yield Change("code", "pycolmap", str(made.pycolmap), str(installed))
     for source, stamp in made.sources.items():
@@ -186,50 +178,38 @@ def changes(
         is_small = stamp[0] <= MAX_HASHED_BYTES
         if is_small and name in made.digests and digest_of(folder / name) != made.digests[name]:
             yield Change("file", str(folder / name))
+    yield from damaged_entries(made)
+
+
+def damaged_entries(made: MadeOf, thorough: bool = False) -> Iterator[Change]:
+    """The results of a trial's stages in the store that are damaged or gone."""
     for name, entry in made.entries.items():
         try:
-            read_manifest(Path(entry))
+            read_manifest(Path(entry), thorough=thorough)
         except ValueError as error:
             yield Change("stored", name, now=str(error))
 
 
-def changes_of_content(folder: Path, made: MadeOf) -> Iterator[Change]:
-    """The files of a trial, and the results of its stages in the store, with another content."""
-    for name, digest in made.digests.items():
-        path = folder / name
-        if path.is_file() and file_sha256(path) != digest:
-            yield Change("written", name)
-    for name, entry in made.entries.items():
-        try:
-            read_manifest(Path(entry), thorough=True)
-        except ValueError as error:
-            yield Change("stored", name, now=str(error))
-
-
-def change_of_files(
-    folder: Path, digests: Mapping[str, str], stamps: Mapping[str, Stamp], thorough: bool
-) -> Change | None:
-    """A change among the files `JUDGED` since their results were written; None without one.
+def changed_files(
+    folder: Path, made: MadeOf, names: Iterable[str] = JUDGED, thorough: bool = False
+) -> Iterator[Change]:
+    """The files ``names`` of a trial with another content than when its results were written.
 
     A large file with its recorded size and time counts as unchanged, unless ``thorough``. Files
     that are gone do not count, since models are deleted to make room.
     """
-    for name in JUDGED:
-        path, recorded = folder / name, digests.get(name)
+    for name in names:
+        path, recorded = folder / name, made.digests.get(name)
         if recorded is None or not path.is_file():
             continue
-        stamp = stamp_of(path)
-        known = stamps.get(name)
-        if (
-            known is not None and known[0] != stamp[0]
-        ):  # of another size, which may be too large to read
-            return Change("written", name)
+        known, stamp = made.published.get(name), stamp_of(path)
         is_large = stamp[0] > MAX_HASHED_BYTES
-        if is_large and not thorough and known == stamp:
-            continue
-        if (file_sha256(path) if is_large else digest_of(path)) != recorded:
-            return Change("written", name)
-    return None
+        # a file of another size may be too large to read
+        has_changed = known is not None and known[0] != stamp[0]
+        if not has_changed and (thorough or not is_large or known != stamp):
+            has_changed = (file_sha256(path) if is_large else digest_of(path)) != recorded
+        if has_changed:
+            yield Change("written", name)
 
 
 def stamp_of(path: Path) -> Stamp:

@@ -66,6 +66,7 @@ INIT = Stage("init", 4, resumable=True)
 TRAIN = Stage("train", 4, resumable=True, scratch=("checkpoint-*.pt",))
 GROUND_TRUTH = Stage("ground_truth", 1)
 EVALUATE = Stage("evaluate", 3)
+VIEWS = Stage("views", 4)  # undistorted photographs of their final size; no step of a trial
 
 STAGES = (CAPTURE, INIT, TRAIN, GROUND_TRUTH, EVALUATE)
 
@@ -88,8 +89,8 @@ CODE_OF_STAGE = {
     "train": (*MODEL, *LOSS, "external", "pipeline/steps/train.py", "pipeline/steps/external.py"),
     "ground_truth": ("scene", "normalization.py", "pipeline/steps/scene.py"),
     "evaluate": (*MODEL, "eval", "weights.py", "pipeline/steps"),
+    "views": ("scene",),
 }
-CODE_OF_VIEWS = ("scene",)  # packages behind the prepared photographs beside the store
 
 
 # ---- the inputs of a step: options of components, gsbench's code and the user's code

@@ -12,7 +12,6 @@ JOBS = ".jobs"  # output of the jobs of launch=local and launch=slurm, with a fo
 
 # in the store
 MANIFEST = "manifest.json"  # in every result: what made it
-VIEWS = "views"  # beside the stages: undistorted photographs of their final size
 
 # in the result of a stage
 TRAINING = "training.json"  # counts, time and memory of a training
@@ -22,7 +21,7 @@ METRICS = "metrics.json"  # of an evaluation
 COMMANDS = "commands.jsonl"  # all commands, with their trials and questions
 PLAN = "plan.json"  # of earlier versions: the trials of the commands
 DECLARED = "declared.jsonl"  # of earlier versions: declared questions, with their times
-LEDGER = "ledger.jsonl"  # ideas, tests and results in their order (`gsbench ledger`)
+LEDGER = "ledger.jsonl"  # of a ledger of ideas of gsbench 0.1, no longer read
 TUNING = "tuning.json"  # of a search: its ranges and points
 SEED = "-seed"  # between hash and seed in the name of a trial's folder
 TRIAL_GLOB = f"*/*/*{SEED}*"  # all trials' folders

@@ -1,9 +1,9 @@
 """The JSON lines of a training: metrics, events and histograms of volumes, by iteration."""
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 from pydantic import AfterValidator, Field
 
@@ -14,11 +14,12 @@ from gsbench.parsing import (
     Number,
     Record,
     Whole,
-    iterate_rows,
+    parse_typed,
     read_bytes,
 )
 
 log = logging.getLogger(__name__)
+T = TypeVar("T")
 
 STEP = "step"  # the key of the iteration in every row
 Exponent = Annotated[float, Field(ge=-300, le=300)]  # ten to this power is a finite number above 0
@@ -76,3 +77,31 @@ def whole_lines(path: Path) -> list[tuple[str, int]]:
     except FileNotFoundError:
         return []
     return [(line, row.step) for line, row in iterate_rows(content, RowWithStep, path)]
+
+
+def iterate_rows(content: bytes, kind: type[T], path: Path) -> Iterator[tuple[str, T]]:
+    """Parse the JSON lines of the file ``path``; yields each line with its object of ``kind``.
+
+    A damaged line and the lines after it are left out. There is a warning, except for an incomplete
+    last line, which a killed process leaves.
+    """
+    lines = content.splitlines(keepends=True)
+    # Parsing all lines at once is faster. Only if that fails are they parsed one by one.
+    try:
+        rows = parse_typed(b"[" + b",".join(lines) + b"]", list[kind], path)  # type: ignore[valid-type]
+    except DamagedError:
+        rows = []
+    if len(rows) == len(lines):  # otherwise a line holds several values
+        yield from (
+            (line.decode("utf-8").rstrip("\r\n"), row)
+            for line, row in zip(lines, rows, strict=True)
+        )
+        return
+    for number, line in enumerate(lines, 1):
+        try:
+            row = parse_typed(line, kind, path)
+        except DamagedError as error:
+            if line.endswith(b"\n") or number < len(lines):
+                log.warning("left out: %s from line %d on, which %s", path, number, error.reason)
+            return
+        yield line.decode("utf-8").rstrip("\r\n"), row

@@ -30,13 +30,12 @@ from gsbench.files import (
 )
 from gsbench.parsing import Amount, Count, DamagedError, Raw, Record, fault_of, read_typed
 from gsbench.runs.keys import Stage, Step
-from gsbench.runs.layout import MANIFEST, VIEWS
+from gsbench.runs.layout import MANIFEST
 from gsbench.system.locks import BusyError, hold
 
 log = logging.getLogger(__name__)
 
 KEY = re.compile("[0-9a-f]+")
-LEFTOVER_AGE = 86_400.0  # seconds after which temporary folders that no lock guards are removed
 
 
 class Output(Record):
@@ -205,11 +204,6 @@ class Store:
                         remove(partial)
             for removed in (self.root / stage.name).glob(".*.removed"):
                 shutil.rmtree(removed, ignore_errors=True)
-        # photographs are prepared in such folders, which have no lock
-        for work in (self.root / VIEWS).glob(".*"):
-            with suppress(OSError):
-                if work.is_dir() and time.time() - work.stat().st_mtime > LEFTOVER_AGE:
-                    shutil.rmtree(work, ignore_errors=True)
 
 
 def write_manifest(folder: Path, step: Step, seconds: float) -> None:

@@ -15,6 +15,7 @@ import re
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
 
@@ -38,9 +39,9 @@ from gsbench.runs.commands import make_digest, remember_result, shared_hash
 from gsbench.runs.config_hash import config_hash
 from gsbench.runs.freshness import (
     Change,
-    change_of_files,
+    changed_files,
     changes,
-    changes_of_content,
+    damaged_entries,
     origin_of,
 )
 from gsbench.runs.nested import sha256_of
@@ -152,6 +153,10 @@ class TrialFolder:
         steps = re.findall(rb'"step": (\d{1,18})', tail)
         return building.stage, int(steps[-1]) if steps else 0
 
+    def share_done(self, iterations: int) -> float:
+        """The share of a training's ``iterations`` that are done."""
+        return min(1.0, self.stage_and_step()[1] / max(1, iterations))
+
     # ---- configuration
 
     def configuration(self) -> dict[str, Any]:
@@ -192,11 +197,10 @@ class TrialFolder:
         return record
 
     def change(self, thorough: bool = False) -> Change | None:
-        """A change among the judged files since the results were written (`change_of_files`)."""
+        """A change among the judged files since the results were written (`changed_files`)."""
         origin = self._known_origin()
-        if origin is None:
-            return None
-        return change_of_files(self.path, origin.digests, origin.published, thorough)
+        found = changed_files(self.path, origin, thorough=thorough) if origin else ()
+        return next(iter(found), None)
 
     def fault_when_read(self) -> Change | None:
         """A change in the files of a finished trial, or in its results in the store; None if none.
@@ -206,7 +210,8 @@ class TrialFolder:
         made = self.made_of()
         if made is None:
             return Change("unrecorded", layout.RESULTS)
-        return next(changes_of_content(self.path, made), None)
+        files = changed_files(self.path, made, made.digests, thorough=True)
+        return next(chain(files, damaged_entries(made, thorough=True)), None)
 
     def _known_origin(self) -> MadeOf | None:
         """The origin of the results, read if it was not yet; None if unrecorded or unsound."""

@@ -80,13 +80,6 @@ class Earlier(Record):
     num_gaussians: Count | None = None
 
 
-class Declared(Record):
-    """The metric that was declared for the verdict, and when (`gsbench.runs.experiments`)."""
-
-    metric: str
-    time: str
-
-
 class ExternalTrainer(Record):
     """The program that trained in gsbench's place: its name, version, own words, and command."""
 
@@ -185,7 +178,6 @@ class TrialRecord(Record):
     measured: str | None = None  # time at which the evaluation was stored
     # ids of the questions that covered the trial when its training began
     questions: list[str] = field(default_factory=list)
-    declared: Declared | None = None  # in files of earlier versions
     awaited: list[str] = field(default_factory=list)
     metric_facts: dict[str, MetricRecord] = field(default_factory=dict)
     metrics_at: dict[Iteration, Earlier] = field(default_factory=dict)

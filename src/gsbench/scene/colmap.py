@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from gsbench.errors import InputError
 from gsbench.normalization import IDENTITY, Normalization
 from gsbench.scene.colmap_read import read_model as read_model
-from gsbench.scene.distortion import without_distortion
 from gsbench.scene.images import check_size, image_size
 from gsbench.scene.names import match_anywhere
 from gsbench.scene.types import Array, Camera, CameraModel, Capture, to_pinhole
+from gsbench.scene.undistortion import plain_camera as plain_camera
+from gsbench.scene.undistortion import without_distortion
 
 Cloud = tuple[Array, NDArray[np.uint8]]  # positions [P, 3] in world units, colours [P, 3]
 MIN_TRACK = 2  # images that must see a 3D point, as in COLMAP
@@ -161,14 +162,6 @@ def new_camera(
     """A COLMAP camera of a size in px, with parameters in COLMAP's order."""
     return pycolmap.Camera(
         camera_id=camera_id, model=model, width=width, height=height, params=list(params)
-    )
-
-
-def plain_camera(camera: pycolmap.Camera) -> CameraModel:
-    """A COLMAP camera as plain values, as PINHOLE if it has no distortion."""
-    camera = without_distortion(camera)
-    return CameraModel(
-        camera.model_name, camera.width, camera.height, tuple(map(float, camera.params))
     )
 
 

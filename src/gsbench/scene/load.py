@@ -1,9 +1,7 @@
 """Loading a `Scene` of pinhole cameras and final images from a capture and a COLMAP model.
 
-Prepared images are cached below ``cache_dir`` as PNG files, one folder for each set. The folder's
-name is a digest of everything that the pixels depend on. A folder appears by one rename, so a set
-is either complete or absent; checksums of its files show later changes. Images that need no change
-are read from the capture.
+Prepared images are kept in a store as PNG files, under a key of all that the pixels depend on.
+Images that need no change are read from the capture.
 
 Undistortion is COLMAP's, with the defaults of its ``image_undistorter``, which INRIA's
 ``convert.py`` uses too: the largest pinhole image without blank pixels, at the original focal
@@ -12,17 +10,10 @@ length. It runs on pixels in memory, so images are not compressed as JPEG again.
 
 from __future__ import annotations
 
-import hashlib
-import json
-import logging
-import os
-import secrets
-import shutil
-from collections.abc import Collection, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import MappingProxyType, SimpleNamespace
+from types import SimpleNamespace
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -30,10 +21,11 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from gsbench.errors import InputError
-from gsbench.files import write_json
+from gsbench.files import file_sha256, write_json
 from gsbench.logs import Progress, no_progress
 from gsbench.parsing import MAX_NUMBER, Count, Number, Record, read_typed
-from gsbench.runs.store import Output, is_sound, record_files
+from gsbench.runs.keys import VIEWS, Step, step_of
+from gsbench.runs.store import Store
 from gsbench.runs.trial_record import Oddity
 from gsbench.scene.beside import DEPTH, files_beside, pixels_of_view, read_beside
 from gsbench.scene.colmap_files import model_files
@@ -50,15 +42,12 @@ from gsbench.scene.options import downscaled_size
 from gsbench.scene.rules import MIN_IMAGES, inspect, settle
 from gsbench.scene.types import Camera, CameraModel, Capture, Scene, View, to_pinhole
 from gsbench.scene.undistortion import lens_findings, undistort
+from gsbench.system.install import version_of
 from gsbench.system.isolate import CrashError, run_isolated
 from gsbench.system.resources import in_threads
 
-log = logging.getLogger(__name__)
-
 PrincipalPoint = Literal["used", "centred"]
-CACHE_VERSION = 3  # to be raised when prepared pixels or the form of cameras.json change
 CAMERAS_FILE = "cameras.json"
-SUMS_FILE = "files.json"  # sizes and checksums of the other files
 INTRINSICS = ("width", "height", "fx", "fy", "cx", "cy")
 # images per isolated process: limits what a crash loses, and progress is reported after each chunk
 _CHUNK = 16
@@ -107,22 +96,15 @@ class PreparedViews(Record):
     oddities: list[Oddity] = field(default_factory=list)  # of lenses
 
 
-class PreparedFiles(Record):
-    """The content of `SUMS_FILE`."""
-
-    files: dict[str, Output]
-
-
 def load_scene(
     capture: Capture,
     model_dir: Path,
-    cache_dir: Path,
+    store: Store,
     downscale: int = 1,
     max_size: int | None = None,
     resample: Resample = "lanczos",
     principal_point: PrincipalPoint = "used",
     progress: Progress = no_progress,
-    made_by: Mapping[str, str | None] = MappingProxyType({}),
     beside: Sequence[str] = (),
     depth_scale: float | None = None,
 ) -> Scene:
@@ -131,27 +113,17 @@ def load_scene(
     Images of a distorted camera are undistorted. Then all images are shrunk by ``downscale`` and to
     a longest side of ``max_size`` px (see `downscaled_size`). ``principal_point="centred"`` moves
     principal points to the image centre, as 3DGS assumes. Views without a pose in the model are
-    left out with a warning. ``made_by`` are the versions of code and packages that prepare images:
-    the cache does not return images that other versions made. ``beside`` are kinds of pictures
-    beside the photographs (`gsbench.scene.beside`). ``progress`` counts images.
+    left out with a warning. ``beside`` are kinds of pictures beside the photographs
+    (`gsbench.scene.beside`). ``progress`` counts images.
 
     Raises `InputError` if fewer than three views or no training view have a pose, or an image does
     not fit its camera.
     """
-    downscaling = Downscaling(downscale, max_size, resample)
-    folder = Path(cache_dir) / _cache_key(capture, Path(model_dir), downscaling, made_by)
-    try:
-        prepared = _read_prepared(folder)
-    except (InputError, OSError) as error:
-        if folder.exists():
-            log.warning("store: %s; the views are prepared again", error)
-            shutil.rmtree(folder)
-        _prepare_views(folder, capture, Path(model_dir), downscaling, progress)
-        prepared = _read_prepared(folder)
-    entries, oddities = (
-        prepared.views,
-        settle(prepared.oddities, f"scene {capture.name}", capture.accept),
-    )
+    step = views_step(capture, model_dir, Downscaling(downscale, max_size, resample), progress)
+    folder = store.get(step).path
+    prepared = read_typed(folder / CAMERAS_FILE, PreparedViews)
+    entries = prepared.views
+    oddities = settle(prepared.oddities, f"scene {capture.name}", capture.accept)
     oddities += _inspect_views(capture, entries)
 
     def mask_of(name: str) -> Mask | None:
@@ -199,25 +171,33 @@ def load_scene(
     )
 
 
-def _prepare_views(
-    folder: Path, capture: Capture, model_dir: Path, downscaling: Downscaling, progress: Progress
-) -> None:
-    """Prepare all registered images of the capture and publish them as ``folder``."""
-    cameras = _model_cameras(capture, model_dir)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    work = folder.parent / f".{folder.name}-{secrets.token_hex(4)}"
-    work.mkdir()  # not mkdtemp, whose folders only their owner can read: a cache may be shared
-    try:
+def views_step(
+    capture: Capture, model_dir: Path, downscaling: Downscaling, progress: Progress = no_progress
+) -> Step:
+    """The step that prepares all posed images of the capture; no pixel depends on points.
+
+    Pillow reads and shrinks images, pycolmap undistorts them.
+    """
+    files = [file for file in sorted(model_files(model_dir)) if file.stem != "points3D"]
+    inputs = {
+        "capture": capture.fingerprint,
+        "names": list(capture.image_names),
+        "cameras": {file.name: file_sha256(file) for file in files},
+        **vars(downscaling),
+        **{package: version_of(package) for package in ("pycolmap", "pillow")},
+    }
+
+    def build(folder: Path) -> None:
         entries: dict[str, dict[str, object]] = {}
         changes: dict[str, ImageToPrepare] = {}
-        for index, (name, (model, pose)) in enumerate(cameras.items()):
+        for index, (name, (model, pose)) in enumerate(_model_cameras(capture, model_dir).items()):
             size = (model.width, model.height)
             changed = model.distorted or downscaling.final_size(*size) != size
             file = f"{index:05d}.png" if changed else ""
             entries[name] = {"file": file, "pose": pose}
             if changed:
                 source, mask = capture.images / name, capture.masks.get(name)
-                changes[name] = ImageToPrepare(source, model, work / file, downscaling, mask)
+                changes[name] = ImageToPrepare(source, model, folder / file, downscaling, mask)
             else:
                 entries[name] |= _intrinsics(to_pinhole(model))
         lenses = {name: image.camera for name, image in changes.items() if image.camera.distorted}
@@ -225,41 +205,10 @@ def _prepare_views(
         prepared = prepare_all(list(changes.values()), progress)
         for name, camera in zip(changes, prepared, strict=True):
             entries[name] |= _intrinsics(camera)
-        document = {"version": CACHE_VERSION, "scene": capture.name, "views": entries}
-        if odd:
-            document["oddities"] = [one.to_json() for one in odd]
-        (work / CAMERAS_FILE).write_text(json.dumps(document, indent=1), encoding="utf-8")
-        write_json(work / SUMS_FILE, {"files": record_files(work)})
-        _publish(work, folder)
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
+        found = {"oddities": [one.to_json() for one in odd]} if odd else {}
+        write_json(folder / CAMERAS_FILE, {"views": entries} | found)
 
-
-def _publish(work: Path, folder: Path) -> None:
-    try:
-        os.rename(work, folder)
-    except OSError:
-        with suppress(InputError, OSError):
-            _read_prepared(folder)
-            return  # another process published the same content first
-        shutil.rmtree(folder)  # the existing folder is damaged
-        os.rename(work, folder)
-
-
-def _read_prepared(folder: Path) -> PreparedViews:
-    """The prepared views by name, and what was odd about their lenses.
-
-    Raises InputError, or FileNotFoundError, unless all files are as they were written.
-    """
-    sums = read_typed(folder / SUMS_FILE, PreparedFiles).files
-    for name, recorded in sums.items():
-        if not is_sound(folder, name, recorded, thorough=True):
-            raise InputError(f"{folder / name} is not as it was prepared")
-    prepared = read_typed(folder / CAMERAS_FILE, PreparedViews)
-    files = {CAMERAS_FILE, *(view.file for view in prepared.views.values() if view.file)}
-    if missing := sorted(files - sums.keys()):
-        raise InputError(f"{folder / SUMS_FILE} lacks {missing[0]}")
-    return prepared
+    return step_of(VIEWS, inputs, build)
 
 
 def _model_cameras(
@@ -309,21 +258,6 @@ def _inspect_views(capture: Capture, placed: Collection[str]) -> tuple[Oddity, .
 
 def _intrinsics(camera: Camera) -> dict[str, float]:
     return {key: getattr(camera, key) for key in INTRINSICS}
-
-
-def _cache_key(
-    capture: Capture, model_dir: Path, downscaling: Downscaling, made_by: Mapping[str, str | None]
-) -> str:
-    """A digest of images, cameras, poses, settings, and versions of what prepares the images."""
-    digest = hashlib.sha256()
-    for file in sorted(model_files(model_dir)):
-        if file.stem != "points3D":  # views do not depend on points
-            content = hashlib.sha256(file.read_bytes()).hexdigest()
-            digest.update(f"{file.name}\0{content}\n".encode())
-    settings = [*vars(downscaling).values(), sorted(made_by.items())]
-    parts = [CACHE_VERSION, capture.fingerprint, capture.image_names, *settings]
-    digest.update(json.dumps(parts).encode())
-    return digest.hexdigest()[:32]
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,18 @@
-"""Matching names: of photographs in models and lists, of masks, renders and poses, to files."""
+"""Matching names: of photographs in models and lists, of masks, renders and poses, to files.
 
+`match` gives each name the file that fits best. `match_pictures` is for renders, whose names follow
+one rule, under which all of them fit.
+"""
+
+import re
 import unicodedata
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import PurePosixPath
 
 from gsbench.errors import InputError
+from gsbench.words import counted, some_of
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"})
 
@@ -43,6 +50,14 @@ def keys_of(form: Key) -> tuple[Key, ...]:
 NAME_KEYS = keys_of(plain)
 
 
+def grouped(names: Iterable[str], key_of: Key) -> dict[str, list[str]]:
+    """The names by their key."""
+    groups: dict[str, list[str]] = defaultdict(list)
+    for name in names:
+        groups[key_of(name)].append(name)
+    return groups
+
+
 def match(
     wanted: Iterable[str], files: Iterable[str], keys: Sequence[Key] = NAME_KEYS
 ) -> dict[str, str]:
@@ -56,26 +71,20 @@ def match(
     matches = {name: name for name in names if name in free}
     for key_of in keys:
         free -= set(matches.values())
-        by_key: dict[str, list[str]] = defaultdict(list)
-        for file in free:
-            by_key[key_of(file)].append(file)
-        names_by_key: dict[str, list[str]] = defaultdict(list)
-        for name in names:
-            if name not in matches and key_of(name) in by_key:
-                names_by_key[key_of(name)].append(name)
-        for key, own in names_by_key.items():
-            found = sorted(by_key[key])
+        by_key = grouped(free, key_of)
+        for key, own in grouped([name for name in names if name not in matches], key_of).items():
+            found = sorted(by_key.get(key, ()))
             if len(found) > 1:
                 raise InputError(
                     f"{own[0]} may be {' or '.join(found)}: keep one of these files, or name one "
                     "exactly"
                 )
-            if len(own) > 1:
+            if found and len(own) > 1:
                 raise InputError(
                     f"{found[0]} may be {' or '.join(sorted(own))}: give each image a file of its "
                     "own"
                 )
-            matches[own[0]] = found[0]
+            matches |= dict.fromkeys(own, found[0]) if found else {}
     return matches
 
 
@@ -99,3 +108,159 @@ def same_folder(one: str, other: str) -> bool:
     """Return whether two names have the same folder, up to capitals."""
     one, other = plain(one), plain(other)
     return parts_of(one)[:-1] == parts_of(other)[:-1] or one.casefold() == other.casefold()
+
+
+SAME_NAMES = ""
+BY_ORDER = "by order"
+
+
+@dataclass(frozen=True)
+class Matching:
+    """The picture of each photograph. ``left_out`` are the pictures without a photograph.
+
+    ``rule`` says how the names were compared; it is "" if they are the same.
+    """
+
+    pairs: Mapping[str, str]
+    rule: str
+    left_out: tuple[str, ...]
+
+
+def match_pictures(
+    photographs: Sequence[str], pictures: Sequence[str], by_order: str = "--by-order"
+) -> Matching:
+    """Match names (relative paths) by the first rule under which every photograph has a picture.
+
+    The rules, from strict to loose, compare names: as they are; without the extension; with folders
+    written as part of the name; without case; without a start and an end that all names share;
+    without leading zeros; and by the last three rules without folders. Raises `InputError` if that
+    rule gives a photograph several pictures, or if no rule gives each a picture. ``by_order`` is
+    the option that error messages suggest for `match_by_order`.
+    """
+    for rule, make_keys in PICTURE_RULES.items():
+        keys = make_keys(photographs)
+        by_key = grouped(pictures, make_keys(pictures).__getitem__)
+        if len({*keys.values()}) < len(photographs) or not {*keys.values()} <= by_key.keys():
+            continue  # it gives two photographs one key, or one no picture
+        for photograph, key in keys.items():
+            if len(by_key[key]) > 1:
+                raise InputError(
+                    f"{', '.join(sorted(by_key[key]))} all fit the photograph {photograph}: leave "
+                    "one"
+                )
+        pairs = {photograph: by_key[key][0] for photograph, key in keys.items()}
+        return Matching(pairs, rule, tuple(sorted(set(pictures) - set(pairs.values()))))
+    raise InputError(_no_match(photographs, pictures, by_order))
+
+
+def match_by_order(photographs: Sequence[str], pictures: Sequence[str]) -> Matching:
+    """Match the k-th picture, with numbers by value, with the k-th photograph.
+
+    Raises `InputError` if there are not equally many, or if the photographs have another order as
+    text than with numbers by value: 3DGS renders them in the order of text (1, 10, 2), other
+    programs by value.
+    """
+    if len(photographs) != len(pictures):
+        raise InputError(
+            f"there are {counted(len(pictures), 'picture')} for "
+            f"{counted(len(photographs), 'photograph')}: by order, "
+            "each needs one"
+        )
+    in_order = sorted(photographs, key=_by_value)
+    if in_order != sorted(photographs):
+        raise InputError(
+            f"by order, the photographs are {some_of(sorted(photographs))} as text and "
+            f"{some_of(in_order)} by number, and programs render in either order: name the "
+            "pictures after their photographs"
+        )
+    pairs = dict(zip(in_order, sorted(pictures, key=_by_value), strict=True))
+    return Matching({photograph: pairs[photograph] for photograph in photographs}, BY_ORDER, ())
+
+
+def _no_match(photographs: Sequence[str], pictures: Sequence[str], by_order: str) -> str:
+    without = []  # by each rule, the photographs without a picture
+    for make_keys in PICTURE_RULES.values():
+        found, keys = {*make_keys(pictures).values()}, make_keys(photographs)
+        without.append([name for name in photographs if keys[name] not in found])
+    missing = min(without, key=len)
+    called = some_of(sorted(pictures)) or "there are none"
+    hint = (
+        f"; {by_order} takes them as they are sorted" if len(pictures) == len(photographs) else ""
+    )
+    return (
+        f"{len(missing)} of {counted(len(photographs), 'photograph')} have no picture of their "
+        f"name ({some_of(missing)}); the pictures are {called}: rename them{hint}"
+    )
+
+
+def _stem(name: str) -> str:
+    return PurePosixPath(name).with_suffix("").as_posix()
+
+
+def _flat(name: str) -> str:
+    return _stem(name).replace("/", "__")
+
+
+def _base(name: str) -> str:
+    return re.split(r"/|__", _stem(name))[-1]
+
+
+Words = dict[str, str]  # what is compared of each name
+
+
+def _folded(words: Words) -> Words:
+    return {name: word.casefold() for name, word in words.items()}
+
+
+def _stripped(words: Words) -> Words:
+    """The words without the start and the end that all of them share.
+
+    Digits next to the rest are kept, so that numbers stay whole.
+    """
+    if len(words) < 2:
+        return words
+    texts = list(words.values())
+    start = len(_common_start(texts).rstrip("0123456789"))
+    end = len(_common_start([text[start:][::-1] for text in texts]).rstrip("0123456789"))
+    return {name: text[start : len(text) - end] for name, text in words.items()}
+
+
+def _common_start(texts: Sequence[str]) -> str:
+    first, last = min(texts), max(texts)
+    different = (index for index, letter in enumerate(first) if last[index : index + 1] != letter)
+    return first[: next(different, len(first))]
+
+
+def _unpadded(words: Words) -> Words:
+    return {
+        name: re.sub(r"\d+", lambda digits: str(int(digits[0])), word)
+        for name, word in words.items()
+    }
+
+
+def _by_value(name: str) -> list[tuple[int, int, str]]:
+    parts = re.split(r"(\d+)", _flat(name))
+    return [(1, int(part), part) if part.isdigit() else (0, 0, part) for part in parts]
+
+
+def _rule(key: Key, *steps: Callable[[Words], Words]) -> Callable[[Sequence[str]], Words]:
+    def keys(names: Sequence[str]) -> Words:
+        words = {name: key(name) for name in names}
+        for step in steps:
+            words = step(words)
+        return words
+
+    return keys
+
+
+PICTURE_RULES = {  # from strict to loose; names are equal if their keys are
+    SAME_NAMES: _rule(str),
+    "apart from the extension": _rule(_stem),
+    "with folders as part of the name": _rule(_flat),
+    "apart from case": _rule(_flat, _folded),
+    "apart from what all names begin or end with": _rule(_flat, _folded, _stripped),
+    "apart from leading zeros": _rule(_flat, _folded, _stripped, _unpadded),
+    "apart from folders": _rule(_base, _folded),
+    "apart from folders and what all names begin or end with": _rule(_base, _folded, _stripped),
+    "apart from folders and leading zeros": _rule(_base, _folded, _stripped, _unpadded),
+}

@@ -64,9 +64,9 @@ class Rule:
     stage: Stage
     measure: Callable[[Any], Iterable[Finding]]
     fine: Range
-    usable: Range
     say: str
     mend: str
+    usable: Range = ANY
     fixed: bool = False
 
     def judge(self, subject: Any) -> Oddity | None:
@@ -225,69 +225,62 @@ def _panoramas(raw: Any) -> Iterable[Finding]:
     yield Finding(len(names), names)
 
 
+def _always(
+    id: str,
+    stage: Stage,
+    measure: Callable[[Any], Iterable[Finding]],
+    usable: Range,
+    say: str,
+    mend: str,
+) -> Rule:
+    """A rule that cannot be accepted."""
+    return Rule(id, stage, measure, usable, say, mend, usable, fixed=True)
+
+
+def _of_file(id: str, usable: Range, say: str, mend: str) -> Rule:
+    """A rule for a value that the caller measured (`given`)."""
+    return _always(id, "file", _fact("value"), usable, say, mend)
+
+
 ELSEWHERE = "the cloud may lie in other coordinates, or have another scale, than the cameras"
 RULES = (
     # ---- files
-    Rule(
+    _of_file(
         "too-few-images",
-        "file",
-        _fact("value"),
-        at_least(MIN_IMAGES),
         at_least(MIN_IMAGES),
         "{value:n image} {which}, but at least 3 are needed",
         "{mend}",
-        fixed=True,
     ),
-    Rule(
+    _of_file(
         "view-size",
-        "file",
-        _fact("value"),
-        at_least(MIN_SIZE),
         at_least(MIN_SIZE),
         "scene.downscale={downscale}{limit} leaves {size} px of {full}",
         "at least 16 px are needed",
-        fixed=True,
     ),
-    Rule(
+    _of_file(
         "principal-point-of-other-size",
-        "file",
-        _fact("value"),
         (1 / 1.5, 1.5),  # copies are halved; other points are off by few percent
-        (1 / 1.5, 1.5),
         "its principal point ({cx:g}, {cy:g}) is the centre of a photograph of another size than "
         "{width}x{height} px",
         "add w and h",
-        fixed=True,
     ),
-    Rule(
+    _of_file(
         "mask-of-other-size",
-        "file",
-        _fact("value"),
-        at_most(0),
         at_most(0),
         "the mask is {size} px and its image {name} {full}",
         "give masks of the images' size",
-        fixed=True,
     ),
-    Rule(
+    _of_file(
         "black-mask",
-        "file",
-        _fact("value"),
-        ABOVE_ZERO,
         ABOVE_ZERO,
         "the mask is black all over, so no pixel counts",
         "correct it, or leave the image out",
-        fixed=True,
     ),
-    Rule(
+    _of_file(
         "grey-mask",
-        "file",
-        _fact("value"),
         at_most(0.05),  # a photograph has far more
-        at_most(0.05),
         "{value:.0%} of its pixels are grey, so it is not a mask",
         "make it black where pixels are ignored, else white",
-        fixed=True,
     ),
     # ---- a folder with photographs
     Rule(
@@ -295,7 +288,6 @@ RULES = (
         "read",
         _findings("no-pose"),
         at_most(0),
-        ANY,
         "{count:n photograph} without a pose in the model: {names:few}",
         "they are not used",
     ),
@@ -304,7 +296,6 @@ RULES = (
         "read",
         _findings("no-file"),
         at_most(0),
-        ANY,
         "{count:n image} with a camera but without a file: {names:few}",
         "they are not used",
     ),
@@ -313,7 +304,6 @@ RULES = (
         "read",
         _findings("found-by-last-part"),
         at_most(0),
-        ANY,
         "files found by the last part of their path: {names:few}",
         "name the photographs as the model does",
     ),
@@ -322,7 +312,6 @@ RULES = (
         "read",
         _findings("focal-length-and-field"),
         (1 / 1.05, 1.05),  # rounding, and a shift of the principal point, are far less
-        ANY,
         "its focal length is {given:g} px, but its field of view means {meant:g} px: {names:few}",
         "the focal length is used",
     ),
@@ -332,16 +321,15 @@ RULES = (
         "capture",
         _panoramas,
         at_most(0),
-        at_most(0),
         "{count:n photograph} declared as panoramas by XMP (equirectangular): {names:few}",
         "split them into pinhole views first, for example with COLMAP's panorama_sfm",
+        usable=at_most(0),
     ),
     Rule(
         "copies",
         "capture",
         _left_out,
         at_most(0),
-        ANY,
         "{count:n photograph} left out, with the name or content of another: {names:few}",
         "keep one of each",
     ),
@@ -351,48 +339,42 @@ RULES = (
         "lens",
         _findings("lens-turns-back"),
         at_most(0.0),
-        at_most(0.01),  # fitted lenses of correct models may do so in the outermost corners
         "the camera of {names:few} ({camera}) turns back inside the picture: {value:.1%} of the "
         "undistorted photograph would be a mirrored ghost",
         "correct its distortion, estimate another model (scene=photos init.camera_model=RADIAL), "
         "or give undistorted photographs",
+        usable=at_most(0.01),  # fitted lenses of correct models may do so in the outermost corners
     ),
     Rule(
         "little-left",
         "lens",
         _findings("little-left"),
         at_least(0.25),
-        ANY,
         "the camera of {names:few} ({camera}) leaves {size} of {full} px undistorted",
         "check its lens",
     ),
     # ---- views
-    Rule(
+    _always(
         "no-training-view",
         "views",
         _kept("train"),
         at_least(1),
-        at_least(1),
         "no training view has a pose, or all of them are copies of test views",
         "change the split or the init",
-        fixed=True,
     ),
-    Rule(
+    _always(
         "no-test-view",
         "views",
         _kept("test"),
         at_least(1),
-        at_least(1),
         "no test view has a pose, so nothing could be measured",
         "change the split or the init, or leave out photographs of another camera",
-        fixed=True,
     ),
     Rule(
         "views-without-pose",
         "views",
         _names("unplaced"),
         at_most(0),
-        ANY,
         "{count:n view} without a pose left out: {names:few}",
         "take photographs with more overlap, or another init",
     ),
@@ -401,7 +383,6 @@ RULES = (
         "scene",
         _left_out,
         at_most(0),
-        ANY,
         "{count:n training view} left out, with the pixels of a test view: {names:few}",
         "keep one of each",
     ),
@@ -410,7 +391,6 @@ RULES = (
         "scene",
         _near_twins,
         at_most(0),
-        ANY,
         "{count} of {tested:n test view} with a near twin in training: {names:few}",
         "such views measure memory; scene.split=sector holds out whole parts",
     ),
@@ -419,7 +399,6 @@ RULES = (
         "scene",
         _far_cameras,
         at_most(20.0),
-        ANY,
         "the camera of {names:few} is {value:,.0f} times as far from the others as they usually "
         "are, and sets the scene extent to {extent:.4g}",
         "check its pose, or leave the image out",
@@ -429,7 +408,6 @@ RULES = (
         "scene",
         _each_camera(_field_of_view),
         (0.2, 150.0),  # satellites have 1 degree, the widest pinhole lenses 130
-        ANY,
         "the camera of {names:few} has a focal length of {camera.fx:.4g} px for a width of "
         "{camera.width} px",
         "check its unit",
@@ -439,7 +417,6 @@ RULES = (
         "scene",
         _each_camera(lambda camera: camera.fy / camera.fx),
         (1 / 1.25, 1.25),  # unequal scaling of photographs gives 1.01
-        ANY,
         "the camera of {names:few} has focal lengths of {camera.fx:.4g} and {camera.fy:.4g} px, "
         "but pixels are square",
         "check both",
@@ -449,7 +426,6 @@ RULES = (
         "scene",
         _each_camera(_off_center),
         at_most(0.4),
-        ANY,
         "the camera of {names:few} has its principal point at ({camera.cx:.4g}, {camera.cy:.4g}) "
         "of {camera.width}x{camera.height} px, far from the middle",
         "check its unit, unless the photographs were cropped",
@@ -459,7 +435,6 @@ RULES = (
         "scene",
         _brightest,
         at_least(49),  # the usual cause are values of 10 or 12 bits in files of 16
-        ANY,
         "no photograph has a value above {value} of 255",
         "scale them to their full range",
     ),
@@ -469,7 +444,6 @@ RULES = (
         "model",
         _fact("placed_share", "num_registered", "num_images", "unregistered"),
         at_least(0.9),
-        ANY,
         "only {num_registered} of {num_images} images have a pose (missing: {unregistered:few})",
         "the other photos are not used; more overlap or texture would help",
     ),
@@ -478,7 +452,6 @@ RULES = (
         "model",
         _fact("num_points"),
         at_least(100),
-        ANY,
         "only {value} points",
         "training starts from next to nothing",
     ),
@@ -487,7 +460,6 @@ RULES = (
         "model",
         _fact("mean_reprojection_error"),
         at_most(1.5),  # px; correct models stay below 0.7 with SIFT, 1.2 with learned features
-        ANY,
         "mean reprojection error {value:.2f} px is large",
         "the cameras or the matches are probably wrong",
     ),
@@ -496,7 +468,6 @@ RULES = (
         "model",
         _fact("rotation_error", "truth"),
         at_most(2.0),  # degrees; correct models stay below 0.5, wrong ones reach 20 and more
-        ANY,
         "the cameras are turned {value:.1f} degrees against the {truth} ones on average",
         "the model is wrong although its images are placed (views at most 7.5 degrees apart are "
         "safe)",
@@ -506,7 +477,6 @@ RULES = (
         "model",
         _fact("center_error", "truth"),
         at_most(0.05),
-        ANY,
         "the cameras are {value:.1%} of the scene extent away from the {truth} ones",
         "the model is probably wrong",
     ),
@@ -515,50 +485,43 @@ RULES = (
         "model",
         lambda model: model.fields_of_view,
         (5.0, 150.0),
-        ANY,
         "estimated focal length {focal:.0f} px (field of view {value:.0f} degrees) is implausible",
         "give init.focal_length in px",
     ),
     # ---- the points that training starts from
-    Rule(
+    _always(
         "cameras-at-one-place",
         "cloud",
         _fact("extent"),
         ABOVE_ZERO,
-        ABOVE_ZERO,
         "all training cameras stand at one place, so no depth can be learnt",
         "take photographs from several places",
-        fixed=True,
     ),
-    Rule(
+    _always(
         "point-beyond-range",
         "cloud",
         _fact("farthest", "number", "total", "place"),
         at_most(1e7),  # squares of larger lengths leave the range in which float32 can train
-        at_most(1e7),
         "initial point {number} of {total:,} is {value:.3g} times as far from the cameras as they "
         "are from each other, at {place}",
         "remove it from the cloud",
-        fixed=True,
     ),
-    Rule(
+    _always(
         "points-out-of-view",
         "cloud",
         _fact("seen_by_one"),
         ABOVE_ZERO,
-        ABOVE_ZERO,
         "no training view has one of the initial points in view",
         "the cloud lies in other coordinates than the cameras; bring it into theirs",
-        fixed=True,
     ),
     Rule(
         "points-share-places",
         "cloud",
         _fact("identical", "first_place"),
         at_most(0.5),
-        at_most(math.nextafter(1, 0)),
         "{value:.0%} of the initial points share their place with another, such as {first_place}",
         "thin or rebuild the cloud",
+        usable=at_most(math.nextafter(1, 0)),
         fixed=True,
     ),
     Rule(
@@ -566,7 +529,6 @@ RULES = (
         "cloud",
         _fact("far"),
         at_most(0),
-        ANY,
         "{value:n initial point} more than 10,000 times as far off as the cameras",
         "clean the cloud",
     ),
@@ -575,7 +537,6 @@ RULES = (
         "cloud",
         _fact("seen"),
         at_least(0.1),  # clouds by structure from motion have 0.97 and more
-        ANY,
         "only {value:.1%} of the initial points are in view of two training views",
         ELSEWHERE,
     ),
@@ -584,7 +545,6 @@ RULES = (
         "cloud",
         _fact("spread"),
         at_least(0.02),
-        ANY,
         "half of the initial points lie within {value:.2g} of the cameras' distances",
         ELSEWHERE,
     ),
@@ -593,7 +553,6 @@ RULES = (
         "cloud",
         _fact("color_agreement"),
         at_least(0.25),  # sound clouds have 0.6 to 0.9, other scales or axes -0.1 to 0.2
-        ANY,
         "the colours of the initial points hardly agree with the photographs (agreement "
         "{value:.2f}; 0 is chance, 1 is equal)",
         ELSEWHERE,
@@ -603,7 +562,6 @@ RULES = (
         "cloud",
         _fact("color_spread", "first_color"),
         at_least(1.0),
-        ANY,
         "all initial points have the colour {first_color}",
         "export the cloud with its colours",
     ),

@@ -34,7 +34,7 @@ from typing import Any, BinaryIO, TypeVar
 
 from gsbench.errors import GsbenchError
 from gsbench.logs import LOGGER, Progress
-from gsbench.system.own_modules import allowed_modules
+from gsbench.system.programs import allowed_modules
 
 PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36  # linux/prctl.h
 # time limit for descendants that SIGKILL does not end, such as those of another user
@@ -123,7 +123,7 @@ T = TypeVar("T")
 
 _BOOTSTRAP = (
     "import json, sys; path, own = json.loads(sys.argv[1]); sys.path[:] = path; "
-    "from gsbench.system.own_modules import adopt_modules; adopt_modules(own); from {module} "
+    "from gsbench.system.programs import adopt_modules; adopt_modules(own); from {module} "
     "import {name}; {name}()"
 )
 # time limit for a child to end the programs that it started, before it is killed

@@ -15,9 +15,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from gsbench.system.compile_clock import CLOCK
 from gsbench.system.locks import hold
 from gsbench.system.machine import load_numba, numba_target
+from gsbench.system.resources import CLOCK
 
 numba = load_numba()  # first: it protects the import of numba
 

@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -214,3 +215,22 @@ def peak_child_mb() -> float:
 def _max_resident_mb(who: int) -> float:
     unit = 1 if sys.platform == "darwin" else 1024  # of ru_maxrss: bytes there, else kB
     return resource.getrusage(who).ru_maxrss * unit / MIB
+
+
+@dataclass
+class CompileClock:
+    """Seconds in which this process compiled kernels, loaded them, or waited for another process.
+
+    It does not know how kernels are compiled, so that whoever reads it need not load numba.
+    """
+
+    seconds: float = 0.0
+    reported: float = 0.0
+
+    def report(self) -> float:
+        """The seconds since the last report."""
+        earlier, self.reported = self.reported, self.seconds
+        return self.seconds - earlier
+
+
+CLOCK = CompileClock()

@@ -199,8 +199,7 @@ TOKEN_TAG = "gsbench.token"
 ERROR_TAG = "error"
 DESCRIPTION = "mlflow.note.content"
 MAX_TAG = 5000  # characters of a tag (MLflow's limit)
-# characters of a parameter: MLflow's limit, and the limits of older servers
-MAX_VALUES = (6000, 500, 250)
+MAX_VALUE = 500  # characters of a parameter, which every server of MLflow 2 and later takes
 
 
 @dataclass
@@ -229,18 +228,11 @@ class MLflow:
         return self._id
 
     def params(self, values: Mapping[str, str]) -> None:
-        """Log the settings, cut for servers that take only short ones."""
+        """Log the settings."""
         from mlflow.entities import Param
-        from mlflow.exceptions import MlflowException
 
-        for limit in MAX_VALUES:
-            params = [Param(key, value[:limit]) for key, value in values.items()]
-            try:
-                self._client.log_batch(self._id, params=params)
-                break
-            except MlflowException:  # perhaps a value is too long for this server
-                if limit == MAX_VALUES[-1] or max(map(len, values.values())) <= MAX_VALUES[-1]:
-                    raise
+        params = [Param(key, value[:MAX_VALUE]) for key, value in values.items()]
+        self._client.log_batch(self._id, params=params)
 
     def tags(self, values: Mapping[str, str]) -> None:
         """Set tags; the note becomes the run's description."""

@@ -6,7 +6,7 @@ import os
 import time
 import uuid
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, chdir, closing, nullcontext
+from contextlib import AbstractContextManager, chdir, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -85,99 +85,6 @@ class MirrorError(Exception):
 LOCK = ".mlflow.lock"
 
 
-class TrackerRun:
-    """The tracker's run of the trial in ``folder``, new or continued, locked until it is closed.
-
-    ``options`` are the settings ``tracking``, ``values`` the whole configuration; ``allowed`` are
-    the modules whose code may run. Raises BusyError if another process mirrors the trial, and any
-    error of the tracker.
-    """
-
-    def __init__(
-        self,
-        folder: TrialFolder,
-        options: Mapping[str, Any],
-        values: dict[str, Any],
-        allowed: Sequence[str] = (),
-    ) -> None:
-        folder.require_no_links()
-        self._options, self._trial = options, TrackedTrial(folder, values)
-        self._file = _state_file(folder, options)
-        with ExitStack() as held:
-            held.enter_context(hold(folder.path / LOCK, "mirroring", wait=False))
-            self._sink = make_sink(options, allowed)
-            self._open(read_if_sound(self._file, Run) or Run())
-            self._held = held.pop_all()
-
-    def close(self) -> None:
-        """Let other processes mirror the trial."""
-        self._held.close()
-
-    @property
-    def is_complete(self) -> bool:
-        """Return whether the run shows how the trial ended, and its present results."""
-        results = self._trial.results_hash()
-        if results is None:
-            return self._run.ended == self._trial.ending()
-        return self._run.complete == results
-
-    def add_curves(self, live: bool = True) -> None:
-        """Log the records that were written since the last call.
-
-        A run that shows results is left as it is.
-        """
-        if self._run.complete is not None:
-            return
-        for name, newest, scalars in self._trial.curves(self._run.logged, live):
-            self._sink.metrics(scalars)
-            self._keep(replace(self._run, logged=self._run.logged | {name: newest}))
-
-    def end(self) -> None:
-        """Log the rest, and close the run as the trial's files say: failed, done, else killed."""
-        if self.is_complete:
-            return
-        # the run shows earlier results, which new ones have replaced
-        if self._run.complete is not None:
-            self._open(self._run)
-        self.add_curves(live=False)
-        folder, sink = self._trial.folder, self._sink
-        if folder.has_failed():
-            sink.artifacts(self._trial.files((CONFIG, FAILED, LOG)), ())
-            sink.close("FAILED", folder.failure().reason)
-            self._keep(replace(self._run, ended=self._trial.ending()))
-        elif (results := folder.sound_record()) is None:
-            sink.close("KILLED", None)
-            self._keep(replace(self._run, ended=self._trial.ending()))
-        else:
-            images, with_model = int(self._options["images"]), bool(self._options.get("model"))
-            summary = self._trial.summary(results, images, with_model)
-            sink.metrics(summary.scalars)
-            sink.tags(summary.tags)
-            sink.artifacts(summary.files, summary.pictures)
-            sink.close("FINISHED", None)
-            self._keep(replace(self._run, complete=self._trial.results_hash()))
-
-    def _open(self, run: Run) -> None:
-        """Open ``run``, or a new one in its place if it shows results that are not the trial's."""
-        if run.token is None or run.complete not in (None, self._trial.results_hash()):
-            now = int(time.time() * 1000)
-            run = Run(token=uuid.uuid4().hex, started=now, replaces=run.token)
-        # Kept before the tracker creates the run, so that the token finds it even if the tracker's
-        # answer is lost.
-        self._keep(run)
-        name = self._sink.open(self._trial, run)
-        if name != run.id:
-            run = Run(token=run.token, started=run.started, id=name)
-        if not run.described:
-            self._sink.params(self._trial.params())
-            self._sink.tags(self._trial.tags())
-        self._keep(replace(run, described=True))
-
-    def _keep(self, run: Run) -> None:
-        self._run = run
-        write_json(self._file, run.to_json())
-
-
 def sync(
     folders: Iterable[TrialFolder], uri: str | None, allowed: Sequence[str] = ()
 ) -> Iterator[str]:
@@ -252,16 +159,65 @@ def mirror(
 ) -> bool:
     """Send a trial that has ended or (``live``) runs; returns False if the tracker lacks nothing.
 
-    Raises the errors of `TrackerRun`.
+    ``options`` are the settings ``tracking``, ``values`` the whole configuration; ``allowed`` are
+    the modules whose code may run. Raises BusyError if another process mirrors the trial, and any
+    error of the tracker.
     """
-    with closing(TrackerRun(folder, options, values, allowed)) as run:
-        if live:
-            run.add_curves()
-        elif run.is_complete:
+    folder.require_no_links()
+    file = _state_file(folder, options)
+
+    def keep(run: Run, **changes: Any) -> Run:
+        run = replace(run, **changes)
+        write_json(file, run.to_json())
+        return run
+
+    with hold(folder.path / LOCK, "mirroring", wait=False):
+        sink, trial = make_sink(options, allowed), TrackedTrial(folder, values)
+        results = trial.results_hash()
+        run = read_if_sound(file, Run) or Run()
+        if run.token is None or run.complete not in (None, results):  # it shows other results
+            now = int(time.time() * 1000)
+            run = Run(token=uuid.uuid4().hex, started=now, replaces=run.token)
+        # Kept before the tracker creates the run, so that the token finds it even if the tracker's
+        # answer is lost.
+        keep(run)
+        name = sink.open(trial, run)
+        if name != run.id:
+            run = Run(token=run.token, started=run.started, id=name)
+        if not run.described:
+            sink.params(trial.params())
+            sink.tags(trial.tags())
+        run = keep(run, described=True)
+        is_shown = run.ended == trial.ending() if results is None else run.complete == results
+        if is_shown and not live:
             return False
-        else:
-            run.end()
+        for name, newest, scalars in trial.curves(run.logged, live):
+            sink.metrics(scalars)
+            run = keep(run, logged=run.logged | {name: newest})
+        if not live:
+            if _end(sink, trial, options):
+                keep(run, complete=trial.results_hash())
+            else:
+                keep(run, ended=trial.ending())
         return True
+
+
+def _end(sink: Sink, trial: TrackedTrial, options: Mapping[str, Any]) -> bool:
+    """Close the run as the trial's files say: failed, done, else killed; True if it is done."""
+    folder = trial.folder
+    if folder.has_failed():
+        sink.artifacts(trial.files((CONFIG, FAILED, LOG)), ())
+        sink.close("FAILED", folder.failure().reason)
+    elif (results := folder.sound_record()) is None:
+        sink.close("KILLED", None)
+    else:
+        summary = trial.summary(results, int(options["images"]), bool(options.get("model")))
+        sink.metrics(summary.scalars)
+        sink.tags(summary.tags)
+        sink.artifacts(summary.files, summary.pictures)
+        sink.close("FINISHED", None)
+        return True
+    return False
 
 
 def _state_file(folder: TrialFolder, options: Mapping[str, Any]) -> Path:

@@ -59,36 +59,44 @@ class FusedStep:
     step by autograd and `CpuAdam`.
     """
 
+    applies_adam = True
+
     def __init__(self, rasterizer: CpuRasterizer, loss: CompiledLoss, background: Tensor) -> None:
         self._rasterizer, self._loss, self._background = rasterizer, loss, background
 
-    def __call__(
+    def step(
         self,
-        model: TrainableGaussians,
+        gaussians: TrainableGaussians,
         camera: Camera,
         target: Tensor,
-        sh_degree: int,
-        absolute_gradient: bool,
+        degree: int,
+        absolute: bool,
+        extra: str | None = None,
+        mask: Tensor | None = None,
+        regularizer: Tensor | None = None,
     ) -> tuple[RenderOutput, Tensor]:
-        """Step towards ``target`` [H, W, 3]; return the render, and loss, L1 and SSIM [3].
+        """See `gsbench.train.trainer.FastStep`; the last three arguments must be None.
 
         Raises ValueError, which names the parameter, for a parameter that is out of range.
         """
-        values = model.values.detach()
-        check_settings(values, camera, sh_degree, self._background)
+        values = gaussians.values.detach()
+        check_settings(values, camera, degree, self._background)
         points = torch.zeros_like(values.means[:, :2], requires_grad=True)
-        absolute = torch.zeros_like(points) if absolute_gradient else None
-        request = RenderRequest(camera, sh_degree, self._background, absolute, None, Lifetime())
+        summed = torch.zeros_like(points) if absolute else None
+        request = RenderRequest(camera, degree, self._background, summed, None, Lifetime())
         image, alpha, radii, passed = self._rasterizer.forward(values, request)
         similarity, l1, g_image = self._loss.compute(image, target, differentiate=True)
         assert g_image is not None
-        states = model.count_step()
+        states = gaussians.count_step()
         adam = AdamStep(
             parameter_arrays(Gaussians(*(state.first for state in states))),
             parameter_arrays(Gaussians(*(state.second for state in states))),
             np.array([state.factors for state in states], np.float32),
-            3 * ((sh_degree + 1) ** 2 - 1),
+            3 * ((degree + 1) ** 2 - 1),
         )
         points.grad = self._rasterizer.backward_and_step(passed, values, request, g_image, adam)
         scalars = torch.tensor([self._loss.total(l1, similarity), l1, similarity])
-        return RenderOutput(image, alpha, radii, points, absolute), scalars
+        return RenderOutput(image, alpha, radii, points, summed), scalars
+
+    def optimize(self, gaussians: TrainableGaussians) -> None:
+        """Do nothing: `step` has applied Adam."""

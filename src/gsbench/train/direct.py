@@ -16,7 +16,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable
-from functools import partial
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import torch
@@ -49,14 +49,6 @@ MOST_SIZES = 4  # of images; each has memory of its own
 FACTORS_KEPT = 4
 
 
-class Differentiated(NamedTuple):
-    """Results of a training step before Adam. The next step overwrites their memory."""
-
-    render: RenderOutput  # ``screen_points.grad`` is filled
-    losses: Tensor  # [3] loss, L1, SSIM; [4] with a regulariser: the loss plus it
-    known: KnownGradients
-
-
 class Shape(NamedTuple):
     """The properties that two steps with the same launches share, besides the parameters."""
 
@@ -71,11 +63,13 @@ class Shape(NamedTuple):
 
 
 class DirectStep:
-    """Renders, measures and differentiates training views; applies Adam.
+    """Renders, measures and differentiates training views; applies Adam (`trainer.FastStep`).
 
     ``graphs`` turns recording on; without it, the same launches are made one by one. With
     ``visible_only``, Adam updates visible Gaussians only.
     """
+
+    applies_adam = False
 
     def __init__(
         self,
@@ -85,17 +79,17 @@ class DirectStep:
         graphs: bool,
         visible_only: bool = False,
     ) -> None:
-        self.rasterizer = rasterizer
-        self.loss = loss
-        self.background = background
-        self.graphs = graphs
-        self.visible_only = visible_only
+        self.rasterizer, self.loss, self.background = rasterizer, loss, background
+        self.graphs, self.visible_only = graphs, visible_only
         self.repeats = 0  # renders that were repeated because lists had too little room
         self._memory: dict[tuple[int, int], _Memory] = {}
         self._plan: dict[tuple[int, int], _Plan] = {}
         self._last: _Plan | None = None
         self._cameras: dict[int, tuple[Camera, Tensor]] = {}
-        self._pool: _GraphPool | None = None
+
+    @cached_property
+    def pool(self) -> _GraphPool:
+        return _GraphPool()
 
     def step(
         self,
@@ -107,11 +101,11 @@ class DirectStep:
         extra: str | None,
         mask: Tensor | None = None,
         regularizer: Tensor | None = None,
-    ) -> Differentiated:
+    ) -> tuple[RenderOutput, Tensor]:
         """Render ``camera``, and differentiate the loss against ``target`` [H, W, 3].
 
-        Pixels where ``mask`` [H, W, 1] is False do not count. ``regularizer`` [], a function of the
-        parameters, is added to the loss; only its gradient is computed by autograd. Raises
+        Pixels where ``mask`` [H, W, 1] is False do not count. Only the gradient of ``regularizer``
+        is computed by autograd. The next step overwrites the memory of the results. Raises
         ValueError for bad values of parameters.
         """
         size = camera.width, camera.height
@@ -123,28 +117,15 @@ class DirectStep:
         if plan is None or not plan.suits(gaussians, shape):
             self._plan.pop(size, None)  # first free the memory of its graphs
             self._last = None
-            plan = _Plan(self, gaussians, camera, shape, memory)
-            self._plan[size] = plan
+            plan = self._plan[size] = _Plan(self, gaussians, camera, shape, memory)
         self._last = plan
-        plan.camera = camera
-        # A graph always reads the same memory, so what differs from step to step is copied to it.
-        plan.view.copy_(self._numbers(camera), non_blocking=True)
-        plan.target.copy_(target, non_blocking=True)
-        if plan.mask is not None and mask is not None:
-            plan.mask.copy_(mask)
-        elif plan.mask is not None:  # other views of this size have one
-            plan.mask.fill_(True)
-        for own, gradient in zip(plan.further, further, strict=True):
-            if own is not None and gradient is not None:
-                own.copy_(gradient)
+        plan.take(camera, self._numbers(camera), target, mask, further)
         with torch.cuda.device_of(self.background):
-            while not plan.run():
-                self.repeats += 1
-        found = plan.result()
+            plan.run()
         if regularizer is None:
-            return found
-        total = found.losses[0] + regularizer.detach()
-        return found._replace(losses=torch.cat([found.losses.to(total), total.view(1)]))
+            return plan.render(), plan.losses
+        total = plan.losses[0] + regularizer.detach()
+        return plan.render(), torch.cat([plan.losses.to(total), total.view(1)])
 
     def optimize(self, gaussians: TrainableGaussians) -> None:
         """Apply Adam with the gradients of the last step; replaced parameters are left out."""
@@ -152,8 +133,8 @@ class DirectStep:
         assert plan is not None, "optimize follows step"
         states = gaussians.advance(plan.known)
         # After a refinement, a graph would write to the parameters that were replaced.
-        if plan.suits(gaussians, plan.shape) and plan.adam_graph is not None:
-            plan.replay_adam()
+        if plan.recorded is not None and plan.suits(gaussians, plan.shape):
+            plan.replay_adam(plan.recorded.adam)
         else:
             gaussians.apply(plan.known, states)
 
@@ -171,11 +152,6 @@ class DirectStep:
             del self._memory[oldest]
             self._plan.pop(oldest, None)
         return memory
-
-    def graph_pool(self) -> _GraphPool:
-        if self._pool is None:
-            self._pool = _GraphPool()
-        return self._pool
 
     def _numbers(self, camera: Camera) -> Tensor:
         """The numbers of ``camera`` on the device; kept, since training views come back."""
@@ -208,60 +184,69 @@ class _Memory:
         self.room: Room | None = None  # None: not known yet
 
     def allocate(self, name: str, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+        """The tensor called ``name``, always at the same place, until it grows."""
         return self.outputs.take(name, math.prod(shape), dtype).view(shape)
 
 
+Graph = Callable[[], None]  # replays its launches
+
+
+class Phases(NamedTuple):
+    """A step in three parts: up to the sizes of the lists, up to the gradients, and Adam."""
+
+    project: Graph
+    composite: Graph
+    adam: Graph
+
+
 class _Plan:
-    """The launches of steps with the same parameters and `Shape`, and their graphs, if recorded."""
+    """The `Phases` of steps with the same parameters and `Shape`, launched or recorded."""
 
     def __init__(
         self,
-        step: DirectStep,
+        owner: DirectStep,
         gaussians: TrainableGaussians,
         camera: Camera,
         shape: Shape,
         memory: _Memory,
     ) -> None:
-        self.owner, self.shape, self.memory = step, shape, memory
-        self.camera = camera  # of the current step
+        self.owner, self.shape, self.memory, self.camera = owner, shape, memory, camera
         self.parameters = list(gaussians.values.tensors().values())
+        self.states = list(gaussians.adam.values())
         self.values = gaussians.values.detach()
-        step.rasterizer.check(self.values)
-        self.adam = list(gaussians.adam.values())
+        owner.rasterizer.check(self.values)
         count, allocate = len(self.values), memory.allocate
+        # inputs of a step: a graph always reads the same memory, so they are copied to it
         size = camera.height, camera.width
         self.view = allocate("view", (len(CameraNumbers._fields),), torch.float32)
         self.target = allocate(f"target_{shape.target}", (*size, 3), shape.target)
-        mask = (*size, 1)
-        self.mask = allocate("mask", mask, torch.bool) if shape.masked else None
-        self.one = allocate("one", (), torch.float32).fill_(1.0)
-        self.losses = allocate("losses", (3,), torch.float32)
-        self.g_image = allocate("g_image", (*size, 3), torch.float32)
-        absolute = allocate("g_absolute", (count, 2), torch.float32) if shape.absolute else None
-        self.gradients = [
-            allocate(f"g_{name}", tuple(tensor.shape), torch.float32)
-            for name, tensor in self.values.tensors().items()
-        ]
+        self.mask = allocate("mask", (*size, 1), torch.bool) if shape.masked else None
+        shapes = {name: tuple(tensor.shape) for name, tensor in self.values.tensors().items()}
         self.further = [
-            allocate(f"further_{name}", tuple(tensor.shape), torch.float32) if wanted else None
-            for (name, tensor), wanted in zip(
-                self.values.tensors().items(), shape.further, strict=True
-            )
+            allocate(f"further_{name}", shapes[name], torch.float32) if wanted else None
+            for name, wanted in zip(shapes, shape.further, strict=True)
         ]
         self.factors = allocate("factors", (len(self.parameters), 2), torch.float32)
         self.factors_on_host = torch.empty(
             (FACTORS_KEPT, *self.factors.shape), pin_memory=memory.device.type == "cuda"
         )
+        # results, which the next step overwrites
+        self.losses = allocate("losses", (3,), torch.float32)
+        self.one = allocate("one", (), torch.float32).fill_(1.0)
+        self.g_image = allocate("g_image", (*size, 3), torch.float32)
+        self.gradients = [allocate(f"g_{name}", own, torch.float32) for name, own in shapes.items()]
+        absolute = allocate("g_absolute", (count, 2), torch.float32) if shape.absolute else None
         self.request = RenderRequest(
-            camera, shape.degree, step.background, absolute, shape.extra, Lifetime()
+            camera, shape.degree, owner.background, absolute, shape.extra, Lifetime()
         )
         self.screen_points = torch.zeros_like(self.values.means[:, :2], requires_grad=True)
-        self.probe = make_probe(step.rasterizer, shape.extra, self.values.means)
-        self.runs = 0
-        self.started: Started | None = None
-        self.finished: tuple[Tensor, Tensor, Tensor, TritonFrame] | None = None
-        self.render_graphs: tuple[Graph, Graph] | None = None
-        self.adam_graph: Graph | None = None
+        self.probe = make_probe(owner.rasterizer, shape.extra, self.values.means)
+        # The first step compiles kernels and allocates memory, which must not be recorded.
+        self.warm = False
+        self.recorded: Phases | None = None
+        # of the last phases
+        self.started: Started
+        self.finished: tuple[Tensor, Tensor, Tensor, TritonFrame]
         self.known: KnownGradients
 
     def suits(self, gaussians: TrainableGaussians, shape: Shape) -> bool:
@@ -274,77 +259,88 @@ class _Plan:
             own is now for own, now in zip(self.parameters, current, strict=True)
         )
 
-    def run(self) -> bool:
-        """Render and differentiate; False if lists had too little room, so it must be repeated."""
+    def take(
+        self,
+        camera: Camera,
+        numbers: Tensor,
+        target: Tensor,
+        mask: Tensor | None,
+        further: list[Tensor | None],
+    ) -> None:
+        """Copy what differs from step to step to the memory that the launches read."""
+        self.camera = camera
+        self.view.copy_(numbers, non_blocking=True)
+        self.target.copy_(target, non_blocking=True)
+        if self.mask is not None and mask is not None:
+            self.mask.copy_(mask)
+        elif self.mask is not None:  # other views of this size have one
+            self.mask.fill_(True)
+        for own, gradient in zip(self.further, further, strict=True):
+            if own is not None and gradient is not None:
+                own.copy_(gradient)
+
+    def run(self) -> None:
+        """Render and differentiate; again, with more room, while the lists do not fit."""
         if self.memory.room is None:
             self._measure_room()
-        self.runs += 1
-        # The first step compiles kernels and allocates memory, which must not be recorded.
-        if self.runs == 2 and self.owner.graphs:
-            self._record()
-        first, second = self.render_graphs or (self._first, self._second)
-        first()
-        sizes = Readback(self._status)
-        second()
-        units, pairs, bad = sizes.values().tolist()
-        if bad:
-            raise_for_values(self.values, self.owner.background)
-        room = self.memory.room
-        assert room is not None
-        if units <= room.units and pairs <= room.pairs:
-            return True
-        # If the units had no room, the number of pairs is not known, but is larger.
-        self._make_room(units, max(pairs, room.pairs))
-        return False
+        while True:
+            if self.warm and self.recorded is None and self.owner.graphs:
+                self._record()
+            self.warm = True
+            phases = self.recorded or self._phases
+            phases.project()
+            sizes = Readback(self.started.units.status)
+            phases.composite()
+            units, pairs, bad = sizes.values().tolist()
+            if bad:
+                raise_for_values(self.values, self.owner.background)
+            room = self._room
+            if units <= room.units and pairs <= room.pairs:
+                return
+            # If the units had no room, the number of pairs is not known, but is larger.
+            self._make_room(units, max(pairs, room.pairs))
+            self.owner.repeats += 1
 
-    def result(self) -> Differentiated:
-        assert self.finished is not None
+    def render(self) -> RenderOutput:
         image, alpha, radii, frame = self.finished
         # The plan's own request has the camera of its first step.
         request = self.request._replace(camera=self.camera)
         footprint = partial(self.owner.rasterizer.footprint, frame, self.values, request)
-        render = RenderOutput(
-            image,
-            alpha,
-            radii,
-            self.screen_points,
-            self.request.absolute,
-            footprint,
-            self.probe,
-        )
-        return Differentiated(render, self.losses, self.known)
+        absolute, probe = self.request.absolute, self.probe
+        return RenderOutput(image, alpha, radii, self.screen_points, absolute, footprint, probe)
 
-    def replay_adam(self) -> None:
-        """Apply the recorded Adam with the present rates and step counts."""
-        assert self.adam_graph is not None
-        host = self.factors_on_host[self.adam[0].step % FACTORS_KEPT]
-        host.numpy()[:] = [one.factors for one in self.adam]
+    def replay_adam(self, adam: Graph) -> None:
+        """Apply the recorded ``adam`` with the present rates and step counts."""
+        host = self.factors_on_host[self.states[0].step % FACTORS_KEPT]
+        host.numpy()[:] = [state.factors for state in self.states]
         self.factors.copy_(host, non_blocking=True)
-        self.adam_graph()
+        adam()
 
     @property
-    def _status(self) -> Tensor:
-        assert self.started is not None
-        return self.started.units.status
+    def _phases(self) -> Phases:
+        return Phases(self._project, self._composite, self._adam)
 
-    def _first(self) -> None:
-        room = self.memory.room
+    @property
+    def _room(self) -> Room:
+        assert self.memory.room is not None
+        return self.memory.room
+
+    def _project(self) -> None:
+        room, memory = self.memory.room, self.memory
         capacity = UNITS_AT_FIRST * len(self.values) if room is None else room.units
         self.started = self.owner.rasterizer.start(
             self.values,
             self.request,
             self.view,
-            self.memory.kept,
-            self.memory.scratch,
+            memory.kept,
+            memory.scratch,
             max(capacity, 1),
-            self.memory.allocate,
+            memory.allocate,
         )
 
-    def _second(self) -> None:
+    def _composite(self) -> None:
         rasterizer, loss, memory = self.owner.rasterizer, self.owner.loss, self.memory
-        assert self.started is not None
-        assert memory.room is not None
-        self.finished = rasterizer.finish(self.started, memory.room)
+        self.finished = rasterizer.finish(self.started, self._room)
         image, _, radii, frame = self.finished
         image = replace_ignored(image, self.target, self.mask)
         measured = loss.measure(image, self.target, self.losses, memory.scratch, True)
@@ -364,29 +360,26 @@ class _Plan:
         self.screen_points.grad = found.screen
         if self.probe is not None:
             self.probe.grad = found.extra
-        seen = frame.projected.row_counts
         self.known = KnownGradients(
             self.parameters,
             self.gradients,
             self.further,
-            seen,
+            frame.projected.row_counts,
             radii if self.owner.visible_only else None,
             self.shape.degree,
         )
 
-    def _third(self) -> None:
-        updates = self.known.updates(self.adam)
+    def _adam(self) -> None:
+        updates = self.known.updates(self.states)
         known = self.known
         TritonAdam().launch(updates, self.factors[: len(updates)], known.seen, known.visible)
 
     def _measure_room(self) -> None:
         """Find the sizes of the lists of this view, and make room for them."""
-        self._first()
+        self._project()
         while True:
-            units, pairs, _ = Readback(self._status).values().tolist()
-            assert self.started is not None
-            capacity = len(self.started.units.widths)
-            if units <= capacity:
+            units, pairs, _ = Readback(self.started.units.status).values().tolist()
+            if units <= len(self.started.units.widths):
                 break
             self.started.find_units(2 * units)
         self._make_room(units, pairs)
@@ -398,16 +391,12 @@ class _Plan:
             max(known.units, int(MARGIN * units) + 1), max(known.pairs, int(MARGIN * pairs) + 1)
         )
         # The graphs launch with the old room. The next step may allocate: it is not recorded yet.
-        self.render_graphs = self.adam_graph = None
-        self.runs = 0
+        self.recorded, self.warm = None, False
 
     def _record(self) -> None:
-        """Record the launches. If CUDA refuses, steps are never recorded again."""
-        pool = self.owner.graph_pool()
+        """Record the phases. If CUDA refuses, steps are never recorded again."""
         try:
-            first, second = pool.record(self._first), pool.record(self._second)
-            self.adam_graph = pool.record(self._third)
-            self.render_graphs = first, second
+            self.recorded = Phases(*map(self.owner.pool.record, self._phases))
         except torch.OutOfMemoryError:
             raise
         except RuntimeError as error:
@@ -416,10 +405,6 @@ class _Plan:
                 str(error).strip().splitlines()[0],
             )
             self.owner.graphs = False
-            self.render_graphs = self.adam_graph = None
-
-
-Graph = Callable[[], None]  # replays it
 
 
 class _GraphPool:

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from gsbench.raster import Rasterizer
-from gsbench.system.compile_clock import CLOCK
+from gsbench.system.resources import CLOCK
 
 log = logging.getLogger(__name__)
 

@@ -56,6 +56,14 @@ def _blur_row(source, start, target, place, numbers):
 
 
 @inlined
+def _clear_slot(ring, slot, length, part, maps):
+    """Set a row of a ring of ``maps`` to 0: it is outside the image."""
+    for m in range(maps):
+        for i in range(0, length, LANES):
+            store(ring, m * part + slot + i, splat(ZERO))
+
+
+@inlined
 def _blur_column(ring, first, i, row, stride):
     """Filter the ring vertically around ``row``, for 16 numbers from number ``i`` of the row.
 
@@ -139,9 +147,7 @@ def similarity_rows(memory, begin, end, height, width, image, target, divisor, d
             for m in range(MAPS):
                 _blur_row(memory, m * padded, ring, m * part + slot, numbers)
         else:
-            for m in range(MAPS):
-                for i in range(0, length, LANES):
-                    store(ring, m * part + slot + i, splat(ZERO))
+            _clear_slot(ring, slot, length, part, MAPS)
         center = row - WINDOW_RADIUS
         if center < begin:
             continue
@@ -211,12 +217,11 @@ def gradient_rows(
         store(memory, i, splat(ZERO))
     for row in range(begin - WINDOW_RADIUS, end + WINDOW_RADIUS):
         slot = (row + TAPS) % TAPS * length
-        for m in range(3):
-            if 0 <= row < height:
+        if 0 <= row < height:
+            for m in range(3):
                 _blur_row(derivatives, (m * height + row) * padded, ring, m * part + slot, numbers)
-            else:
-                for i in range(0, length, LANES):
-                    store(ring, m * part + slot + i, splat(ZERO))
+        else:
+            _clear_slot(ring, slot, length, part, 3)
         center = row - WINDOW_RADIUS
         if center < begin:
             continue

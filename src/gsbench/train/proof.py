@@ -16,7 +16,7 @@ import logging
 import math
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -85,32 +85,35 @@ def prove(
     departure ends the proof, since the next comparison would only repeat it. It takes seconds,
     besides the compilation of the kernels.
     """
-    started = time.perf_counter()
+    started, chosen = time.perf_counter(), loss or PhotometricLoss()
     errors: list[Error] = []
-    broken: list[str] = []
-
-    def sound() -> bool:
-        return not any(error.is_departure for error in errors)
-
+    failures: list[str] = []
+    comparisons: list[Callable[[], list[Error]]] = [
+        lambda: [error for case in scenes for error in measure(rasterizer, case, str(device))],
+        lambda: _repeat_errors(rasterizer, device, scenes),
+        lambda: _training_errors(rasterizer, device, scenes[0], chosen),
+    ]
     try:
-        _compile_for_gpu(rasterizer, device)
-        for case in scenes:
-            errors += measure(rasterizer, case, str(device))
-        if sound() and find_executor(rasterizer.name).same_bits:
-            errors += _repeat_errors(rasterizer, device, scenes)
-        if sound():
-            errors += _training_errors(rasterizer, device, scenes[0], loss or PhotometricLoss())
+        for compare in comparisons:
+            errors += compare()
+            failures += [str(error) for error in errors if error.is_departure]
+            if failures:
+                break
     except (torch.OutOfMemoryError, InputError):
         raise
     except Exception as error:  # noqa: BLE001
         # Whatever a compiler or a driver raises is the result of the proof.
         reason, *_ = str(error).strip().splitlines() or [""]
-        broken.append(f"{type(error).__name__}: {reason}")
-    failures = [str(error) for error in errors if error.is_departure] + broken
+        failures.append(f"{type(error).__name__}: {reason}")
     largest: dict[str, float] = {}
     for found in errors:
         if math.isfinite(found.off):
             largest[found.quantity] = max(largest.get(found.quantity, 0.0), found.off)
+    direct_fault = ""
+    if rasterizer.name == "triton" and not failures:
+        from gsbench.train import direct_proof  # it imports Triton
+
+        direct_fault = direct_proof.direct_fault(rasterizer, device, scenes[-1])
     return RasterProof(
         raster=rasterizer.name,
         device=_device_name(device),
@@ -118,36 +121,16 @@ def prove(
         errors=largest,
         failures=failures,
         seconds=round(time.perf_counter() - started, 1),
-        direct_fault="" if failures else _direct_fault(rasterizer, device, scenes[-1]),
+        direct_fault=direct_fault,
     )
-
-
-def _compile_for_gpu(rasterizer: Rasterizer, device: torch.device) -> None:
-    """Compile Triton's kernels for a GPU side by side."""
-    if rasterizer.name == "triton" and device.type == "cuda":
-        from gsbench.raster.triton.executor import TritonRasterizer
-        from gsbench.train.compile_ahead import compile_ahead
-
-        if isinstance(rasterizer, TritonRasterizer):
-            compile_ahead(rasterizer, device)
-
-
-def _direct_fault(rasterizer: Rasterizer, device: torch.device, case: Case) -> str:
-    """`direct_fault` of an executor that has direct steps, "" for others."""
-    if rasterizer.name != "triton":
-        return ""
-    # They import Triton.
-    from gsbench.raster.triton.executor import TritonRasterizer
-    from gsbench.train.direct_proof import direct_fault
-
-    if not isinstance(rasterizer, TritonRasterizer):
-        return ""
-    return direct_fault(rasterizer, device, case)
 
 
 def _repeat_errors(
     rasterizer: Rasterizer, device: torch.device, scenes: tuple[Case, ...]
 ) -> list[Error]:
+    """The tensors whose bits differ in a second run, if the same bits are promised."""
+    if not find_executor(rasterizer.name).same_bits:
+        return []
     first = [_bits(rasterizer, case, str(device)) for case in scenes]
     # The second run is after all scenes, so that it reuses memory.
     again = [_bits(rasterizer, case, str(device)) for case in scenes]

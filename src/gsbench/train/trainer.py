@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from inspect import signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -27,8 +27,8 @@ from gsbench.raster.executors import find_executor, lacks
 from gsbench.runs.layout import CURVES, EVENTS, HISTOGRAMS
 from gsbench.scene.beside import DEPTH, resized
 from gsbench.scene.types import Camera, Scene
-from gsbench.system.compile_clock import CLOCK
 from gsbench.system.device import free_bytes
+from gsbench.system.resources import CLOCK
 from gsbench.system.stopping import deferred, requested
 from gsbench.train.checkpoint import CheckpointWriter, load_checkpoint
 from gsbench.train.growth import GrowthWatch
@@ -47,10 +47,6 @@ from gsbench.train.records import PHOTOMETRIC, LossLog, append, drop_after, volu
 from gsbench.train.resolution import Resolution, ScaledViews
 from gsbench.train.views import CameraOrder, SceneViews, Targets, generators
 
-if TYPE_CHECKING:
-    from gsbench.train.adam_cpu import FusedStep
-    from gsbench.train.direct import DirectStep
-
 log = logging.getLogger(__name__)
 
 SHARE_FOR_IMAGES = 0.5  # of a GPU's free memory; the rest is for the model and its renders
@@ -64,6 +60,33 @@ class Status:
     loss: float
     num_gaussians: int
     iterations_per_second: float
+
+
+class FastStep(Protocol):
+    """Training steps without autograd, with the bits of those by autograd."""
+
+    applies_adam: bool  # within ``step``: nothing can look at the model between both
+
+    def step(
+        self,
+        gaussians: TrainableGaussians,
+        camera: Camera,
+        target: Tensor,
+        degree: int,
+        absolute: bool,
+        extra: str | None,
+        mask: Tensor | None = None,
+        regularizer: Tensor | None = None,
+    ) -> tuple[RenderOutput, Tensor]:
+        """Render ``camera`` and differentiate the loss; return the render and loss, L1, SSIM.
+
+        ``regularizer`` [] is added to the loss; its sum with it is a fourth number.
+        """
+        ...
+
+    def optimize(self, gaussians: TrainableGaussians) -> None:
+        """Apply Adam with the gradients of the last step, unless ``step`` has."""
+        ...
 
 
 class Trainer:
@@ -108,11 +131,10 @@ class Trainer:
         color = [*options.background]
         self.background = torch.tensor(color, dtype=torch.float32, device=self.device)  # [3]
         self.loss = PhotometricLoss(options.ssim_weight, torch.get_num_threads())
-        self.direct, step_all = fast_steps(rasterizer, self.loss, options, self.background)
-        self.fused = fused_step(rasterizer, self.loss, options, self.background)
-        self.stepped = False  # whether the fused step of this iteration has applied Adam
+        self.fast, step_all = fast_steps(rasterizer, self.loss, options, self.background)
+        self.used: FastStep | None = None  # by this iteration
         if ideas.reads_renders or ideas.optimizer is not None or self.needs_depth:
-            self.direct = self.fused = None  # such parts need autograd
+            self.fast = None  # such parts need autograd
         self.gaussians = TrainableGaussians(
             initial, options, scene.extent, step_all, ideas.optimizer
         )
@@ -264,8 +286,12 @@ class Trainer:
         cameras, targets = self.scaled_views.at(self.scale)
         target, mask = targets.get(index), targets.mask(index)
         regularizer = self.densifier.regularizer(self.gaussians.values)
-        if self.direct is not None:
-            step = self.direct.step(
+        self.used = self.fast
+        if self.fast is not None and self.fast.applies_adam:
+            free = regularizer is None and mask is None and self._nobody_looks()
+            self.used = self.fast if free else None
+        if self.used is not None:
+            return self.used.step(
                 self.gaussians,
                 cameras[index],
                 target,
@@ -275,12 +301,6 @@ class Trainer:
                 mask,
                 regularizer,
             )
-            return step.render, step.losses
-        free = self.fused is not None and regularizer is None and mask is None
-        self.stepped = free and self._nobody_looks()
-        if self.fused is not None and self.stepped:
-            wanted = self.densifier.needs_absolute_gradient
-            return self.fused(self.gaussians, cameras[index], target, self.sh_degree, wanted)
         render = self.render(index)
         depth_points = self._add_depth(render, cameras[index]) if self.needs_depth else None
         total, scalars = self._loss(render, index, replace_ignored(render.image, target, mask))
@@ -408,10 +428,8 @@ class Trainer:
         return not densifier.rules(Refinement(step, self.gaussians, self.rngs["densify"], event))
 
     def _optimize(self, render: RenderOutput) -> None:
-        if self.stepped:
-            return
-        if self.direct is not None:
-            self.direct.optimize(self.gaussians)
+        if self.used is not None:
+            self.used.optimize(self.gaussians)
             return
         self.gaussians.optimizer_step(
             self.sh_degree, render.visible if self.options.visible_adam else None
@@ -474,14 +492,25 @@ def snapshot_file(step: int) -> str:
 
 def fast_steps(
     rasterizer: Rasterizer, loss: PhotometricLoss, options: TrainConfig, background: Tensor
-) -> tuple["DirectStep | None", StepAll | None]:
-    """Make direct steps for a GPU, if they can be used, and compiled Adam; None without."""
-    device = background.device
-    if device.type == "cpu":
-        from gsbench.train.adam_cpu import CpuAdam
+) -> tuple[FastStep | None, StepAll | None]:
+    """Make fast steps, if rasterizer and loss are those that have them, and compiled Adam."""
+    device = background.device.type
+    if device == "cpu":
+        from gsbench.raster.cpu import CpuRasterizer
+        from gsbench.train.adam_cpu import CpuAdam, FusedStep
+        from gsbench.train.loss_cpu import CompiledLoss
 
-        return None, CpuAdam(torch.get_num_threads())
-    if device.type != "cuda" or find_executor("triton").obstacle(device.type) is not None:
+        adam = CpuAdam(torch.get_num_threads())
+        compiled = loss.implementation(device)
+        # a user's subclass may render otherwise
+        if (
+            type(rasterizer) is not CpuRasterizer
+            or not isinstance(compiled, CompiledLoss)
+            or options.visible_adam
+        ):
+            return None, adam
+        return FusedStep(rasterizer, compiled, background), adam
+    if device != "cuda" or find_executor("triton").obstacle(device) is not None:
         return None, None
     # They import Triton.
     from gsbench.raster.triton.executor import TritonRasterizer
@@ -489,32 +518,16 @@ def fast_steps(
     from gsbench.train.direct import DirectStep
     from gsbench.train.loss_triton import TritonLoss
 
-    kernels, direct = loss.implementation(device.type), None
+    kernels = loss.implementation(device)
     if (
-        type(rasterizer) is TritonRasterizer  # a user's subclass may render otherwise
-        and rasterizer.direct_steps
-        and isinstance(kernels, TritonLoss)
+        type(rasterizer) is not TritonRasterizer
+        or not rasterizer.direct_steps
+        or not isinstance(kernels, TritonLoss)
     ):
-        visible_only = options.visible_adam
-        direct = DirectStep(rasterizer, kernels, background, graphs=True, visible_only=visible_only)
+        return None, TritonAdam()
+    visible_only = options.visible_adam
+    direct = DirectStep(rasterizer, kernels, background, graphs=True, visible_only=visible_only)
     return direct, TritonAdam()
-
-
-def fused_step(
-    rasterizer: Rasterizer, loss: PhotometricLoss, options: TrainConfig, background: Tensor
-) -> "FusedStep | None":
-    """Make fused steps for the CPU, if rasterizer, loss and Adam are those that can be fused."""
-    if background.device.type != "cpu" or options.visible_adam:
-        return None
-    from gsbench.raster.cpu import CpuRasterizer
-    from gsbench.train.adam_cpu import FusedStep
-    from gsbench.train.loss_cpu import CompiledLoss
-
-    kernels = loss.implementation("cpu")
-    # a user's subclass may render otherwise
-    if type(rasterizer) is not CpuRasterizer or not isinstance(kernels, CompiledLoss):
-        return None
-    return FusedStep(rasterizer, kernels, background)
 
 
 def sh_degree_at(options: TrainConfig, step: int) -> int:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gsbench.errors import InputError
-from gsbench.launch.states import states_now
+from gsbench.launch.states import STATES, states_now
 from gsbench.runs.cleaning import Stored, free, stored
 from gsbench.runs.experiments import experiment_home, list_experiments, trial_folders
 from gsbench.runs.trial_folder import TrialFolder
@@ -15,7 +15,6 @@ from gsbench.verbs.arguments import ArgumentParser
 from gsbench.words import counted, readable_bytes
 
 UNITS = {"h": 3600.0, "d": 86_400.0, "w": 7 * 86_400.0}
-LET_GO = ("superseded", "failed", "partial")  # states of trials whose results may go
 
 
 def clean(argv: Sequence[str], runs: Path) -> int:
@@ -42,7 +41,7 @@ def clean(argv: Sequence[str], runs: Path) -> int:
     let_go = set[Path]()
     if options.experiment is not None:
         states = states_now(experiment_home(runs, options.experiment))
-        let_go = {trial.folder for trial in states if trial.state in LET_GO}
+        let_go = {trial.folder for trial in states if STATES[trial.state].freed}
     if running := [place for place in trials if is_held(TrialFolder(place).lock)]:
         raise InputError(
             f"{counted(len(running), 'trial')} of this runs folder run now, and may need what "

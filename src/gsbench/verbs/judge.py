@@ -34,21 +34,14 @@ def judge(argv: Sequence[str], runs: Path) -> int:
         return _declare(options)
     if options.results is None:
         raise InputError("judge needs RESULTS: a table (.csv) or a folder {arm}/{scene}/{seed}")
-    declared = None if options.declared is None else read_declared(options.declared)
-    if declared is not None:
-        _require_as_declared(options, declared)
+    if options.declared is not None:
+        asked = read_declared(options.declared)
+        _require_as_declared(options, asked)
     elif options.baseline is None:
         raise InputError("judge needs --baseline NAME, one of the methods")
-    frame = _frame(options, declared.metric if declared else options.metric)
-    comparison = compare_methods(
-        frame,
-        declared.baseline if declared else options.baseline,
-        declared.metric if declared else options.metric,
-        declared.least if declared else options.least,
-        DIRECTIONS[(declared.better if declared else options.better) or ""],
-        declared,
-        options.results.stem,
-    )
+    else:
+        asked = _asked(options)
+    comparison = compare_methods(_frame(options), asked, options.results.stem)
     if options.json:
         print(json.dumps(comparison.to_json(), indent=1))
     else:
@@ -116,12 +109,9 @@ def _declare(options: argparse.Namespace) -> int:
         raise InputError(f"judge --declare needs {listed(lacking)}, too")
     if options.results is not None or options.declared is not None:
         raise InputError("judge --declare comes before the results: leave them out")
-    asked = Declared(
-        baseline=options.baseline,
+    asked = replace(
+        _asked(options),
         methods=options.methods,
-        metric=options.metric,
-        better=options.better or "",
-        least=options.least,
         scenes=options.scenes,
         seeds=tuple(options.seeds),
     )
@@ -129,6 +119,15 @@ def _declare(options: argparse.Namespace) -> int:
     trials = (1 + len(asked.methods)) * len(asked.scenes) * len(asked.seeds)
     print(f"{options.declare}: {counted(len(asked.methods), 'question')}, {trials} trainings")
     return 0
+
+
+def _asked(options: argparse.Namespace) -> Declared:
+    return Declared(
+        baseline=options.baseline,
+        metric=options.metric,
+        better=options.better or "",
+        least=options.least,
+    )
 
 
 def _require_as_declared(options: argparse.Namespace, declared: Declared) -> None:
@@ -143,7 +142,7 @@ def _require_as_declared(options: argparse.Namespace, declared: Declared) -> Non
             )
 
 
-def _frame(options: argparse.Namespace, metric: str) -> "pd.DataFrame":
+def _frame(options: argparse.Namespace) -> "pd.DataFrame":
     """The table of results; that of a folder is measured now."""
     import pandas as pd  # here, since it is slow to import
 

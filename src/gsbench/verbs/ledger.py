@@ -3,45 +3,62 @@
 import argparse
 import json
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from gsbench.analysis.ledger_table import describe_ledger, difference_text, ledger_tables, why
 from gsbench.analysis.results import read_experiment
-from gsbench.analysis.table_formats import to_markdown
+from gsbench.analysis.sentences import sentence
 from gsbench.analysis.verdicts import judge
 from gsbench.app.command import run_trials
 from gsbench.app.ledger_trials import (
     Trials,
     check_words,
     compose_words,
-    keys_by_scene,
+    digests_of,
     merged,
     permitted_words,
     seeds_of,
 )
-from gsbench.claims import ledger as rules
 from gsbench.claims.gate import asked_difference
-from gsbench.claims.ledger import IDEAS, RATE
-from gsbench.claims.stopping import Needed, finished_trials
+from gsbench.claims.ledger import (
+    CHOOSES,
+    DROPPED,
+    FAILED,
+    IDEAS,
+    KEPT,
+    RATE,
+    Book,
+    read_ledger,
+    result_of,
+)
+from gsbench.claims.stopping import Needed, SequentialTest, finished_trials
 from gsbench.config.overrides import key_of
 from gsbench.errors import GsbenchError, InputError
 from gsbench.eval.options import EvalConfig
 from gsbench.files import checked_runs_folder, make_runs_folder
-from gsbench.runs import ledger as records
-from gsbench.runs.commands import Question
+from gsbench.runs.commands import (
+    BASELINE,
+    CONFIRMATION,
+    ERROR_RATE,
+    Command,
+    History,
+    Idea,
+    Ledger,
+    Question,
+    append,
+    command_now,
+)
 from gsbench.runs.config_hash import config_hash
-from gsbench.runs.experiments import make_home, stamp_now
-from gsbench.runs.layout import IN_RUNS, LEDGER
-from gsbench.runs.ledger import BASELINE, DROPPED, FAILED, KEPT, UNDECIDED, Ledger
+from gsbench.runs.layout import IN_RUNS
 from gsbench.settings import OpenFraction, is_folder_name
 from gsbench.verbs.arguments import ArgumentParser, names, number, whole_number
 from gsbench.words import did_you_mean, listed
 
-EXIT_CODES = {KEPT: 0, DROPPED: 1, FAILED: 1, UNDECIDED: 3}
+EXIT_CODES = {KEPT: 0, DROPPED: 1, FAILED: 1}
+UNDECIDED_CODE = 3
 MOST_IDEAS = 10_000
-
 
 log = logging.getLogger(__name__)
 
@@ -51,11 +68,11 @@ def ledger(argv: Sequence[str], runs: Path) -> int:
     options = _parser().parse_args(argv)
     if not is_folder_name(options.name) or options.name in IN_RUNS:
         raise InputError(f"ledger: {options.name!r} cannot be the name of an experiment")
-    action, taken = ACTIONS[options.action]
-    for option, flag in FLAGS.items():
-        if getattr(options, option) and option not in taken:
+    for flag, actions, how in OPTIONS:
+        given = getattr(options, how.get("dest") or flag.lstrip("-"))
+        if given and options.action not in actions:
             raise InputError(f"ledger {options.action} takes no {flag}")
-    return action(options, runs / options.name)
+    return ACTIONS[options.action](options, runs / options.name)
 
 
 def _parser() -> ArgumentParser:
@@ -68,325 +85,264 @@ def _parser() -> ArgumentParser:
     )
     parser.add_argument("action", choices=list(ACTIONS))
     parser.add_argument("name", help="the ledger, which is an experiment in the runs folder")
-    parser.add_argument("settings", nargs="*", metavar="KEY=VALUE", help="as of a sweep")
-    parser.add_argument("--metric", help="new: decides, such as lpips_squeeze (psnr)")
-    parser.add_argument(
-        "--least", help="new: the least difference that matters, as 0.1 or 10%% (the metric's)"
-    )
-    parser.add_argument(
-        "--ideas",
-        type=whole_number(MOST_IDEAS),
-        help=f"new: the most ideas that will be tried ({IDEAS})",
-    )
-    parser.add_argument(
-        "--fdr",
-        type=number(OpenFraction),
-        help=f"new: the false discovery rate, from 0 to 1 ({RATE})",
-    )
-    parser.add_argument("--against", help="try: a kept idea to start from (default: the baseline)")
-    parser.add_argument("--as", dest="idea", help="try: the idea's name (default: densify.name)")
-    parser.add_argument("--only", type=names, help="confirm: these ideas (default: all kept)")
-    parser.add_argument("--json", action="store_true", help="try, show: print JSON")
+    for flag, actions, how in OPTIONS:
+        words = f"{', '.join(actions)}: {how['help']}"
+        parser.add_argument(flag, **how | {"help": words})
     return parser
 
 
 def new(options: argparse.Namespace, home: Path) -> int:
     """Declare a ledger; the same command again changes nothing."""
-    trials = compose_words(options.name, options.settings, options.settings)
-    keys, seeds = keys_by_scene(trials, options.name), seeds_of(trials)
+    trials = compose_words(home.name, options.settings, options.settings)
+    baseline = _idea(BASELINE, trials, options.settings)
     values = next(iter(trials.values())).values
     metric = options.metric or "psnr"
     sign, least = asked_difference(metric, options.least, values)
     EvalConfig(**values["eval"] | {"primary": metric})  # raises if it is not computed
-    opened = records.Opened(
-        time=stamp_now(),
+    opened = Ledger(
         metric=metric,
         sign=1 if sign > 0 else -1,
         least=least.size,
         relative=least.relative,
         ideas=options.ideas or IDEAS,
         rate=options.fdr or RATE,
-        seeds=seeds,
-        words=tuple(options.settings),
-        keys=keys,
+        seeds=seeds_of(trials),
     )
+
+    def make(history: History) -> Command | None:
+        if history.ledger is None:
+            if read_experiment(home).trials:
+                raise InputError(f"{home.name} has trials already: give the ledger another name")
+            return command_now(ledger=opened, idea=baseline)
+        if (history.ledger, history.ideas[BASELINE]) != (opened, baseline):
+            raise InputError(f"{home.name} is another ledger already: give this one another name")
+        return None
+
     make_runs_folder(checked_runs_folder(str(home.parent)))
-    if home.is_dir() and not (home / LEDGER).exists() and read_experiment(home).trials:
-        raise InputError(f"{home.name} has trials already: give the ledger another name")
-    make_home(home)
-    begun = records.begin_ledger(home, opened)
-    if begun.opened.to_json() | {"time": ""} != opened.to_json() | {"time": ""}:
-        raise InputError(f"{home.name} is another ledger already: give this one another name")
-    print("\n".join(describe_ledger(begun)))
+    append(home, make)
+    print("\n".join(read_ledger(home).describe()))
     return 0
+
+
+def _idea(name: str, trials: Trials, words: Sequence[str], against: str = "") -> Idea:
+    """An idea with these trials; under another name it is the same one."""
+    values = next(iter(trials.values())).values
+    nameless = values | {part: values[part] | {"name": ""} for part in ("init", "densify")}
+    return Idea(
+        name=name,
+        identity=config_hash(nameless),
+        words=tuple(words),
+        digests=digests_of(trials, name),
+        against=against,
+    )
 
 
 def try_idea(options: argparse.Namespace, home: Path) -> int:
     """Run one idea until it is decided; an idea that was decided before is only shown."""
-    book = records.read_ledger(home)
-    rules.check_unknown_trials(book, read_experiment(home).trials)
+    book, typed = read_ledger(home), options.settings
     against = options.against or BASELINE
-    if against != BASELINE and against not in book.kept:
+    if against not in (BASELINE, *book.kept):
         kept = listed([BASELINE, *book.kept])
         raise InputError(
             f"--against {against}: it must be one of {kept}{did_you_mean(against, book.kept)}"
         )
-    check_words(options.settings)
-    start = permitted_words(book, against, options.settings)
-    trials = compose_words(home.name, start, options.settings)
+    check_words(typed)
+    start = permitted_words(book.ideas[against], typed)
+    words = merged(start, typed)
+    baseline, of_idea = (compose_words(home.name, own, typed) for own in (start, words))
     # The idea's new seeds need new trials of the baseline, so it must be what it was.
-    if keys_by_scene(trials, home.name) != book.keys_of(against):
+    if digests_of(baseline, against) != book.ideas[against].digests:
         raise InputError(
             f"the settings or the code of {against} have changed since its trials ran: bring them "
             "back"
         )
-    words = merged(start, options.settings)
-    of_idea = compose_words(home.name, words, options.settings)
-    idea, book = _start(home, of_idea, against, options)
+    name = options.idea or next(iter(of_idea.values())).values["densify"]["name"]
+    idea = _begin(home, _idea(name, of_idea, words, against), is_named=bool(options.idea))
+    book, fails = read_ledger(home), ""
     if not book.is_decided(idea) and idea not in book.tests:
-        book = _screen(home, book, idea, trials | of_idea)
+        fails = _train(book.screening(book.ideas[idea]), baseline | of_idea)
+        append(home, lambda history: _promotion(history, home, idea))
+        book = read_ledger(home)
     if not book.is_decided(idea) and idea in book.tests:
-        seeds = [f"seed={','.join(map(str, book.tests[idea].seeds))}"]
-        baseline, new = (
-            compose_words(home.name, merged(side, seeds), options.settings)
-            for side in (start, words)
+        test = book.tests[idea]
+        seeds = next(iter(test.seeds.values()))
+        log.info(
+            "%s looks better, so it is tested on new seeds, %d to %d, with the level %.2g",
+            *(idea, seeds[0], seeds[-1], test.level / 2),
         )
-        book = _test(home, book, idea, baseline | new)
-    _print_idea(book, idea, options.json)
-    return EXIT_CODES[book.ended[idea].result]
+        again = [f"seed={','.join(map(str, seeds))}"]
+        sides = [compose_words(home.name, merged(own, again), typed) for own in (start, words)]
+        fails = _train(test, sides[0] | sides[1])
+        book = read_ledger(home)
+    # An idea of which something is known cannot be tried anew as if it were not.
+    if fails and book.is_measured(idea):
+        raise GsbenchError(f"{idea}: {fails}; to go on, give the same command again")
+    if options.json:
+        failed = {"result": FAILED, "reason": fails} if fails else {}
+        print(json.dumps(_facts(book, idea) | failed | _left(book)))
+    else:
+        print(f"{idea}: {FAILED}: {fails}" if fails else book.line(idea))
+        print(book.describe()[1])
+    return EXIT_CODES.get(FAILED if fails else book.result(idea), UNDECIDED_CODE)
 
 
-def _start(
-    home: Path, trials: Trials, against: str, options: argparse.Namespace
-) -> tuple[str, Ledger]:
-    """Enter an idea unless the ledger has it; return its name and the ledger."""
-    keys, values = keys_by_scene(trials, home.name), next(iter(trials.values())).values
-    # An idea under another name is the same idea: it must not be tried twice.
-    nameless = values | {part: values[part] | {"name": ""} for part in ("init", "densify")}
-    identity = config_hash(nameless)
-    chosen: list[str] = []
+def _begin(home: Path, idea: Idea, is_named: bool) -> str:
+    """Enter an idea unless the ledger has it; return its name there."""
+    chosen = [idea.name]
 
-    def make(book: Ledger) -> records.Started | None:
-        same = [
-            one
-            for one in book.started.values()
-            if (one.identity, one.against) == (identity, against)
-        ]
-        if keys in (book.opened.keys, book.keys_of(against)):
-            raise InputError(f"the idea is {against} itself: give it other settings or code")
-        if same:
-            chosen.append(same[0].idea)
-            ended = book.ended.get(same[0].idea)
-            begun = ended is None and not book.shares_seeds
-            if not begun and not book.is_decided(same[0].idea):
-                rules.check_ideas_left(book)  # other ideas may have taken its place
-            return None
-        rules.check_ideas_left(book)
-        name = options.idea or values["densify"]["name"]
-        if name in (*book.started, BASELINE):
-            if options.idea:
-                raise InputError(f"--as {name}: another idea has this name: give another")
-            name = f"{name}-{len(book.started) + 1}"
-        chosen.append(name)
-        return records.Started(
-            time=stamp_now(),
-            idea=name,
-            against=against,
-            identity=identity,
-            words=tuple(merged(book.words_of(against), options.settings)),
-            keys=keys,
-        )
+    def make(history: History) -> Command | None:
+        book = read_ledger(home)
+        if idea.digests in (book.ideas[BASELINE].digests, book.ideas[idea.against].digests):
+            raise InputError(f"the idea is {idea.against} itself: give it other settings or code")
+        for name in book.begun:
+            if (book.ideas[name].identity, book.ideas[name].against) == (
+                idea.identity,
+                idea.against,
+            ):
+                chosen[0] = name
+                if book.failure(name):
+                    book.check_ideas_left()  # other ideas may have taken its place
+                return None
+        book.check_ideas_left()
+        if idea.name in book.ideas:
+            if is_named:
+                raise InputError(f"--as {idea.name}: another idea has this name: give another")
+            chosen[0] = f"{idea.name}-{len(book.begun) + 1}"
+        named = replace(idea, name=chosen[0])
+        question = replace(book.screening(named), untested=CHOOSES)
+        return command_now(idea=named, questions=(question.with_id(history.head),))
 
-    book = records.append(home, make)
-    return chosen[0], book
+    append(home, make)
+    return chosen[0]
 
 
-def _screen(home: Path, book: Ledger, idea: str, trials: Trials) -> Ledger:
-    """Compare the idea on the seeds of all ideas; write its result, or its test if it passes."""
-    ended = _answer(book, idea, rules.screening_of(book, idea), trials)
-
-    def make(now: Ledger) -> records.Entry | None:
-        # A process that ran the same command may have been faster.
-        if idea in now.tests or now.is_decided(idea):
-            return None
-        if ended.result != KEPT:
-            return ended
-        return rules.next_test(now, idea, stamp_now())
-
-    return records.append(home, make)
+def _promotion(history: History, home: Path, idea: str) -> Command | None:
+    """The test of an idea that looks better, unless it has one."""
+    book = read_ledger(home)
+    verdict = book.verdicts[idea]
+    if idea in book.tests or not verdict.final or result_of(verdict) != KEPT:
+        return None
+    return command_now(questions=(book.test(idea).with_id(history.head),))
 
 
-def _test(home: Path, book: Ledger, idea: str, trials: Trials) -> Ledger:
-    """Test the idea on its new seeds, and write its result."""
-    test = book.tests[idea]
-    log.info(
-        "%s looks better, so it is tested on new seeds, %d to %d, with the level %.2g",
-        idea,
-        test.seeds[0],
-        test.seeds[-1],
-        test.level,
-    )
-    ended = _answer(book, idea, rules.test_of(book, idea), trials)
-    return records.append(home, lambda now: None if now.is_decided(idea) else ended)
-
-
-def _answer(book: Ledger, idea: str, question: Question, trials: Trials) -> records.Ended:
-    """Train the idea and what it is compared with, look by look; the result, not yet written."""
+def _train(question: Question, trials: Trials) -> str:
+    """Train the trials of a question look by look until it is decided; "", or why trials fail."""
     fails = ""
 
     def run(planned: Sequence[Needed]) -> None:
         nonlocal fails
         try:
-            code = run_trials([trials[key, seed] for _, key, seed in planned], asks=False)
+            code = run_trials([trials[one] for one in planned], asks=False)
         except GsbenchError as error:
             fails = str(error)
         else:
             fails = "its trials fail" if code else ""
 
-    asked = rules.ask_idea(question, lambda: finished_trials(trials.values()))
+    asked = SequentialTest((question,), lambda: finished_trials(trials.values()))
     (verdict,) = asked.answer(run)
-    tested = idea in book.tests
-    if not fails or verdict.final:
-        return rules.end_of(idea, verdict, stamp_now(), tested)
-    of_idea = set(book.keys_of(idea).values())
-    failed = {key for key, trial in trials.items() if trial.files.has_failed()}
-    measured = {trial.key for trial in finished_trials(trials.values())}
-    # An idea of which something is known cannot be tried anew as if it were not.
-    if tested or of_idea & measured or not {key for key, _ in failed} <= of_idea:
-        raise GsbenchError(f"{idea}: {fails}; to go on, give the same command again")
-    reason = next((trials[key].files.failure().reason for key in sorted(failed)), fails)
-    return records.Ended(time=stamp_now(), idea=idea, result=FAILED, reason=reason, seeds=0)
+    return "" if verdict.final else fails
 
 
 def confirm(options: argparse.Namespace, home: Path) -> int:
     """Train the baseline and the kept ideas on captures that no idea has seen."""
-    book = records.read_ledger(home)
-    rules.check_unknown_trials(book, read_experiment(home).trials)
+    book, typed = read_ledger(home), options.settings
     ideas = list(options.only or book.kept)
     if missing := [idea for idea in ideas if idea not in book.kept]:
         raise InputError(f"--only {missing[0]}: kept were {listed(book.kept) or 'no ideas'}")
     if not ideas:
         raise InputError("no idea was kept, so there is nothing to confirm")
-    if not any(key_of(word) == "scene" for word in options.settings):
+    if not any(key_of(word) == "scene" for word in typed):
         raise InputError("confirm needs captures that no idea has seen: scene=…")
     by_idea = {
         idea: compose_words(
-            home.name,
-            merged(permitted_words(book, idea, options.settings), options.settings),
-            options.settings,
+            home.name, merged(permitted_words(book.ideas[idea], typed), typed), typed
         )
         for idea in (BASELINE, *ideas)
     }
-    keys = {idea: keys_by_scene(trials, home.name) for idea, trials in by_idea.items()}
-    asked = records.Confirming(time=stamp_now(), seeds=seeds_of(by_idea[BASELINE]), keys=keys)
+    old, *new = (_idea(idea, trials, ()) for idea, trials in by_idea.items())
+    seeds, level = seeds_of(by_idea[BASELINE]), ERROR_RATE / len(ideas)
+    asked = [book.ask(one, old, CONFIRMATION, seeds, level) for one in new]
 
-    def make(now: Ledger) -> records.Confirming | None:
-        if now.number_of(asked) is not None:
-            return None
-        rules.check_untouched(now, read_experiment(home).trials, asked)
-        return asked
+    def make(history: History) -> Command | None:
+        read_ledger(home).check_untouched(asked)
+        known = [one for one in history.questions if any(map(one.covers, asked))]
+        own = tuple(one.with_id(history.head) for one in asked)
+        return None if known else command_now(questions=own)
 
-    book = records.append(home, make)
-    number = book.number_of(asked)
-    assert number is not None  # `make` has just added it
-    if book.confirmations[number][1] is None:
-        book = _run_confirmation(home, book, number, by_idea)
-    print(to_markdown(ledger_tables(book)[1 + number]))
+    append(home, make)
+    for trials in by_idea.values():
+        if code := run_trials(list(trials.values()), asks=False):
+            raise (InputError if code == 2 else GsbenchError)("trials fail: nothing is confirmed")
+        # only now are the photographs' hashes known, which show a copy under another name
+        read_ledger(home).check_untouched(asked)
+    done = finished_trials([one for trials in by_idea.values() for one in trials.values()])
+    for question in asked:
+        verdict = judge(done, question)
+        print(f"{question.name}: {result_of(verdict)}: {sentence(verdict)}")
     return 0
-
-
-def _run_confirmation(
-    home: Path, book: Ledger, number: int, by_idea: Mapping[str, Trials]
-) -> Ledger:
-    """Train all trials of a confirmation, and write its results."""
-    asked, _ = book.confirmations[number]
-    first = {key: trial for key, trial in by_idea[BASELINE].items() if key[1] == asked.seeds[0]}
-    _run_all(first)
-    # Only now are the photographs' hashes known, which show a copy under another name.
-    rules.check_untouched(book, read_experiment(home).trials, asked)
-    trials = {key: trial for of_idea in by_idea.values() for key, trial in of_idea.items()}
-    _run_all(trials)
-    done = rules.named_by_key(finished_trials(trials.values()))
-    unfinished = [one.by_key for one in read_experiment(home).unfinished]
-    questions = rules.confirmation_of(book.opened, asked)
-    verdicts = [judge(done, question, unfinished) for question in questions]
-
-    def make(now: Ledger) -> records.Confirmed | None:
-        if now.confirmations[number][1] is not None:  # by a process that ran the same command
-            return None
-        return rules.confirmed(number, verdicts, stamp_now())
-
-    return records.append(home, make)
 
 
 def show(options: argparse.Namespace, home: Path) -> int:
     """Print the ledger."""
-    book, trials = records.read_ledger(home), read_experiment(home).trials
-    rules.check_unknown_trials(book, trials)
-    for note in rules.contradictions(book, trials):
-        log.warning("%s", note)
+    book = read_ledger(home)
     if options.json:
-        ideas = [_facts(book, idea) for idea in book.started]
-        confirmations = [one.to_json() for pair in book.confirmations for one in pair if one]
-        values = {"opened": book.opened.to_json(), "ideas": ideas, "confirmations": confirmations}
-        print(json.dumps(values | _left(book), indent=1))
+        opened = book.opened.to_json() | {"words": book.ideas[BASELINE].words}
+        ideas = [_facts(book, idea) for idea in book.begun]
+        print(json.dumps({"opened": opened, "ideas": ideas} | _left(book), indent=1))
         return 0
-    print("\n".join([*describe_ledger(book), "", *map(to_markdown, ledger_tables(book))]))
+    lines = [f"{number}. {book.line(idea)}" for number, idea in enumerate(book.begun, 1)]
+    print("\n".join([*book.describe(), *lines]))
     return 0
 
 
-FLAGS = {
-    "settings": "settings",
-    "metric": "--metric",
-    "least": "--least",
-    "ideas": "--ideas",
-    "fdr": "--fdr",
-    "against": "--against",
-    "idea": "--as",
-    "only": "--only",
-    "json": "--json",
-}
-ACTIONS = {  # with the options that each of them takes
-    "new": (new, ("settings", "metric", "least", "ideas", "fdr")),
-    "try": (try_idea, ("settings", "against", "idea", "json")),
-    "confirm": (confirm, ("settings", "only")),
-    "show": (show, ("json",)),
-}
-
-
-def _run_all(trials: Trials) -> None:
-    if code := run_trials(list(trials.values()), asks=False):
-        raise (InputError if code == 2 else GsbenchError)("trials fail: nothing is confirmed")
+ACTIONS = {"new": new, "try": try_idea, "confirm": confirm, "show": show}
+OPTIONS: tuple[tuple[str, tuple[str, ...], dict[str, Any]], ...] = (  # with their actions
+    (
+        "settings",
+        ("new", "try", "confirm"),
+        {"nargs": "*", "metavar": "KEY=VALUE", "help": "as of a sweep"},
+    ),
+    ("--metric", ("new",), {"help": "decides, such as lpips_squeeze (psnr)"}),
+    (
+        "--least",
+        ("new",),
+        {"help": "the least difference that matters, as 0.1 or 10%% (the metric's)"},
+    ),
+    (
+        "--ideas",
+        ("new",),
+        {"type": whole_number(MOST_IDEAS), "help": f"the most that will be tried ({IDEAS})"},
+    ),
+    (
+        "--fdr",
+        ("new",),
+        {"type": number(OpenFraction), "help": f"false discovery rate, from 0 to 1 ({RATE})"},
+    ),
+    ("--against", ("try",), {"help": "a kept idea to start from (default: the baseline)"}),
+    ("--as", ("try",), {"dest": "idea", "help": "the idea's name (default: densify.name)"}),
+    ("--only", ("confirm",), {"type": names, "help": "these ideas (default: all kept)"}),
+    ("--json", ("try", "show"), {"action": "store_true", "help": "print JSON"}),
+)
 
 
 # ---- what is printed
 
 
-def _print_idea(book: Ledger, idea: str, as_json: bool) -> None:
-    if as_json:
-        print(json.dumps(_facts(book, idea) | _left(book)))
-        return
-    ended = book.ended[idea]
-    difference = difference_text(book.opened, ended.difference)
-    facts = [f"{book.opened.metric} {difference}"] if difference else []
-    if ended.seconds is not None:
-        facts.append(f"{ended.seconds:.2f} times the training time")
-    print("; ".join([f"{idea}: {ended.result}: {why(ended)}", *facts]))
-    print(describe_ledger(book)[1])
-
-
-def _facts(book: Ledger, idea: str) -> dict[str, Any]:
+def _facts(book: Book, idea: str) -> dict[str, Any]:
     """The known facts of an idea, for programs."""
-    started, ended = book.started[idea], book.ended.get(idea)
-    facts: dict[str, Any] = {"idea": idea, "against": started.against}
+    verdict = book.verdicts[idea]
+    interval = verdict.interval
+    known: dict[str, Any] = {"idea": idea, "against": book.ideas[idea].against}
     if test := book.tests.get(idea):
-        facts |= {"level": test.level, "test_seeds": test.seeds}
-    if ended is None:
-        return facts | {"result": "begun"}
-    return facts | {
-        key: value for key, value in ended.to_json().items() if key not in ("idea", "time")
-    }
+        known |= {"level": test.level / 2, "test_seeds": next(iter(test.seeds.values()))}
+    known |= {"result": book.result(idea), "reason": book.why(idea), "seeds": verdict.pairs.seeds}
+    if interval is not None:
+        known["difference"] = {"mean": verdict.mean, "low": interval.low, "high": interval.high}
+    for name, cost in (("gaussians", "gaussians"), ("seconds", "train_time")):
+        if (ratio := book.ratio(idea, cost)) is not None:
+            known[name] = ratio
+    return known
 
 
-def _left(book: Ledger) -> dict[str, Any]:
+def _left(book: Book) -> dict[str, Any]:
     return {"tried": book.tried, "planned": book.opened.ideas, "kept": book.kept}

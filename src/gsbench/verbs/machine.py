@@ -1,4 +1,5 @@
-"""Verbs about this machine: ``doctor`` (what is missing) and ``bench`` (how fast it is)."""
+"""Verbs about this machine: ``doctor`` (what is missing, and what is odd about a capture) and
+``bench`` (how fast it is)."""
 
 import argparse
 import itertools
@@ -6,8 +7,7 @@ import json
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
-from importlib.util import find_spec
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -16,7 +16,7 @@ from gsbench.raster.executors import AUTO, EXECUTORS, names, resolve
 from gsbench.runs.trial_record import RasterProof
 from gsbench.scene.rules import MIN_SIZE
 from gsbench.system.install import install_command, version_of
-from gsbench.system.own_modules import allow_modules
+from gsbench.system.programs import allow_modules
 from gsbench.system.resources import available_threads, installed_gpus
 from gsbench.verbs.arguments import ArgumentParser, comma_separated, path, whole_number
 from gsbench.words import counted, readable_bytes
@@ -53,6 +53,12 @@ class Finding(NamedTuple):
 def doctor(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 1 if something is bad, or if a proof fails."""
     parser = ArgumentParser("doctor")
+    parser.add_argument(
+        "words",
+        nargs="*",
+        metavar="SETTING",
+        help="of a scene, such as scene=photos scene.path=/my/photos: what is odd about it",
+    )
     parser.flag("--prove", "compare a rasterizer with the float64 reference on this machine")
     parser.add_argument(
         "--raster", default=AUTO, choices=names(), help="the rasterizer to prove (auto)"
@@ -67,7 +73,16 @@ def doctor(argv: Sequence[str], runs: Path) -> int:
     if options.json or options.raster != AUTO or options.device != "auto":
         raise InputError("doctor: --raster, --device and --json belong to --prove")
     code = 0
-    checks = check_packages(), check_devices(), check_proofs(), check_weights(), check_runs(runs)
+    if options.words:
+        checks: tuple[Iterable[Finding], ...] = (check_scene(options.words),)
+    else:
+        checks = (
+            check_packages(),
+            check_devices(),
+            check_proofs(),
+            check_weights(),
+            check_runs(runs),
+        )
     for verdict, topic, text in itertools.chain(*checks):
         print(f"{verdict:<5} {topic:<12} {text}")
         if verdict == "bad":
@@ -104,6 +119,32 @@ def _describe(proof: RasterProof) -> str:
         f"raster={proof.raster} {verdict} the reference on {proof.device} ({proof.seconds:.0f} "
         f"s): {largest}"
         + (f"; steps use autograd, since {proof.direct_fault}" if proof.direct_fault else "")
+    )
+
+
+def check_scene(words: Sequence[str]) -> Iterator[Finding]:
+    """The rules (docs/captures.md) that say something about a scene, before anything is trained.
+
+    Their lines are logged; what is not usable raises InputError. Photographs without cameras get
+    none here, so rules about cameras and views are left to their trial.
+    """
+    from gsbench.renders.truth import scene_trial
+    from gsbench.runs.keys import INIT, TRAIN
+
+    trial, views = scene_trial(words), False
+    for step in trial.steps():
+        if views := step.stage is TRAIN:
+            break
+        if step.stage is INIT and trial.capture.model is None:
+            break
+        trial.store.get(step)
+    capture = trial.capture
+    odd = [*capture.oddities, *(trial.views.scene.oddities if views else ())]
+    yield Finding(
+        "note" if odd else "ok",
+        str(capture.name),
+        f"{counted(len(capture.image_names), 'photograph')}, {len(capture.test_names)} for testing"
+        f" ({capture.held_out}); odd: {', '.join(one.rule for one in odd) or 'nothing'}",
     )
 
 
@@ -273,7 +314,6 @@ def _bench_parser() -> ArgumentParser:
         "--threads", type=count, help="CPU threads (default: as many as torch takes)"
     )
     parser.flag("--json", "print JSON")
-    parser.flag("--host", "what a step of raster=triton costs the host; needs no GPU")
     parser.flag("--kernels", "with --json: add the time of each kernel, and of waits for the GPU")
     parser.flag("--no-memory", "do not measure peak memory, in processes of their own")
     return parser
@@ -282,8 +322,6 @@ def _bench_parser() -> ArgumentParser:
 def bench(argv: Sequence[str], _runs: Path | None = None) -> int:
     """Print the table, or with ``--json`` the list of results."""
     options = _bench_parser().parse_args(argv)
-    if options.host:
-        return _bench_host(options.json)
     if options.ply is not None and not options.ply.is_file():
         raise InputError(f"--ply: {options.ply} does not exist")
     if options.kernels and not options.json:
@@ -308,16 +346,6 @@ def bench(argv: Sequence[str], _runs: Path | None = None) -> int:
         kernels=options.kernels,
     )
     print(json.dumps(rows, indent=2) if options.json else table(rows))
-    return 0
-
-
-def _bench_host(as_json: bool) -> int:
-    if find_spec("triton") is None:
-        raise InputError("--host: needs Triton (pip install triton)")
-    from gsbench.bench.host import time_host
-
-    rows = time_host()
-    print(json.dumps(rows, indent=2) if as_json else table(rows))
     return 0
 
 

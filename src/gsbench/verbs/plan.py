@@ -9,15 +9,23 @@ from typing import Any
 from pydantic import PositiveFloat
 
 from gsbench.analysis.comparison import compare
-from gsbench.analysis.designs import Components, Design, estimate_components
 from gsbench.analysis.notes import texts
 from gsbench.analysis.pairs import BASELINE
-from gsbench.analysis.planning import COMMANDS, UNSURE, Plan, Purpose, make_plan
+from gsbench.analysis.planning import (
+    COMMANDS,
+    UNSURE,
+    Components,
+    Design,
+    Plan,
+    Purpose,
+    estimate_components,
+    make_plan,
+)
 from gsbench.analysis.quantities import Quantity, quantity
 from gsbench.analysis.results import Arm, TrialResult, load_experiment
 from gsbench.analysis.statistics import MIN_SCENES
-from gsbench.analysis.verdicts import interval_of
-from gsbench.claims.ledger import GIVE_UP, IDEAS, RATE, SCREEN, level_of_test
+from gsbench.analysis.verdicts import GIVE_UP, interval_of
+from gsbench.claims.ledger import IDEAS, RATE, SCREEN, level_of_test
 from gsbench.errors import InputError
 from gsbench.runs.commands import ERROR_RATE
 from gsbench.verbs.arguments import ArgumentParser, number, whole_number

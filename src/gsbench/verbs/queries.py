@@ -5,7 +5,7 @@ import re
 from contextlib import suppress
 from pathlib import Path
 
-from gsbench.app.hydra_app import run_main
+from gsbench.app.hydra_main import run_main
 from gsbench.config.command_words import check_single, typed_permissions
 from gsbench.config.compose import Composer
 from gsbench.config.overrides import parse_word

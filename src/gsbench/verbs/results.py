@@ -5,7 +5,6 @@ import json
 import re
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -34,9 +33,7 @@ from gsbench.analysis.results import (
     Arm,
     Experiment,
     TrialResult,
-    load_all_trials,
     load_experiment,
-    newest_code,
 )
 from gsbench.analysis.table_formats import FORMATS, csv_of
 from gsbench.analysis.tables import DEFAULT_ROWS, build_table, format_cell, with_agreement
@@ -54,7 +51,6 @@ TRIALS, JSON = "trials", "json"
 FAIRNESS = "fairness"
 PAPER_NOTES = "paper"  # `gsbench tables paper` shows the paper's own inconsistencies
 REPORT_NAME = "report.html"
-FILE_SUFFIXES = (".html", ".htm")  # of a report
 
 
 def tables(argv: Sequence[str], runs: Path) -> int:
@@ -255,23 +251,12 @@ def report(argv: Sequence[str], runs: Path) -> int:
         raise InputError(
             f"--baseline {options.baseline}: {experiment.name} has {', '.join(densifiers)}"
         )
-    file = experiment.folder / REPORT_NAME
-    if options.out is not None:
-        file = file_at(options.out, experiment.name)
-    output = writable_output if options.out in (None, file) else own_output
     for warning in experiment.warnings:
         print(f"left out: {warning}", file=sys.stderr)
     text = build_report(experiment, options.baseline, dict(options.where))
-    with output(file):
-        write_text(file, text)
-    print(file)
+    out = options.out or experiment.folder / REPORT_NAME
+    _write({f"-{REPORT_NAME}": text}, out, experiment.name)
     return 0
-
-
-def file_at(out: Path, experiment: str) -> Path:
-    """The file that ``--out`` means: ``out``, or in a folder one with the experiment's name."""
-    is_file = out.suffix.lower() in FILE_SUFFIXES and not out.is_dir()
-    return out if is_file else out / f"{experiment}-{REPORT_NAME}"
 
 
 def explain(argv: Sequence[str], runs: Path) -> int:
@@ -288,8 +273,7 @@ def explain_cell(address: str, runs: Path) -> str:
     if len(parts) != 4 or not all(parts):
         raise InputError(f"{address!r} is not {CELL}")
     name, scene, metric, arm = parts
-    everything = load_all_trials(runs, name)
-    experiment = newest_code(everything)
+    experiment = load_experiment(runs, name)
     trials = _trials_at(experiment, scene, arm)
     shown = quantity(metric, trials)
     check_averageable(trials, f"scene={scene} {arm}")
@@ -307,8 +291,8 @@ def explain_cell(address: str, runs: Path) -> str:
     lines += ["", "Conditions", *(f"  {key}: {value}" for key, value in conditions)]
     lines += _trials_lines(trials, shown)
     place = trials[0].path.parent
-    of_cell = [trial for trial in everything.trials if trial.path.parent == place]
-    versions = newest_code(replace(everything, trials=tuple(of_cell))).versions
+    is_older = any(trial.path.parent == place for trial in experiment.older)
+    versions = experiment.versions if is_older else ()
     start = f"{place.relative_to(runs).as_posix()}/"
     if left_out := [*(line for line in experiment.faults if line.startswith(start)), *versions]:
         lines += ["", "Left out", *(f"  {line}" for line in left_out)]

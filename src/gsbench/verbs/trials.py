@@ -1,15 +1,17 @@
 """Verbs about the trials of an experiment: ``gsbench status``, ``retry`` and ``sync``."""
 
+from __future__ import annotations
+
 import json
 import logging
 import os
 import sys
 import time
-from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.console import Group
 from rich.live import Live
@@ -21,29 +23,32 @@ from gsbench.config.compose import Trial, compose_one
 from gsbench.config.overrides import key_of
 from gsbench.errors import GsbenchError, InputError
 from gsbench.launch.dry_run import describe_plan
-from gsbench.launch.progress import Progress, progress_of
+from gsbench.launch.progress import SPEED, progress_frame
 from gsbench.launch.record import remove
 from gsbench.launch.states import (
+    STATES,
     TrialState,
     label_of,
     names_of,
     states_now,
     states_of_experiment,
+    summary_of,
 )
 from gsbench.runs.commands import PlannedTrial, drop, read_history
 from gsbench.runs.experiments import experiment_home, list_experiments, trial_folders
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS
 from gsbench.runs.user_code import PERMISSIONS
-from gsbench.system.own_modules import allow_modules
+from gsbench.system.programs import allow_modules
 from gsbench.tracking.beside import end_with
 from gsbench.tracking.sync import MirrorError
 from gsbench.tracking.sync import sync as send_missing
 from gsbench.verbs.arguments import ArgumentParser
 from gsbench.words import counted, readable_time
 
-ORDER = ("failed", "damaged", "running", "queued", "partial", "missing", "superseded", "done")
-RETRIED = ("failed", "partial", "damaged", "missing")
+if TYPE_CHECKING:
+    import pandas as pd
+
 SECONDS_BETWEEN_LOOKS = 3.0
 
 log = logging.getLogger(__name__)
@@ -56,7 +61,7 @@ def status(argv: Sequence[str], runs: Path) -> int:
         "experiment", nargs="?", help="its name; without one, a line for each experiment"
     )
     parser.flag("--all", "list the finished trials too")
-    parser.flag("--watch", "a table of arms and scenes, renewed until all have ended")
+    parser.flag("--watch", "a row for each arm, renewed until all trials have ended")
     parser.flag(
         "--verify",
         "also compare by content what a look leaves to size and time: large files, and the results "
@@ -76,7 +81,7 @@ def status(argv: Sequence[str], runs: Path) -> int:
         return _overview(runs)
     home = experiment_home(runs, options.experiment)
     if options.watch:
-        _watch(home)
+        _watch(runs, options.experiment)
     _say_what_is_lost(home)
     trials = states_now(home)
     if options.verify:
@@ -100,7 +105,7 @@ def status(argv: Sequence[str], runs: Path) -> int:
         print(json.dumps(shown, indent=1, default=str))  # `default` is for the folder, a Path
     else:
         print("\n".join(lines_of(trials, options.all)))
-    return int(any(trial.state in RETRIED for trial in trials))
+    return int(any(STATES[trial.state].retried for trial in trials))
 
 
 def _say_what_is_lost(home: Path) -> None:
@@ -117,60 +122,41 @@ def _verified(trial: TrialState) -> TrialState:
     return trial if fault is None else replace(trial, state="damaged", note=str(fault))
 
 
-def _watch(home: Path) -> None:
-    """Show the progress of the experiment in ``home`` until its trials have ended, or Ctrl-C."""
-    progress = progress_of(home)
+def _watch(runs: Path, experiment: str) -> None:
+    """Show the progress of an experiment until its trials have ended, or Ctrl-C."""
+    frame = progress_frame(runs, experiment)
     with (
         suppress(KeyboardInterrupt),
-        Live(_progress_view(home.name, progress), auto_refresh=False) as live,
+        Live(_progress_view(experiment, frame), auto_refresh=False) as live,
     ):
-        while not progress.has_ended:
+        while frame[["running", "waiting"]].to_numpy().any():
             time.sleep(SECONDS_BETWEEN_LOOKS)
-            progress = progress_of(home)
-            live.update(_progress_view(home.name, progress), refresh=True)
+            frame = progress_frame(runs, experiment)
+            live.update(_progress_view(experiment, frame), refresh=True)
 
 
-def _progress_view(name: str, progress: Progress) -> Group:
-    """A table of arms by scenes with the numbers of trials by state, and lines below it."""
-    scenes = sorted({scene for _, scene in progress.cells})
-    arms = sorted({arm for arm, _ in progress.cells})
-    table = Table(title=escape(f"{name}: trials done of all"))
-    # In a narrow terminal the scenes are cut: arms often differ in their last letters only.
-    table.add_column("arm", no_wrap=True, min_width=max(map(len, arms), default=0))
-    for scene in scenes:
-        table.add_column(escape(scene))
-    for arm in arms:
-        cells = [progress.cells.get((arm, scene)) for scene in scenes]
-        table.add_row(escape(arm), *(_cell(cell) if cell else "–" for cell in cells))
-    lines = []
-    if progress.speeds:
-        lines.append(f"{sum(progress.speeds.values()):.1f} iterations/s")
-    if progress.seconds_left is not None and not progress.has_ended:
-        lines.append(f"about {readable_time(progress.seconds_left)} left")
-    return Group(table, ", ".join(lines), escape(progress.leader))
-
-
-def _cell(counts: dict[str, int]) -> str:
-    others = [f"{counts[state]} {state}" for state in ("running", "failed") if counts[state]]
-    return ", ".join([f"{counts['done']}/{sum(counts.values())}", *others])
+def _progress_view(name: str, frame: pd.DataFrame) -> Group:
+    """A table of arms with the numbers of trials by state, and the time left."""
+    table = Table(title=escape(name))
+    # In a narrow terminal other columns are cut: arms often differ in their last letters only.
+    table.add_column("arm", no_wrap=True, min_width=max(map(len, frame.index), default=0))
+    for column in frame.columns:
+        table.add_column("it/s" if column == SPEED else column, justify="right")
+    for arm, row in frame.iterrows():
+        table.add_row(escape(str(arm)), *(f"{round(value, 2):g}" for value in row))
+    left = frame.attrs["seconds_left"]
+    return Group(table, f"about {readable_time(left)} left" if left else "")
 
 
 def lines_of(trials: list[TrialState], with_done: bool) -> list[str]:
     """A line for each trial not done or in doubt (``with_done``: for each), and a summary."""
     lines, names = [], names_of(trials)
-    for trial in sorted(trials, key=lambda trial: ORDER.index(trial.state)):
+    order = [*STATES]
+    for trial in sorted(trials, key=lambda trial: order.index(trial.state)):
         if trial.state != "done" or trial.note or with_done:
             label = label_of(trial.folder, names)
             lines.append(f"{trial.state:<8} {label:<50} {_age(trial):>12}  {trial.note}".rstrip())
-    lines.append(summary_of(trials))
-    return lines
-
-
-def summary_of(trials: list[TrialState]) -> str:
-    """The number of trials in each state, in one line."""
-    counts: Counter[str] = Counter(trial.state for trial in trials)
-    texts = [f"{counts[state]} {state}" for state in reversed(ORDER) if counts[state]]
-    return f"{counted(len(trials), 'trial')}: {', '.join(texts)}"
+    return [*lines, summary_of(trial.state for trial in trials)]
 
 
 def _overview(runs: Path) -> int:
@@ -179,7 +165,8 @@ def _overview(runs: Path) -> int:
         print(f"no experiment in {runs} yet")
     for name in names:
         _say_what_is_lost(runs / name)
-        print(f"{name:<20} {summary_of(states_now(runs / name))}")
+        states = states_now(runs / name)
+        print(f"{name:<20} {summary_of(trial.state for trial in states)}")
     return 0
 
 
@@ -188,7 +175,7 @@ def _age(trial: TrialState) -> str:
     if trial.since is None:
         return ""
     time_since = readable_time(max(0.0, time.time() - trial.since))
-    return f"for {time_since}" if trial.state in ("running", "queued") else f"{time_since} ago"
+    return f"for {time_since}" if STATES[trial.state].lasts else f"{time_since} ago"
 
 
 def retry(argv: Sequence[str], runs: Path) -> int:
@@ -214,7 +201,7 @@ def retry(argv: Sequence[str], runs: Path) -> int:
             "command"
         )
     _say_what_is_lost(home)
-    unfinished = [trial for trial in states_of_experiment(home) if trial.state in RETRIED]
+    unfinished = [trial for trial in states_of_experiment(home) if STATES[trial.state].retried]
     if not unfinished:
         print(f"nothing to retry: all trials of {options.experiment} are done, running or queued")
         return 0

@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 from skimage.transform import SimilarityTransform
 
-from gsbench.init.colmap.similarity import (
+from gsbench.init.colmap.alignment import (
     align_poses,
     fit_similarity,
     rotation_angles,

@@ -16,8 +16,8 @@ from gsbench.init.colmap.database import (
     write_keypoints,
     write_matches,
 )
-from gsbench.init.colmap.geometry import verification_options, verify_pairs
 from gsbench.init.colmap.mapping import Attempt, Geometry, map_images, measure_geometry
+from gsbench.init.colmap.matches import verification_options, verify_pairs
 from gsbench.init.colmap.pairs import select_pairs
 from gsbench.init.colmap.reconstruct import common_poses
 from gsbench.logs import no_progress
@@ -339,7 +339,7 @@ def test_focal_lengths_are_assumed_in_a_copy_whose_pairs_are_verified_again(tmp_
         monkeypatch.setattr(owner, name, lambda *given: calls.append(given) or result)
 
     note(mapping.colmap_database, "assume_focal_lengths", [("a", "b")])
-    note(mapping.geometry, "verify_pairs", None)
+    note(mapping.matches, "verify_pairs", None)
     note(mapping._Mapper, "incremental", ["model"])
     mapper = mapper_of(tmp_path, Sfm(seed=4, min_inliers=9))
     assert mapper.with_assumed_focal_lengths(1.4) == ["model"]

@@ -9,10 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from gsbench.init import Sfm
 from gsbench.init.base import TrainingPoints
-from gsbench.init.colmap import alignment, geometry, mapping, reconstruct
+from gsbench.init.colmap import alignment, mapping, matches, reconstruct
 from gsbench.init.colmap import pairs as pairing
 from gsbench.init.colmap.database import create_database, write_keypoints, write_matches
-from gsbench.init.colmap.geometry import verify_pairs
+from gsbench.init.colmap.matches import verify_pairs
 from gsbench.logs import no_progress
 from tests.helpers import refusal
 from tests.init.models import add_point, camera_at, model_with
@@ -57,7 +57,7 @@ def database(tmp_path_factory):
     same = np.stack([np.arange(len(POINTS))] * 2, axis=1).astype(np.uint32)
     pairs = pairing.select_pairs(NAMES, Sfm())
     write_matches(path, dict.fromkeys(pairs, same))
-    verify_pairs(path, pairs, geometry.verification_options(Sfm()), no_progress)
+    verify_pairs(path, pairs, matches.verification_options(Sfm()), no_progress)
     return path
 
 
@@ -131,6 +131,6 @@ def test_points_of_training_views_keep_place_and_observations_and_get_those_view
 
 
 def test_settings_reach_colmaps_verification():
-    made = geometry.verification_options(Sfm(seed=7, min_inliers=11, min_inlier_ratio=0.31))
+    made = matches.verification_options(Sfm(seed=7, min_inliers=11, min_inlier_ratio=0.31))
     assert made.ransac.random_seed == 7
     assert (made.min_num_inliers, made.min_inlier_ratio) == (11, 0.31)

@@ -3,15 +3,12 @@
 import math
 
 import numpy as np
-import pytest
 import torch
-from numpy.testing import assert_array_equal
-from PIL import Image, ImageDraw, ImageFont
 
 from gsbench.events import Cause
 from gsbench.gaussians.model import Gaussians
 from gsbench.pipeline.steps import evaluate
-from gsbench.pipeline.steps.evaluate import _with_legend, draw_ellipsoids
+from gsbench.pipeline.steps.evaluate import draw_ellipsoids
 from tests.train.conftest import orbit_camera
 
 
@@ -34,7 +31,7 @@ def test_only_voluminous_gaussians_are_outlined():
     black = np.zeros((camera.height, camera.width, 3), dtype=np.uint8)
     picture = np.asarray(draw_ellipsoids(black, gaussians, causes, camera, 0.03))
     drawn, legend = np.split(picture, [camera.height])
-    assert len(legend) % 14 == 0  # px, the height of a line
+    assert len(legend) == 2 * 14  # px: lines of the title and of one cause
     in_legend = {tuple(color) for color in legend.reshape(-1, 3).tolist()}
     assert Cause.SPLIT_VOLUME.color in in_legend
     assert Cause.CLONE.color not in in_legend
@@ -58,26 +55,3 @@ def test_of_too_many_gaussians_the_most_voluminous_are_outlined(monkeypatch):
     black = np.zeros((camera.height, camera.width, 3), dtype=np.uint8)
     drawn = np.asarray(draw_ellipsoids(black, gaussians, causes, camera, 0.03))[: camera.height]
     assert {tuple(color) for color in drawn[drawn.any(-1)].tolist()} == {Cause.ADDED.color}
-
-
-@pytest.mark.parametrize("words_in_a_line", [3, 2, 1])
-def test_the_legend_below_the_picture_is_wrapped(words_in_a_line):
-    """The font has 11 px, words are 5 px apart, lines 14 px high, and the margin is 2 px."""
-    font = ImageFont.load_default(11)
-    words = [
-        ("title", (255, 255, 255)),
-        ("word", (255, 255, 255)),
-        (Cause.CLONE.words, Cause.CLONE.color),
-    ]
-    first, second, third = (math.ceil(font.getlength(text)) + 5 for text, _ in words)
-    width, at = {
-        3: (first + second + third, [(2, 0), (2 + first, 0), (2 + first + second, 0)]),
-        2: (first + second, [(2, 0), (2 + first, 0), (2, 1)]),
-        1: (5, [(2, 0), (2, 1), (2, 2)]),
-    }[words_in_a_line]
-    image = Image.fromarray(np.full((10, width, 3), 90, dtype=np.uint8))
-    expected = Image.new("RGB", (width, 10 + 14 * (at[-1][1] + 1)))
-    expected.paste(image, (0, 0))
-    for (text, color), (left, line) in zip(words, at, strict=True):
-        ImageDraw.Draw(expected).text((left, 10 + 14 * line), text, fill=color, font=font)
-    assert_array_equal(_with_legend(image, "title word", [Cause.CLONE]), expected)

@@ -33,7 +33,7 @@ from gsbench.runs.store import Store
 from gsbench.runs.user_code import UserCode
 from gsbench.scene.colmap import model_points, read_model, write_model
 from gsbench.scene.types import Capture, Scene, View
-from gsbench.system.own_modules import SAFE_PATH
+from gsbench.system.programs import SAFE_PATH
 from gsbench.train.ideas import NO_IDEAS
 from gsbench.train.options import TrainConfig
 from tests.gaussians.helpers import random_gaussians

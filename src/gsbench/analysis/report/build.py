@@ -11,17 +11,15 @@ from typing import Any
 from gsbench.analysis import sentences
 from gsbench.analysis.cells import select_trials, where_words
 from gsbench.analysis.comparison import Answer, chosen, compare
-from gsbench.analysis.designs import seeds_needed
 from gsbench.analysis.differences import between_scenes_notes
 from gsbench.analysis.fairness import caveats, counts_notes, fairness_table, limit_notes
 from gsbench.analysis.images import choose_views, png_uri
-from gsbench.analysis.ledger_table import describe_ledger, ledger_tables
 from gsbench.analysis.notes import texts
 from gsbench.analysis.pairs import pair_trials
 from gsbench.analysis.paper import layout_of, load_published, paper_tables
-from gsbench.analysis.quantities import COSTS, choose_quantities, relative_change
-from gsbench.analysis.ranks import rank_all
-from gsbench.analysis.report.charts import ForestRow, forest_plot, line_chart, rank_plot
+from gsbench.analysis.planning import seeds_needed
+from gsbench.analysis.quantities import COSTS, relative_change
+from gsbench.analysis.report.charts import forest_plot, line_chart
 from gsbench.analysis.report.curves import event_charts, event_table, training_charts
 from gsbench.analysis.report.quality import quality_charts
 from gsbench.analysis.report.sweeps import sweep_charts
@@ -30,13 +28,11 @@ from gsbench.analysis.report.where import region_maps
 from gsbench.analysis.results import Experiment, TrialResult, group_by, trials_of
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry, fill
 from gsbench.analysis.tables import build_table, with_agreement
-from gsbench.analysis.verdicts import Verdict
-from gsbench.errors import InputError
+from gsbench.analysis.verdicts import SceneEstimate, Verdict
 from gsbench.eval.facts import find_metric
 from gsbench.parsing import read_if_sound
 from gsbench.runs import layout
 from gsbench.runs.experiments import Arm, TuningRecord
-from gsbench.runs.ledger import read_ledger
 from gsbench.scene.images import read_image
 from gsbench.words import command, counted, signed
 
@@ -82,17 +78,12 @@ def build_report(
             | {"maps": maps.get((own.baseline, own.arm), [])}
             for own in comparison.answers
         ],
-        ledger=show_ledger(experiment.folder),
+        ledger=experiment.history.ledger and command("ledger", "show", experiment.name),
         risk=comparison.risk,
         sweeps=sweep_charts(comparison),
         unused=texts(comparison.remarks),
         # the top of the page has the verdicts
         tables=[replace(table, verdicts=()) for table in with_agreement(tables)],
-        ranks=[
-            rank_plot(ranking)
-            for ranking in rank_all(trials, choose_quantities(trials))
-            if comparison.answers
-        ],
         contradictions=[] if paper_table is None else load_published().contradictions,
         search=search_summary(experiment.folder),
         say=sentences,
@@ -185,17 +176,6 @@ def seeds_to_resolve(verdict: Verdict) -> int | None:
     return seeds_needed(verdict.deviation, len(verdict.scenes), verdict.quantity.worthwhile)
 
 
-def show_ledger(folder: Path) -> dict[str, Any] | None:
-    """The sentences and tables of the experiment's ledger of ideas; None if it has none."""
-    if not (folder / layout.LEDGER).exists():
-        return None
-    try:
-        ledger = read_ledger(folder)
-    except InputError as error:
-        return {"lines": [str(error)], "tables": []}
-    return {"lines": describe_ledger(ledger), "tables": ledger_tables(ledger)}
-
-
 def _costs(baseline: Sequence[TrialResult], other: Sequence[TrialResult]) -> list[str]:
     """Say how counts and training times changed over the scenes that both arms have."""
     lines = []
@@ -217,9 +197,10 @@ def _spread_of_times(trials: Sequence[TrialResult]) -> str:
 
 
 def _forest(verdict: Verdict) -> str:
-    rows = [ForestRow(scene.scene, scene.mean, scene.interval) for scene in verdict.scenes]
+    rows = [*verdict.scenes]
     if len(rows) > 1:
-        rows.append(ForestRow("mean of scenes", verdict.mean or 0.0, verdict.interval))
+        mean, seeds = verdict.mean or 0.0, verdict.pairs.seeds
+        rows.append(SceneEstimate("mean of scenes", mean, seeds, verdict.interval))
     better = (
         "right of zero is better" if verdict.quantity.direction == 1 else "left of zero is better"
     )

@@ -1,20 +1,18 @@
 """Charts as inline SVG, without script or network, each with a description in words.
 
-This module computes positions; the templates ``line_chart``, ``forest_plot`` and ``rank_plot``
-write the elements.
+This module computes positions; the templates ``line_chart`` and ``forest_plot`` write the
+elements.
 """
 
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from statistics import median
 from types import MappingProxyType
 
-from gsbench.analysis.ranks import Ranking
-from gsbench.analysis.sentences import p_text
 from gsbench.analysis.statistics import Interval
 from gsbench.analysis.table_formats import fill
+from gsbench.analysis.verdicts import SceneEstimate
 from gsbench.words import true_minus
 
 WIDTH, HEIGHT = 380, 250  # px at full size; text is 12 px
@@ -28,21 +26,6 @@ TICKS = 5
 THOUSANDS = 1e4  # numbers from here on are written with k or M
 
 Points = Sequence[tuple[float, float]]
-
-
-@dataclass(frozen=True)
-class ForestRow:
-    """A difference with its interval, None if it is unknown."""
-
-    label: str
-    mean: float
-    interval: Interval | None = None
-
-    def color(self, better: int) -> str:
-        """Grey if the interval contains 0 or is unknown, green on the side ``better``, else red."""
-        if self.interval is None or not self.interval.excludes_zero():
-            return "#555555"
-        return "#1b7837" if self.mean * better > 0.0 else "#b2182b"
 
 
 def line_chart(
@@ -112,7 +95,7 @@ def line_chart(
     )
 
 
-def forest_plot(title: str, rows: Sequence[ForestRow], x_label: str, better: int) -> str:
+def forest_plot(title: str, rows: Sequence[SceneEstimate], x_label: str, better: int) -> str:
     """Differences with intervals, one per row, and a line at 0; ``better`` is a gain's sign.
 
     An interval much wider than the others is cut, so that it does not stretch the axis.
@@ -133,7 +116,7 @@ def forest_plot(title: str, rows: Sequence[ForestRow], x_label: str, better: int
         for end in (row.interval.low, row.interval.high)
     ]
     words = [
-        f"{row.label} {short_number(row.mean)}"
+        f"{row.scene} {short_number(row.mean)}"
         + (
             f", interval {short_number(row.interval.low)} to {short_number(row.interval.high)}"
             if row.interval
@@ -147,7 +130,7 @@ def forest_plot(title: str, rows: Sequence[ForestRow], x_label: str, better: int
         title=title,
         words=f"{title}. {x_label}. {'; '.join(words)}.",
         rows=[
-            (FOREST_TOP + FOREST_ROW * (k + 0.5), row, row.color(better), _cut(row, most))
+            (FOREST_TOP + FOREST_ROW * (k + 0.5), row, forest_color(row, better), _cut(row, most))
             for k, row in enumerate(rows)
         ],
         x=Axis(ends, False, FOREST_LEFT, WIDTH - RIGHT, ticks=3),
@@ -159,60 +142,18 @@ def forest_plot(title: str, rows: Sequence[ForestRow], x_label: str, better: int
     )
 
 
-def _cut(row: ForestRow, most: float) -> tuple[float, float] | None:
+def forest_color(row: SceneEstimate, better: int) -> str:
+    """Grey if the interval contains 0 or is unknown, green on the side ``better``, else red."""
+    if row.interval is None or not row.interval.excludes_zero():
+        return "#555555"
+    return "#1b7837" if row.mean * better > 0.0 else "#b2182b"
+
+
+def _cut(row: SceneEstimate, most: float) -> tuple[float, float] | None:
     """The ends of a row's interval, at most ``most`` from 0; None without an interval."""
     if row.interval is None:
         return None
     return max(row.interval.low, -most), min(row.interval.high, most)
-
-
-RANK_TOP, GROUP_STEP = 44, 9  # px: rows of a rank plot begin here; between the bars of its groups
-LETTER = 6.6  # px, a letter of 12 px on average
-
-
-def rank_plot(ranking: Ranking) -> str:
-    """Mean ranks, one arm per row.
-
-    Bars at the right join arms that do not differ; the scale shows the critical difference.
-    """
-    names, count, groups = [str(arm) for arm in ranking.arms], len(ranking.scenes), ranking.groups
-    left = 20 + LETTER * max(map(len, names))
-    right = left + max(160.0, WIDTH - left - 30)
-    heights = [RANK_TOP + FOREST_ROW * (k + 0.5) for k in range(len(names))]
-
-    def to_px(rank: float) -> float:
-        return left + (rank - 1) / (len(names) - 1) * (right - left)
-
-    listed = ", ".join(
-        f"{name} {rank:.2f}" for name, rank in zip(names, ranking.ranks, strict=True)
-    )
-    joined = "; ".join(f"{names[first]} to {names[last]}" for first, last in groups) or "none"
-    critical = f"{ranking.critical:.2f}"
-    friedman = (
-        "" if ranking.p is None else f" Friedman's test that no arm differs: p {p_text(ranking.p)}."
-    )
-    return fill(
-        "rank_plot.html.j2",
-        title=f"{ranking.quantity.name}: ranks over {count} scenes",
-        words=f"Mean ranks, 1 is best: {listed}. Critical difference {critical}. Not different: "
-        f"{joined}.",
-        note="A bar joins arms whose ranks differ by less than the critical difference (CD, "
-        f"Nemenyi, 5 %).{friedman}",
-        arms=list(zip(heights, names, ranking.ranks, strict=True)),
-        groups=[
-            (right + 14 + GROUP_STEP * k, heights[a] - 6, heights[b] + 6)
-            for k, (a, b) in enumerate(groups)
-        ],
-        critical=f"CD {critical}",
-        scale=to_px(1 + ranking.critical) - to_px(1),
-        x=to_px,
-        left=left,
-        right=right,
-        width=right + 24 + GROUP_STEP * len(groups),
-        height=heights[-1] + FOREST_ROW / 2 + 30,
-        top=RANK_TOP,
-        bottom=heights[-1] + FOREST_ROW / 2,
-    )
 
 
 ROUND = (1, 2, 2.5, 5, 10)  # steps between ticks, as multiples of a power of ten

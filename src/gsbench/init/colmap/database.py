@@ -15,8 +15,7 @@ from gsbench.init.base import FIELD_OF_VIEW_DEG
 from gsbench.init.colmap.pairs import select_pairs
 from gsbench.init.options import ColmapOptions
 from gsbench.scene.colmap import rescaled_camera
-from gsbench.scene.exif import lens_of
-from gsbench.scene.images import image_size, open_image, read_image, write_png
+from gsbench.scene.images import image_size, lens_of, open_image, read_image, write_png
 from gsbench.scene.types import Capture
 
 DEFAULT_FOCAL_LENGTH = 1.2  # of the longest side, as in COLMAP

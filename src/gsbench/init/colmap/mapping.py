@@ -22,7 +22,7 @@ import pycolmap
 from gsbench.errors import InputError
 from gsbench.init.base import REGISTERED_SHARE, UnplacedError
 from gsbench.init.colmap import database as colmap_database
-from gsbench.init.colmap import geometry
+from gsbench.init.colmap import matches
 from gsbench.init.options import ColmapOptions
 from gsbench.logs import Progress
 from gsbench.scene.rules import MIN_IMAGES
@@ -217,8 +217,8 @@ class _Mapper:
         colmap_database.remove_database(copy)
         shutil.copy(self.database, copy)
         pairs = colmap_database.assume_focal_lengths(copy, factor)
-        options = geometry.verification_options(self.options)
-        geometry.verify_pairs(copy, pairs, options, self.progress)
+        options = matches.verification_options(self.options)
+        matches.verify_pairs(copy, pairs, options, self.progress)
         return self.incremental(copy, SMALL_ANGLE_DEG)
 
     def _run(

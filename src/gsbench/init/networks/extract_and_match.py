@@ -14,9 +14,8 @@ from gsbench.files import file_sha256
 from gsbench.init.base import Preparation, Timer
 from gsbench.init.colmap.pairs import STRONGEST, proposed_pairs, select_pairs
 from gsbench.init.colmap.reconstruct import load_reference
-from gsbench.init.networks.extractors import EXTRACTORS, extract_features
 from gsbench.init.networks.features import Features, FeatureSettings, FeatureStore
-from gsbench.init.networks.matchers import build_matcher, match
+from gsbench.init.networks.models import EXTRACTORS, build_matcher, extract_features, match
 from gsbench.init.options import ColmapOptions
 from gsbench.logs import Progress
 from gsbench.scene.masks import read_mask

@@ -328,30 +328,17 @@ def draw_ellipsoids(
         color = Cause(int(causes[index[member]])).color
         canvas.line([tuple(point) for point in outline.T.round().astype(int).tolist()], fill=color)
     drawn = [cause for cause in Cause if (causes[index[projected.index]] == int(cause)).any()]
-    condition = f"with a volume above {volume_threshold:g}"
-    title = (
-        f"Gaussians {condition}, by what made them:" if drawn else f"no Gaussian {condition} here"
-    )
+    condition = f"volume above {volume_threshold:g}"
+    title = f"{condition}, made by:" if drawn else f"none has a {condition}"
     return _with_legend(image, title, drawn)
 
 
 def _with_legend(image: Image.Image, title: str, causes: Sequence[Cause]) -> Image.Image:
-    """The image with a legend below: title, and causes in their colours, wrapped to its width."""
-    words = [(word, TEXT_COLOR) for word in title.split()]
-    words += [(cause.words, cause.color) for cause in causes]
-    font = ImageFont.load_default(FONT_SIZE)
-    places: list[tuple[int, int]] = []
-    x, row = 0, 0
-    for text, _ in words:
-        width = math.ceil(font.getlength(text)) + FONT_SIZE // 2
-        if x and x + width > image.width:
-            x, row = 0, row + 1
-        places.append((x + 2, row))
-        x += width
-    height = (row + 1) * LINE_HEIGHT
-    result = Image.new("RGB", (image.width, image.height + height))
+    """The image with a legend below: a line for the title, and one in its colour for each cause."""
+    lines = [(title, TEXT_COLOR), *((cause.words, cause.color) for cause in causes)]
+    result = Image.new("RGB", (image.width, image.height + len(lines) * LINE_HEIGHT))
     result.paste(image, (0, 0))
-    canvas = ImageDraw.Draw(result)
-    for (text, color), (left, line) in zip(words, places, strict=True):
-        canvas.text((left, image.height + line * LINE_HEIGHT), text, fill=color, font=font)
+    canvas, font = ImageDraw.Draw(result), ImageFont.load_default(FONT_SIZE)
+    for row, (text, color) in enumerate(lines):
+        canvas.text((2, image.height + row * LINE_HEIGHT), text, fill=color, font=font)
     return result

@@ -37,7 +37,7 @@ from gsbench.pipeline.steps.train import check_points, write_training
 from gsbench.runs.keys import TRAIN, Step, options_of, step_of
 from gsbench.runs.layout import EVENTS, POINT_CLOUD, RENDERS, TRAINER_LOG
 from gsbench.runs.trial_record import FROM_MODEL, FROM_RENDERS
-from gsbench.system.own_modules import SAFE_PATH
+from gsbench.system.programs import SAFE_PATH
 from gsbench.words import readable_time
 
 if TYPE_CHECKING:

@@ -5,7 +5,7 @@ as PNG.
 """
 
 from dataclasses import asdict, replace
-from functools import cache, cached_property
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +18,9 @@ from gsbench.init.placed import GREY
 from gsbench.init.point_files import read_points
 from gsbench.logs import Progress, progress
 from gsbench.normalization import IDENTITY
-from gsbench.runs.keys import CAPTURE, CODE_OF_VIEWS, GROUND_TRUTH, INIT, Step, options_of, step_of
-from gsbench.runs.layout import MASKS, VIEWS
+from gsbench.runs.keys import CAPTURE, GROUND_TRUTH, INIT, Step, options_of, step_of
+from gsbench.runs.layout import MASKS
 from gsbench.runs.nested import sha256_of
-from gsbench.runs.package_code import edited, states_of
 from gsbench.runs.store import Store
 from gsbench.runs.user_code import NO_USER_CODE, UserCode
 from gsbench.scene.beside import digests, files_beside
@@ -222,27 +221,14 @@ class Views:
             scene = load_scene(
                 self.capture,
                 self.store.path(self.init) / MODEL_FOLDER,
-                self.store.root / VIEWS,
+                self.store,
                 progress=report,
-                made_by=view_versions(),
                 **self.preparation,
                 **self._beside,
             )
         scene = without_copies(scene)
         odd = inspect("scene", scene, f"scene {scene.name}", self.capture.accept)
         return replace(scene, oddities=scene.oddities + odd)
-
-
-@cache
-def view_versions() -> dict[str, str | None]:
-    """The versions of what makes the views' pixels: edited parts of gsbench, and packages.
-
-    Pillow reads and shrinks images, pycolmap undistorts them.
-    """
-    return {
-        **edited(states_of(CODE_OF_VIEWS)),
-        **{package: version_of(package) for package in ("pycolmap", "pillow")},
-    }
 
 
 def ground_truth_step(views: Views) -> Step:

@@ -27,10 +27,9 @@ from gsbench.runs.keys import TRAIN, Step, options_of, rasterizer_inputs, step_o
 from gsbench.runs.layout import LINEAGE, POINT_CLOUD, TRAINING
 from gsbench.runs.trial_record import InitialCloud, Oddity
 from gsbench.scene.types import Capture
-from gsbench.system.compile_clock import CLOCK
 from gsbench.system.install import own_checkout
 from gsbench.system.machine import describe_machine
-from gsbench.system.resources import peak_memory_mb, reset_peak_memory
+from gsbench.system.resources import CLOCK, peak_memory_mb, reset_peak_memory
 from gsbench.train.options import IDEAS
 from gsbench.train.start import check_start
 from gsbench.train.trainer import Status, Trainer

@@ -6,6 +6,7 @@ The two factors of a step are those of `gsbench.gaussians.trainable.ParameterSta
 import numpy as np
 
 from gsbench.gaussians.paper_values import ADAM_BETAS, ADAM_EPSILON
+from gsbench.raster.cpu import layout as at
 from gsbench.raster.cpu.simd import LANES, load, square_root, store
 from gsbench.system.jit import inlined, kernel
 
@@ -68,28 +69,10 @@ def adam_rows(spare, begin, end, values, first, second, gradients, active, facto
 @inlined
 def step_all(gaussians, adam, gradients, begin, end, spare):
     """Step the Gaussians ``begin`` to before ``end``; row 0 of ``gradients`` is of ``begin``."""
-    first, second, factors, active = adam
-    step_rows(
-        gaussians.means, first.means, second.means, gradients.means,
-        begin, end, 0, 3, factors[0, 0], factors[0, 1], spare,
-    )  # fmt: skip
-    step_rows(
-        gaussians.log_scales, first.log_scales, second.log_scales, gradients.log_scales,
-        begin, end, 0, 3, factors[1, 0], factors[1, 1], spare,
-    )  # fmt: skip
-    step_rows(
-        gaussians.quaternions, first.quaternions, second.quaternions, gradients.quaternions,
-        begin, end, 0, 4, factors[2, 0], factors[2, 1], spare,
-    )  # fmt: skip
-    step_rows(
-        gaussians.logits, first.logits, second.logits, gradients.logits,
-        begin, end, 0, 1, factors[3, 0], factors[3, 1], spare,
-    )  # fmt: skip
-    step_rows(
-        gaussians.sh_dc, first.sh_dc, second.sh_dc, gradients.sh_dc,
-        begin, end, 0, 3, factors[4, 0], factors[4, 1], spare,
-    )  # fmt: skip
-    step_rows(
-        gaussians.sh_rest, first.sh_rest, second.sh_rest, gradients.sh_rest,
-        begin, end, 0, active, factors[5, 0], factors[5, 1], spare,
-    )  # fmt: skip
+    for k in range(len(gaussians)):
+        values = gaussians[k]
+        active = adam.active if k == at.SH_REST else values.shape[1]
+        a, b = adam.factors[k, 0], adam.factors[k, 1]
+        step_rows(
+            values, adam.first[k], adam.second[k], gradients[k], begin, end, 0, active, a, b, spare
+        )

@@ -123,6 +123,18 @@ def _log2_alpha_again(records, base, dx, dy):
 
 
 @inlined
+def _at_block(frame, base, place, offset_x, offset_y, number, state):
+    """dx, dy, t and log2(alpha) of a record in a block, and where the forward pass blended it.
+
+    ``number`` counts the entries of the tile's list up to the record.
+    """
+    dx, dy = load(PIXEL_X, place) + offset_x, load(PIXEL_Y, place) + offset_y
+    power, t = _log2_alpha_again(frame.records, base, dx, dy)
+    blended = (power >= LOG2_ALPHA_MIN) & (number <= load(frame.last, state + place))
+    return dx, dy, t, power, blended
+
+
+@inlined
 def _touched_blocks(records, base, tile_x, tile_y, column, row):
     """The blocks of the tile at pixel (tile_x, tile_y) that may have a pixel with alpha >= 1/255.
 
@@ -363,42 +375,21 @@ def composite_backward_tiles(memory, first, past, frame, g_image, g_alpha, all_r
             offset_x = tile_x - records[base + at.MEAN_X]
             offset_y = tile_y - records[base + at.MEAN_Y]
             number = splat(np.float32(entry - begin + 1))
-            sum_r, sum_g, sum_b = splat(ZERO), splat(ZERO), splat(ZERO)
-            sum_h, sum_ht, sum_hy = splat(ZERO), splat(ZERO), splat(ZERO)
-            sum_htt, sum_hty, sum_hyy = splat(ZERO), splat(ZERO), splat(ZERO)
-            sum_abs_t, sum_abs_y = splat(ZERO), splat(ZERO)
+            zero = splat(ZERO)
+            sums = (zero, zero, zero, zero, zero, zero, zero, zero, zero)
+            sum_abs_t, sum_abs_y = zero, zero
             while todo != 0:
                 block = lowest_bit(todo)
                 todo &= todo - np.uint64(1)
                 place = block * np.uint64(LANES)
-                dx = load(PIXEL_X, place) + offset_x
-                dy = load(PIXEL_Y, place) + offset_y
-                power, t = _log2_alpha_again(records, base, dx, dy)
-                blended = (power >= LOG2_ALPHA_MIN) & (number <= load(frame.last, state + place))
+                _, dy, t, power, blended = _at_block(
+                    frame, base, place, offset_x, offset_y, number, state
+                )
                 raw = select(blended, exp2(power), ZERO)
-                opacity = minimum(raw, splat(ALPHA_MAX))
-                before = load(through, place) / (ONE - opacity)
-                weight = before * opacity
-                g_red, g_green, g_blue = _load_planes(planes, place)
-                light = fma(g_green, records[base + at.GREEN], g_blue * records[base + at.BLUE])
-                light = fma(g_red, records[base + at.RED], light)  # c . g
-                later = load(behind, place)
-                gain = light - later
-                # d loss / d log(alpha). The gradient passes the clamp to 0.99, as in 3DGS: hence
-                # the raw alpha.
-                h = before * raw * gain
-                store(behind, place, fma(opacity, gain, later))
-                store(through, place, before)
-                sum_r = fma(weight, g_red, sum_r)
-                sum_g = fma(weight, g_green, sum_g)
-                sum_b = fma(weight, g_blue, sum_b)
+                g = _load_planes(planes, place)
+                h, weight = _pull(records, base, place, raw, g, behind, through)
                 ht, hy = h * t, h * dy
-                sum_h += h
-                sum_ht += ht
-                sum_hy += hy
-                sum_htt = fma(ht, t, sum_htt)
-                sum_hty = fma(ht, dy, sum_hty)
-                sum_hyy = fma(hy, dy, sum_hyy)
+                sums = _add_moments(sums, h, ht, hy, t, dy, weight, g)
                 if want_absolute is not None:
                     sum_abs_t += absolute(ht)
                     # d power / d mean_y = shear a t + e dy, with a and e from the curves: curve =
@@ -406,13 +397,46 @@ def composite_backward_tiles(memory, first, past, frame, g_image, g_alpha, all_r
                     shear_a = records[base + at.SHEAR] * records[base + at.CURVE_T]
                     slope = fma(ht, shear_a, hy * records[base + at.CURVE_Y])
                     sum_abs_y += absolute(slope) * TO_PRECISION
-            moments = (sum_h, sum_ht, sum_hy, sum_htt, sum_hty, sum_hyy, sum_r, sum_g, sum_b)
             if want_absolute is not None:
-                sums = lane_sums((*moments, sum_abs_t, sum_abs_y))
+                total = lane_sums((*sums, sum_abs_t, sum_abs_y))
             else:
-                sums = lane_sums(moments)
+                total = lane_sums(sums)
             # No atomics: a shard of tiles is run by one thread, which alone writes to these rows.
-            store(rows, base, load(rows, base) + sums)
+            store(rows, base, load(rows, base) + total)
+
+
+@inlined
+def _pull(records, base, place, raw, g, behind, through):
+    """d loss / d log(alpha) and the weight alpha T of a record in a block; move U and T on.
+
+    ``raw`` is alpha before the clamp to 0.99, 0 where the record was not blended; the gradient
+    passes the clamp, as in 3DGS. ``g`` is the gradient of the pixels.
+    """
+    opacity = minimum(raw, splat(ALPHA_MAX))
+    before = load(through, place) / (ONE - opacity)
+    light = fma(g[1], records[base + at.GREEN], g[2] * records[base + at.BLUE])
+    light = fma(g[0], records[base + at.RED], light)  # c . g
+    later = load(behind, place)
+    gain = light - later
+    store(behind, place, fma(opacity, gain, later))
+    store(through, place, before)
+    return before * raw * gain, before * opacity
+
+
+@inlined
+def _add_moments(sums, h, ht, hy, t, dy, weight, g):
+    """The first nine sums of a gradient row (`layout`) with those of one more block."""
+    return (
+        sums[0] + h,
+        sums[1] + ht,
+        sums[2] + hy,
+        fma(ht, t, sums[3]),
+        fma(ht, dy, sums[4]),
+        fma(hy, dy, sums[5]),
+        fma(weight, g[0], sums[6]),
+        fma(weight, g[1], sums[7]),
+        fma(weight, g[2], sums[8]),
+    )
 
 
 @inlined
@@ -484,10 +508,9 @@ def cover_tiles(memory, first, past, frame, values, covered, sums, distances):
                 block = lowest_bit(todo)
                 todo &= todo - np.uint64(1)
                 place = block * np.uint64(LANES)
-                dx = load(PIXEL_X, place) + offset_x
-                dy = load(PIXEL_Y, place) + offset_y
-                power, _ = _log2_alpha_again(records, base, dx, dy)
-                blended = (power >= LOG2_ALPHA_MIN) & (number <= load(frame.last, state + place))
+                dx, dy, _, _, blended = _at_block(
+                    frame, base, place, offset_x, offset_y, number, state
+                )
                 count += select(blended, splat(ONE), ZERO)
                 total += select(blended, load(own, place), ZERO)
                 reach += select(blended, square_root(fma(dx, dx, dy * dy)), ZERO)

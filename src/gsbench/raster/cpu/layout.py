@@ -60,7 +60,7 @@ class Parameters(NamedTuple):
 
 
 COLUMNS = (3, 3, 4, 1, 3, REST)  # of `Parameters`
-
+SH_REST = 5  # its place
 
 CHUNK = 512  # Gaussians whose gradients, 120 kB, stay in the cache until Adam reads them
 

@@ -33,6 +33,7 @@ from gsbench.raster.cpu.shuffle import (
     index_bits,
     load_rest,
     outer_rest,
+    store_columns,
     store_rest,
     transpose,
 )
@@ -202,24 +203,26 @@ def _project(memory, begin, end, gaussians, degree, v, outputs):
         clamped = select(red < ZERO, splat(ONE), ZERO)
         clamped += select(green < ZERO, splat(TWO), ZERO) + select(blue < ZERO, splat(FOUR), ZERO)
 
-        # One vector per entry of a record; a transposition makes one row per Gaussian of them.
-        store(rows, at.MEAN_X * LANES, column)
-        store(rows, at.MEAN_Y * LANES, row)
-        store(rows, at.SHEAR * LANES, -xy / yy)
-        store(rows, at.CURVE_T * LANES, a * (-0.5 * LOG2_E))
-        store(rows, at.CURVE_Y * LANES, (-0.5 * LOG2_E) / yy)
-        store(rows, at.LOG2_OPACITY * LANES, log2_opacity)
-        store(rows, at.RED * LANES, maximum(ZERO, red))  # NaN stays
-        store(rows, at.GREEN * LANES, maximum(ZERO, green))
-        store(rows, at.BLUE * LANES, maximum(ZERO, blue))
-        store(rows, at.SLOPE * LANES, xy / xx)
-        store(rows, at.RIGHTMOST_Y * LANES, xy * square_root(reach / xx))
-        store(rows, at.DEPTH * LANES, z)
-        store(rows, at.TILES_X * LANES, as_span(first_x, past_x))
-        store(rows, at.TILES_Y * LANES, as_span(first_y, past_y))
-        store(rows, at.INDEX * LANES, index_bits(start))
-        store(rows, at.CLAMPED * LANES, as_integers(clamped))
-        transpose(rows, 0)
+        # One vector per entry of a record, in the order of `layout`; one row per Gaussian of them.
+        entries = (
+            column,
+            row,
+            -xy / yy,
+            a * (-0.5 * LOG2_E),
+            (-0.5 * LOG2_E) / yy,
+            log2_opacity,
+            maximum(ZERO, red),  # NaN stays
+            maximum(ZERO, green),
+            maximum(ZERO, blue),
+            xy / xx,
+            xy * square_root(reach / xx),
+            z,
+            as_span(first_x, past_x),
+            as_span(first_y, past_y),
+            index_bits(start),
+            as_integers(clamped),
+        )
+        store_columns(rows, 0, entries)
         while todo != 0:
             lane = lowest_bit(todo)
             todo &= todo - np.uint64(1)
@@ -360,12 +363,8 @@ def _clear_unseen(begin, end, origin, record, past_record, record_ints, outputs)
     for own in range(record, past_record + 1):
         past = end if own == past_record else _gaussian(record_ints, own)
         if past > unseen:
-            _clear(gradients.means, unseen - origin, past - origin)
-            _clear(gradients.log_scales, unseen - origin, past - origin)
-            _clear(gradients.quaternions, unseen - origin, past - origin)
-            _clear(gradients.logits, unseen - origin, past - origin)
-            _clear(gradients.sh_dc, unseen - origin, past - origin)
-            _clear(gradients.sh_rest, unseen - origin, past - origin)
+            for k in range(len(gradients)):
+                _clear(gradients[k], unseen - origin, past - origin)
             _clear(g_screen, unseen, past)
             if len(g_absolute) > 0:
                 _clear(g_absolute, unseen, past)

@@ -12,17 +12,15 @@ Indices count array elements; they are not checked and must not be negative. Arr
 
 import math
 import operator
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from collections.abc import Callable
+from inspect import Parameter, Signature, signature
 
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.core import extending as numba_extending
 from numba.core.extending import lower_builtin, models, register_model
-from numba.core.typing.templates import AbstractTemplate, infer_global, signature
-
-# Kernels call an intrinsic without its first argument, typing_context.
-intrinsic: Any = numba_extending.intrinsic
+from numba.core.typing.templates import AbstractTemplate, infer_global
+from numba.core.typing.templates import signature as numba_signature
 
 LANES = 16  # of float32
 
@@ -58,11 +56,11 @@ BINARY = [(Vector, Vector), (Vector, types.Number), (types.Number, Vector)]
 @register_model(Vector)
 @register_model(Mask)
 class _Model(models.PrimitiveModel):
-    def __init__(self, manager: Any, frontend_type: Any) -> None:
+    def __init__(self, manager, frontend_type):
         super().__init__(manager, frontend_type, frontend_type.ir)
 
 
-def lane_indices(lanes: Sequence[int]) -> ir.Constant:
+def lane_indices(lanes):
     """The numbers of lanes as a constant for LLVM's shuffles."""
     return ir.Constant(
         ir.VectorType(ir.IntType(32), len(lanes)),
@@ -70,16 +68,14 @@ def lane_indices(lanes: Sequence[int]) -> ir.Constant:
     )
 
 
-def broadcast(builder: Any, scalar: Any, kind: ir.VectorType) -> Any:
+def broadcast(builder, scalar, kind):
     """The LLVM value ``scalar`` in all lanes of a vector of the LLVM type ``kind``."""
     undefined = ir.Constant(kind, ir.Undefined)
     first = builder.insert_element(undefined, scalar, ir.Constant(ir.IntType(32), 0))
     return builder.shuffle_vector(first, undefined, lane_indices([0] * kind.count))
 
 
-def as_vectors(
-    context: Any, builder: Any, values: Sequence[Any], kinds: Sequence[Any]
-) -> list[Any]:
+def as_vectors(context, builder, values, kinds):
     """``values``, of the numba types ``kinds``, as vectors; numbers are broadcast to all lanes."""
     return [
         broadcast(builder, context.cast(builder, value, kind, types.float32), VECTOR.ir)
@@ -89,17 +85,46 @@ def as_vectors(
     ]
 
 
-def _fits(kinds: Sequence[Any]) -> bool:
-    """Whether the numba types are vectors and numbers."""
-    return all(isinstance(kind, Vector | types.Number) for kind in kinds)
+def lowering(gives, names: str, check: Callable[..., None] = lambda *kinds: None):
+    """Make numba call a function ``emit(context, builder, sig, args)`` where a kernel calls it.
+
+    ``names`` are the kernel's arguments, ``gives`` is the numba type of the result, and ``check``
+    raises TypeError for types of arguments that the function does not take.
+    """
+
+    def decorate(emit):
+        def define(typing_context, *kinds):
+            check(*kinds)
+            return gives(*kinds), emit
+
+        define.__name__, define.__doc__ = emit.__name__, emit.__doc__
+        # numba reads the number of arguments here
+        parameters = [
+            Parameter(name, Parameter.POSITIONAL_OR_KEYWORD)
+            for name in ("typing_context", *names.split())
+        ]
+        define.__signature__ = Signature(parameters)  # type: ignore[attr-defined]
+        return numba_extending.intrinsic(define)
+
+    return decorate
 
 
-def _register_operator(
-    functions: Sequence[Any],
-    operands: Sequence[tuple[Any, ...]],
-    emit: Callable[..., Any],
-    gives: types.Type = VECTOR,
-) -> None:
+def of_vectors(emit):
+    """`lowering` of a function ``emit(builder, *operands)`` of vectors and numbers to a vector."""
+
+    def check(*kinds):
+        if not all(isinstance(kind, Vector | types.Number) for kind in kinds):
+            raise TypeError(f"vectors and numbers are needed, got {kinds}")
+
+    def codegen(context, builder, sig, args):
+        return emit(builder, *as_vectors(context, builder, args, sig.args))
+
+    codegen.__name__, codegen.__doc__ = emit.__name__, emit.__doc__
+    _, *names = signature(emit).parameters
+    return lowering(VECTOR, " ".join(names), check)(codegen)
+
+
+def _register_operator(functions, operands, emit, gives=VECTOR):
     """Make numba compile ``functions`` to ``emit(builder, *operands)``.
 
     ``operands`` lists the combinations of types that they take, ``gives`` is the type of the
@@ -107,13 +132,13 @@ def _register_operator(
     """
 
     class _Template(AbstractTemplate):
-        def generic(self, args: Sequence[Any], kws: Any) -> Any:
+        def generic(self, args, kws):
             fits = any(
                 len(args) == len(kinds) and all(map(isinstance, args, kinds)) for kinds in operands
             )
-            return signature(gives, *args) if fits else None
+            return numba_signature(gives, *args) if fits else None
 
-    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    def lower(context, builder, sig, args):
         return emit(builder, *as_vectors(context, builder, args, sig.args))
 
     for function in functions:
@@ -122,7 +147,7 @@ def _register_operator(
             lower_builtin(function, *kinds)(lower)
 
 
-def _emits(instruction: str, *options: str) -> Callable[..., Any]:
+def _emits(instruction, *options):
     """A function (builder, *operands) that emits one LLVM instruction."""
     return lambda builder, *operands: getattr(builder, instruction)(*options, *operands)
 
@@ -142,69 +167,60 @@ _register_operator([operator.invert], [(Mask,)], _emits("not_"), MASK)
 # Memory
 
 
-def address(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+def address(context, builder, sig, args):
     """Address of element ``args[1]`` of the array ``args[0]``."""
     data = context.make_array(sig.args[0])(context, builder, args[0]).data
     return builder.gep(data, [context.cast(builder, args[1], sig.args[1], types.intp)])
 
 
-def pointer_to(context: Any, builder: Any, sig: Any, args: Any, kind: ir.Type = VECTOR.ir) -> Any:
+def pointer_to(context, builder, sig, args, kind=VECTOR.ir):
     """`address` as a pointer to a value of the LLVM type ``kind``."""
     return builder.bitcast(address(context, builder, sig, args), kind.as_pointer())
 
 
-def _check_array(array: Any) -> None:
-    if not (
-        isinstance(array, types.Array) and array.layout == "C" and array.dtype == types.float32
-    ):
+def _is_array(kind, dtype):
+    return isinstance(kind, types.Array) and kind.layout == "C" and kind.dtype == dtype
+
+
+def _check_array(array, *others):
+    if not _is_array(array, types.float32):
         raise TypeError(f"a contiguous float32 array is needed, got {array}")
 
 
-@intrinsic
-def load(typing_context, array, index):
-    """The vector ``array.flat[index : index + 16]``."""
-    _check_array(array)
-
-    def codegen(context, builder, sig, args):
-        # LLVM aligns the stack to 16 bytes only. Vectors that it spills to the stack could then
-        # cross cache lines, in some processes and threads but not in others, which would cost a
-        # quarter of a kernel's time.
-        builder.function.attributes.alignstack = 4 * LANES
-        builder.function.attributes.add("nounwind")
-        return builder.load(pointer_to(context, builder, sig, args), align=4)
-
-    return VECTOR(array, index), codegen
-
-
-@intrinsic
-def load_numbers(typing_context, array, index):
-    """Like ``load``, but the array may also be uint8."""
-    is_bytes = isinstance(array, types.Array) and array.layout == "C" and array.dtype == types.uint8
-    if not is_bytes:
+def _check_numbers(array, index):
+    if not _is_array(array, types.uint8):
         _check_array(array)
+
+
+@lowering(VECTOR, "array index", _check_array)
+def load(context, builder, sig, args):
+    """The vector ``array.flat[index : index + 16]``."""
+    # LLVM aligns the stack to 16 bytes only. Vectors that it spills to the stack could then cross
+    # cache lines, in some processes and threads but not in others, which would cost a quarter of a
+    # kernel's time.
+    builder.function.attributes.alignstack = 4 * LANES
+    builder.function.attributes.add("nounwind")
+    return builder.load(pointer_to(context, builder, sig, args), align=4)
+
+
+@lowering(VECTOR, "array index", _check_numbers)
+def load_numbers(context, builder, sig, args):
+    """Like ``load``, but the array may also be uint8."""
+    is_bytes = sig.args[0].dtype == types.uint8
     kind = ir.VectorType(ir.IntType(8), LANES) if is_bytes else VECTOR.ir
-
-    def codegen(context, builder, sig, args):
-        value = builder.load(pointer_to(context, builder, sig, args, kind), align=1)
-        return builder.uitofp(value, VECTOR.ir) if is_bytes else value
-
-    return VECTOR(array, index), codegen
+    value = builder.load(pointer_to(context, builder, sig, args, kind), align=1)
+    return builder.uitofp(value, VECTOR.ir) if is_bytes else value
 
 
-@intrinsic
-def store(typing_context, array, index, value):
+@lowering(types.void, "array index value", _check_array)
+def store(context, builder, sig, args):
     """Write the vector ``value`` to ``array.flat[index : index + 16]``."""
-    _check_array(array)
-
-    def codegen(context, builder, sig, args):
-        (operand,) = as_vectors(context, builder, args[2:], sig.args[2:])
-        builder.store(operand, pointer_to(context, builder, sig, args), align=4)
-        return context.get_dummy_value()
-
-    return types.void(array, index, value), codegen
+    (operand,) = as_vectors(context, builder, args[2:], sig.args[2:])
+    builder.store(operand, pointer_to(context, builder, sig, args), align=4)
+    return context.get_dummy_value()
 
 
-def _places(context: Any, builder: Any, sig: Any, args: Any) -> Iterator[Any]:
+def _places(context, builder, sig, args):
     """The address of ``array.flat[indices[k] * stride + offset]`` for each lane k.
 
     ``args`` starts with ``array``, ``indices``, ``stride`` and ``offset``.
@@ -217,198 +233,139 @@ def _places(context: Any, builder: Any, sig: Any, args: Any) -> Iterator[Any]:
         yield builder.gep(data, [builder.add(builder.mul(index, stride), offset)])
 
 
-@intrinsic
-def gather(typing_context, array, indices, stride, offset):
+@lowering(VECTOR, "array indices stride offset", _check_array)
+def gather(context, builder, sig, args):
     """Load ``array.flat[indices[k] * stride + offset]`` into lane k; ``indices`` is int64 [16]."""
-    _check_array(array)
-
-    def codegen(context, builder, sig, args):
-        vector = ir.Constant(VECTOR.ir, ir.Undefined)
-        for lane, place in enumerate(_places(context, builder, sig, args)):
-            vector = builder.insert_element(
-                vector, builder.load(place), ir.Constant(ir.IntType(32), lane)
-            )
-        return vector
-
-    return VECTOR(array, indices, stride, offset), codegen
+    vector = ir.Constant(VECTOR.ir, ir.Undefined)
+    for lane, place in enumerate(_places(context, builder, sig, args)):
+        number = ir.Constant(ir.IntType(32), lane)
+        vector = builder.insert_element(vector, builder.load(place), number)
+    return vector
 
 
-@intrinsic
-def scatter(typing_context, array, indices, stride, offset, value):
+@lowering(types.void, "array indices stride offset value", _check_array)
+def scatter(context, builder, sig, args):
     """Write lane k of ``value`` to ``array.flat[indices[k] * stride + offset]``.
 
     If indices are equal, the last lane is kept.
     """
-    _check_array(array)
-
-    def codegen(context, builder, sig, args):
-        for lane, place in enumerate(_places(context, builder, sig, args)):
-            builder.store(
-                builder.extract_element(args[4], ir.Constant(ir.IntType(32), lane)), place
-            )
-        return context.get_dummy_value()
-
-    return types.void(array, indices, stride, offset, value), codegen
+    for lane, place in enumerate(_places(context, builder, sig, args)):
+        number = ir.Constant(ir.IntType(32), lane)
+        builder.store(builder.extract_element(args[4], number), place)
+    return context.get_dummy_value()
 
 
-@intrinsic
-def prefetch(typing_context, array, index):
+@lowering(types.void, "array index")
+def prefetch(context, builder, sig, args):
     """Prefetch the cache line of ``array.flat[index]``; never faults."""
-
-    def codegen(context, builder, sig, args):
-        byte_pointer, word = ir.IntType(8).as_pointer(), ir.IntType(32)
-        kind = ir.FunctionType(ir.VoidType(), [byte_pointer, word, word, word])
-        function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
-        read, keep_in_all_caches, data = (ir.Constant(word, value) for value in (0, 3, 1))
-        pointer = pointer_to(context, builder, sig, args, ir.IntType(8))
-        builder.call(function, [pointer, read, keep_in_all_caches, data])
-        return context.get_dummy_value()
-
-    return types.void(array, index), codegen
+    byte_pointer, word = ir.IntType(8).as_pointer(), ir.IntType(32)
+    kind = ir.FunctionType(ir.VoidType(), [byte_pointer, word, word, word])
+    function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
+    read, keep_in_all_caches, data = (ir.Constant(word, value) for value in (0, 3, 1))
+    pointer = pointer_to(context, builder, sig, args, ir.IntType(8))
+    builder.call(function, [pointer, read, keep_in_all_caches, data])
+    return context.get_dummy_value()
 
 
 # Functions of vectors and masks
 
 
-def _call(builder: Any, name: str, *operands: Any) -> Any:
+def _call(builder, name, *operands):
     kind = ir.FunctionType(VECTOR.ir, [VECTOR.ir] * len(operands))
     return builder.call(
         cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v{LANES}f32"), operands
     )
 
 
-def _function(emit: Callable[..., Any], *kinds: Any) -> Any:
-    """An intrinsic of vectors and numbers that compiles to ``emit(builder, *operands)``."""
-    if not _fits(kinds):
-        return None
-
-    def codegen(context, builder, sig, args):
-        return emit(builder, *as_vectors(context, builder, args, sig.args))
-
-    return VECTOR(*kinds), codegen
-
-
-def _choice(sign: str, a: Any, b: Any) -> Any:
-    """``a if a <sign> b else b``: one instruction of x86, where LLVM's minnum takes several."""
-    return _function(
-        lambda builder, x, y: builder.select(builder.fcmp_ordered(sign, x, y), x, y), a, b
-    )
-
-
-@intrinsic
-def splat(typing_context, scalar):
+@of_vectors
+def splat(builder, scalar):
     """A vector with ``scalar`` in all lanes."""
-
-    def codegen(context, builder, sig, args):
-        return as_vectors(context, builder, args, sig.args)[0]
-
-    return VECTOR(scalar), codegen
+    return scalar
 
 
-@intrinsic
-def fma(typing_context, a, b, c):
+@of_vectors
+def fma(builder, a, b, c):
     """``a * b + c``, fused if that is fast on the host."""
-    return _function(lambda builder, *v: _call(builder, "fmuladd", *v), a, b, c)
+    return _call(builder, "fmuladd", a, b, c)
 
 
-@intrinsic
-def minimum(typing_context, a, b):
+# `minimum` and `maximum` are one instruction of x86, where LLVM's minnum takes several.
+
+
+@of_vectors
+def minimum(builder, a, b):
     """``a if a < b else b``, which is b if either is NaN."""
-    return _choice("<", a, b)
+    return builder.select(builder.fcmp_ordered("<", a, b), a, b)
 
 
-@intrinsic
-def maximum(typing_context, a, b):
+@of_vectors
+def maximum(builder, a, b):
     """``a if a > b else b``, which is b if either is NaN."""
-    return _choice(">", a, b)
+    return builder.select(builder.fcmp_ordered(">", a, b), a, b)
 
 
-@intrinsic
-def absolute(typing_context, a):
-    """``|a|``."""
-    return _function(lambda builder, x: _call(builder, "fabs", x), a)
+@of_vectors
+def absolute(builder, a):
+    return _call(builder, "fabs", a)
 
 
-@intrinsic
-def square_root(typing_context, a):
-    return _function(lambda builder, x: _call(builder, "sqrt", x), a)
+@of_vectors
+def square_root(builder, a):
+    return _call(builder, "sqrt", a)
 
 
-@intrinsic
-def floor(typing_context, a):
-    return _function(lambda builder, x: _call(builder, "floor", x), a)
+@of_vectors
+def floor(builder, a):
+    return _call(builder, "floor", a)
 
 
-@intrinsic
-def ceil(typing_context, a):
-    return _function(lambda builder, x: _call(builder, "ceil", x), a)
+@of_vectors
+def ceil(builder, a):
+    return _call(builder, "ceil", a)
 
 
-@intrinsic
-def select(typing_context, mask, a, b):
+@lowering(VECTOR, "mask a b")
+def select(context, builder, sig, args):
     """``a`` where ``mask`` is True, else ``b``; one of the two may be a number."""
-    if not _fits((a, b)) or mask != MASK:
-        return None
-
-    def codegen(context, builder, sig, args):
-        return builder.select(args[0], *as_vectors(context, builder, args[1:], sig.args[1:]))
-
-    return VECTOR(mask, a, b), codegen
+    return builder.select(args[0], *as_vectors(context, builder, args[1:], sig.args[1:]))
 
 
-@intrinsic
-def mask_bits(typing_context, mask):
+@lowering(types.uint64, "mask")
+def mask_bits(context, builder, sig, args):
     """The mask as an integer with lane k in bit k."""
-
-    def codegen(context, builder, sig, args):
-        return builder.zext(builder.bitcast(args[0], ir.IntType(LANES)), ir.IntType(64))
-
-    return types.uint64(mask), codegen
+    return builder.zext(builder.bitcast(args[0], ir.IntType(LANES)), ir.IntType(64))
 
 
-@intrinsic
-def mask_from_bits(typing_context, bits):
+@lowering(MASK, "bits")
+def mask_from_bits(context, builder, sig, args):
     """The mask whose lane k is bit k of an integer."""
-
-    def codegen(context, builder, sig, args):
-        wide_bits = context.cast(builder, args[0], sig.args[0], types.uint64)
-        return builder.bitcast(builder.trunc(wide_bits, ir.IntType(LANES)), MASK.ir)
-
-    return MASK(bits), codegen
+    wide_bits = context.cast(builder, args[0], sig.args[0], types.uint64)
+    return builder.bitcast(builder.trunc(wide_bits, ir.IntType(LANES)), MASK.ir)
 
 
-@intrinsic
-def lanes_with_bit(typing_context, masks, index, bit):
+@lowering(types.uint64, "masks index bit")
+def lanes_with_bit(context, builder, sig, args):
     """A 64-bit word whose bit k is 1 if ``masks.flat[index + k] & bit`` is not 0.
 
     ``masks`` is a uint16 array.
     """
     lanes = 64
     kind = ir.VectorType(ir.IntType(16), lanes)
-
-    def codegen(context, builder, sig, args):
-        values = builder.load(pointer_to(context, builder, sig, args, kind), align=2)
-        wanted = broadcast(builder, context.cast(builder, args[2], sig.args[2], types.uint16), kind)
-        found = builder.icmp_unsigned(
-            "!=", builder.and_(values, wanted), ir.Constant(kind, [0] * lanes)
-        )
-        return builder.bitcast(found, ir.IntType(lanes))
-
-    return types.uint64(masks, index, bit), codegen
+    values = builder.load(pointer_to(context, builder, sig, args, kind), align=2)
+    wanted = broadcast(builder, context.cast(builder, args[2], sig.args[2], types.uint16), kind)
+    none = ir.Constant(kind, [0] * lanes)
+    found = builder.icmp_unsigned("!=", builder.and_(values, wanted), none)
+    return builder.bitcast(found, ir.IntType(lanes))
 
 
-@intrinsic
-def lowest_bit(typing_context, bits):
+@lowering(types.uint64, "bits")
+def lowest_bit(context, builder, sig, args):
     """The number of the lowest set bit of an integer, which must not be 0."""
-
-    def codegen(context, builder, sig, args):
-        wide_bits = context.cast(builder, args[0], sig.args[0], types.uint64)
-        return builder.cttz(wide_bits, ir.Constant(ir.IntType(1), 1))
-
-    return types.uint64(bits), codegen
+    wide_bits = context.cast(builder, args[0], sig.args[0], types.uint64)
+    return builder.cttz(wide_bits, ir.Constant(ir.IntType(1), 1))
 
 
-def _polynomial(builder: Any, x: Any, coefficients: Sequence[float]) -> Any:
+def _polynomial(builder, x, coefficients):
     """``sum_k coefficients[k] x^k``."""
     value = VECTOR.constant(coefficients[-1])
     for coefficient in coefficients[-2::-1]:
@@ -426,86 +383,64 @@ _LOG2_SERIES = tuple(2.0 / math.log(2.0) / (2 * k + 1) for k in range(5))
 _BITS_OF_ROOT_HALF = 0x3F3504F3
 
 
-@intrinsic
-def exp2(typing_context, a):
+@of_vectors
+def exp2(builder, a):
     """``2^a`` with an error of at most 2.5e-7 for -126 <= a < 127.5; undefined elsewhere.
 
     2^a = 2^n 2^f. Adding 1.5 * 2^23 to a leaves the nearest integer n in the low bits of the
     mantissa.
     """
-
-    def emit(builder, x):
-        magic = VECTOR.constant(1.5 * 2.0**MANTISSA_BITS)
-        shifted = builder.fadd(x, magic)
-        fraction = builder.fsub(x, builder.fsub(shifted, magic))
-        value = builder.bitcast(_polynomial(builder, fraction, _EXP2), VECTOR.bits_ir)
-        exponent = builder.shl(builder.bitcast(shifted, VECTOR.bits_ir), VECTOR.bits(MANTISSA_BITS))
-        return builder.bitcast(builder.add(value, exponent), VECTOR.ir)
-
-    return _function(emit, a)
+    magic = VECTOR.constant(1.5 * 2.0**MANTISSA_BITS)
+    shifted = builder.fadd(a, magic)
+    fraction = builder.fsub(a, builder.fsub(shifted, magic))
+    value = builder.bitcast(_polynomial(builder, fraction, _EXP2), VECTOR.bits_ir)
+    exponent = builder.shl(builder.bitcast(shifted, VECTOR.bits_ir), VECTOR.bits(MANTISSA_BITS))
+    return builder.bitcast(builder.add(value, exponent), VECTOR.ir)
 
 
-@intrinsic
-def log2(typing_context, a):
+@of_vectors
+def log2(builder, a):
     """``log2(a)`` of positive normal numbers, with an error of at most 2e-7 max(1, |log2(a)|).
 
     The result for other numbers is undefined.
     """
-
-    def emit(builder, x):
-        # x = 2^n m with m from sqrt(1/2) to sqrt(2): n is the difference of the bits and those of
-        # sqrt(1/2), shifted.
-        bits = builder.bitcast(x, VECTOR.bits_ir)
-        exponent = builder.ashr(
-            builder.sub(bits, VECTOR.bits(_BITS_OF_ROOT_HALF)), VECTOR.bits(MANTISSA_BITS)
-        )
-        mantissa = builder.bitcast(
-            builder.sub(bits, builder.shl(exponent, VECTOR.bits(MANTISSA_BITS))), VECTOR.ir
-        )
-        s = builder.fdiv(
-            builder.fsub(mantissa, VECTOR.constant(1.0)),
-            builder.fadd(mantissa, VECTOR.constant(1.0)),
-        )
-        series = _polynomial(builder, builder.fmul(s, s), _LOG2_SERIES)
-        return _call(builder, "fmuladd", s, series, builder.sitofp(exponent, VECTOR.ir))
-
-    return _function(emit, a)
+    # a = 2^n m with m from sqrt(1/2) to sqrt(2): n is the difference of the bits and those of
+    # sqrt(1/2), shifted.
+    bits, digits = builder.bitcast(a, VECTOR.bits_ir), VECTOR.bits(MANTISSA_BITS)
+    exponent = builder.ashr(builder.sub(bits, VECTOR.bits(_BITS_OF_ROOT_HALF)), digits)
+    mantissa = builder.bitcast(builder.sub(bits, builder.shl(exponent, digits)), VECTOR.ir)
+    one = VECTOR.constant(1.0)
+    s = builder.fdiv(builder.fsub(mantissa, one), builder.fadd(mantissa, one))
+    series = _polynomial(builder, builder.fmul(s, s), _LOG2_SERIES)
+    return _call(builder, "fmuladd", s, series, builder.sitofp(exponent, VECTOR.ir))
 
 
 # The lane of ``lane_sums`` with the sum of its k-th argument: the four bits of k, reversed.
 SUM_LANES = tuple(int(f"{k:04b}"[::-1], 2) for k in range(LANES))
 
 
-@intrinsic
-def lane_sums(typing_context, vectors):
+@lowering(VECTOR, "vectors")
+def lane_sums(context, builder, sig, args):
     """Sum the 16 lanes of each of up to 16 vectors.
 
     Returns a vector with the k-th sum in lane ``SUM_LANES[k]`` and 0 in the other lanes. A tree of
     shuffles and additions merges pairs of vectors at each level, so the sums of eleven vectors take
     about as long as three single sums.
     """
-    if not (isinstance(vectors, types.UniTuple) and vectors.dtype is VECTOR):
-        return None
-
-    def codegen(context, builder, sig, args):
-        level = [builder.extract_value(args[0], k) for k in range(sig.args[0].count)]
-        half = LANES // 2
-        while half:
-            if len(level) % 2:
-                level.append(VECTOR.constant(0.0))
-            # In each group of 2 * half lanes, the first half is from a, the second from b.
-            low = [
-                lane // (2 * half) * 2 * half + lane % half + lane // half % 2 * LANES
-                for lane in range(LANES)
-            ]
-            first, second = lane_indices(low), lane_indices([lane + half for lane in low])
-            level = [
-                builder.fadd(
-                    builder.shuffle_vector(a, b, first), builder.shuffle_vector(a, b, second)
-                )
-                for a, b in zip(level[::2], level[1::2], strict=True)
-            ]
-            half //= 2
-        return level[0]
-
-    return VECTOR(vectors), codegen
+    level = [builder.extract_value(args[0], k) for k in range(sig.args[0].count)]
+    half = LANES // 2
+    while half:
+        if len(level) % 2:
+            level.append(VECTOR.constant(0.0))
+        # In each group of 2 * half lanes, the first half is from a, the second from b.
+        low = [
+            lane // (2 * half) * 2 * half + lane % half + lane // half % 2 * LANES
+            for lane in range(LANES)
+        ]
+        first, second = lane_indices(low), lane_indices([lane + half for lane in low])
+        level = [
+            builder.fadd(builder.shuffle_vector(a, b, first), builder.shuffle_vector(a, b, second))
+            for a, b in zip(level[::2], level[1::2], strict=True)
+        ]
+        half //= 2
+    return level[0]

@@ -152,15 +152,13 @@ def _leave_light_behind(first_border, crossed, red, green, blue):
 
 
 @triton.jit
-def _composite_pixels(block, begin, end, steps, size, inputs, outputs):
+def _composite_pixels(block, begin, end, steps, size, lists, pixels, closing, image, alpha):
     """Composite a list, ``begin`` to ``end``, into the pixels of ``block`` at ``steps`` [S].
 
-    The tuples have arguments of ``composite``: those of the image's size, what is read and what is
-    written.
+    See ``composite`` for the other arguments; ``size`` is that of the image.
     """
     width, height, blocks_x = size
-    entries, records, closing, background = inputs
-    image, alpha, transmittance, last, borders = outputs
+    entries, records, background = lists.entries, lists.records, pixels.background
     inside, pixel, x, y = block_pixels(block, steps, blocks_x, width, height)
     # The transmittance of a pixel that has stopped or is outside the image has a minus sign: it
     # does not change again.
@@ -178,7 +176,7 @@ def _composite_pixels(block, begin, end, steps, size, inputs, outputs):
     alive = True
     position = begin
     places = block_places(steps)
-    first_border = borders + (begin // SEGMENT).to(tl.int64) * BORDER + places
+    first_border = pixels.borders + (begin // SEGMENT).to(tl.int64) * BORDER + places
     crossed = 0
     while (position < end) & alive:
         border = tl.minimum(position + SEGMENT, end)
@@ -224,8 +222,8 @@ def _composite_pixels(block, begin, end, steps, size, inputs, outputs):
 
     light = tl.abs(light)
     state = block * BLOCK_PIXELS + places
-    tl.store(transmittance + state, light)
-    tl.store(last + state, tl.minimum(seen, end))
+    tl.store(pixels.transmittance + state, light)
+    tl.store(lists.last + state, tl.minimum(seen, end))
     tl.store(alpha + pixel, 1.0 - light, mask=inside)
     tl.store(image + 3 * pixel, tl.fma(light, tl.load(background), red), mask=inside)
     tl.store(image + 3 * pixel + 1, tl.fma(light, tl.load(background + 1), green), mask=inside)
@@ -233,39 +231,13 @@ def _composite_pixels(block, begin, end, steps, size, inputs, outputs):
 
 
 @triton.jit(do_not_specialize=["split", "closing", "width", "height", "blocks_x"])
-def composite(
-    order,
-    starts,
-    split,
-    entries,
-    records,
-    closing,
-    background,
-    width,
-    height,
-    blocks_x,
-    image,
-    alpha,
-    transmittance,
-    last,
-    borders,
-):
-    """Composite the blocks in ``order`` [blocks]; the first programs have those with long lists.
+def composite(lists, pixels, split, closing, width, height, blocks_x, image, alpha):
+    """Composite the blocks in their order; the first programs have those with long lists.
 
     Each of the first ``split`` blocks has ``STEPS`` programs. If its list is long, each of them
-    composites the pixels of one step; if not, the first composites all.
-
-    In:
-
-    - ``starts`` [blocks + 1] and ``entries`` [pairs], the lists;
-    - ``records`` [N + 1, 16], with an invisible one at ``closing``.
-
-    Out:
-
-    - ``image`` [H, W, 3], ``alpha`` [H, W];
-    - ``transmittance``, the final one, and ``last``, the end of the entries that were read before
-      the pixel stopped; both by block, lane and step;
-    - ``borders``, those that compositing of the pixel crossed.
+    composites the pixels of one step; if not, the first composites all. The record at ``closing``
+    is invisible. ``image`` is [H, W, 3], ``alpha`` [H, W]; ``lists`` are `Blocks`, ``pixels``
+    `Pixels`, of which the last entries, transmittances and borders are written.
     """
     program = tl.program_id(0)
     step = program % STEPS
@@ -273,18 +245,18 @@ def composite(
     if rank >= split:
         step = 0
         rank = program - split * (STEPS - 1)
-    block = tl.load(order + rank).to(tl.int32)
-    begin, end = tl.load(starts + block), tl.load(starts + block + 1)
-    pairs = tl.load(starts + tl.num_programs(0) - split * (STEPS - 1))
+    block = tl.load(pixels.order + rank).to(tl.int32)
+    begin, end = tl.load(lists.starts + block), tl.load(lists.starts + block + 1)
+    pairs = tl.load(lists.starts + tl.num_programs(0) - split * (STEPS - 1))
     size = (width, height, blocks_x)
-    inputs = (entries, records, closing, background)
-    outputs = (image, alpha, transmittance, last, borders)
     if (rank < split) & (end - begin > tl.maximum(pairs // LONG_SHARE, SEGMENT)):
         steps = step + tl.arange(0, 1)
-        _composite_pixels(block, begin, end, steps, size, inputs, outputs)
+        _composite_pixels(block, begin, end, steps, size, lists, pixels, closing, image, alpha)
     elif step == 0:
         steps_of_all = tl.arange(0, STEPS)
-        _composite_pixels(block, begin, end, steps_of_all, size, inputs, outputs)
+        _composite_pixels(
+            block, begin, end, steps_of_all, size, lists, pixels, closing, image, alpha
+        )
 
 
 @triton.jit
@@ -387,21 +359,15 @@ def store_last_slot(slots, last_slots, block, begin, end, mask):
 
 @triton.jit(do_not_specialize=["blocks", "inner", "closing", "width", "height", "blocks_x"])
 def composite_backward(
-    order,
-    starts,
+    lists,
+    pixels,
+    slots,
     blocks,
     inner,
-    entries,
-    slots,
-    records,
     closing,
-    background,
     width,
     height,
     blocks_x,
-    transmittance,
-    last,
-    borders,
     g_image,
     g_alpha,
     rows_out,
@@ -418,11 +384,12 @@ def composite_backward(
     [pairs] has the row of each entry. Rows of entries that compositing did not reach are not
     written: see ``last_slots`` at `store_last_slot`. ``g_alpha`` is read only if ``HAS_ALPHA``.
     """
-    block, begin = _segment(order, starts, blocks, inner)
+    entries, records, background = lists.entries, lists.records, pixels.background
+    block, begin = _segment(pixels.order, lists.starts, blocks, inner)
     steps = tl.arange(0, STEPS)
     places = block_places(steps)
     state = block * BLOCK_PIXELS + places
-    seen = tl.load(last + state)
+    seen = tl.load(lists.last + state)
     end = tl.max(tl.max(seen, 0), 0)
     store_last_slot(slots, last_slots, block, begin, end, tl.program_id(0) >= inner)
     # Compositing did not reach this segment.
@@ -438,7 +405,7 @@ def composite_backward(
         tl.load(g_image + 3 * pixel + 1, mask=inside, other=0.0),
         tl.load(g_image + 3 * pixel + 2, mask=inside, other=0.0),
     )
-    light = tl.load(transmittance + state)
+    light = tl.load(pixels.transmittance + state)
     behind = (
         g[0] * tl.load(background) + g[1] * tl.load(background + 1) + g[2] * tl.load(background + 2)
     )
@@ -448,7 +415,7 @@ def composite_backward(
     if stop < end:
         # A pixel that stopped before the border has none if another program composited it.
         crossed = seen > stop
-        border = borders + (begin // SEGMENT).to(tl.int64) * BORDER + places
+        border = pixels.borders + (begin // SEGMENT).to(tl.int64) * BORDER + places
         behind = tl.fma(g[0], tl.load(border + BEHIND_RED, mask=crossed, other=0.0), behind)
         behind = tl.fma(g[1], tl.load(border + BEHIND_GREEN, mask=crossed, other=0.0), behind)
         behind = tl.fma(g[2], tl.load(border + BEHIND_BLUE, mask=crossed, other=0.0), behind)

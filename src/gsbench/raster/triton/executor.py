@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -39,9 +38,13 @@ from gsbench.raster.triton.layout import (
 )
 from gsbench.raster.triton.lists import (
     UNITS_AT_FIRST,
+    Blocks,
     Lists,
+    Parameters,
+    Pixels,
     Projected,
     Room,
+    Rows,
     Units,
     check_pairs,
     find_all_units,
@@ -53,8 +56,6 @@ from gsbench.raster.triton.splitting import store_splitting
 from gsbench.scene.types import Camera
 
 EXTRA_KERNELS = {"splitting_matrix": store_splitting}  # each writes an extra output
-# the parameters from which the backward pass repeats the geometry of the forward pass
-READ_AGAIN = ("means", "log_scales", "quaternions", "opacity_logits")
 # Blocks, those with the longest lists, that may have four programs each: on a GPU of about 130
 # multiprocessors so many programs run at once. 0: each block has one program.
 SPLIT_BLOCKS = 1024
@@ -116,36 +117,22 @@ class TritonFrame:
     last: Tensor  # [blocks * BLOCK_PIXELS] int32
     borders: Tensor  # [count_borders(pairs) * BORDER]; see `composite` for these three
 
-    def of_blocks(self, request: RenderRequest) -> dict[str, Any]:
-        """The arguments that all kernels which read the lists of blocks have in common."""
-        return {
-            "starts": self.lists.starts,
-            "entries": self.lists.entries,
-            "records": self.projected.records,
-            "width": request.camera.width,
-            "height": request.camera.height,
-            "blocks_x": self.blocks_x,
-            "last": self.last,
-        }
+    def size(self, request: RenderRequest) -> dict[str, int]:
+        camera = request.camera
+        return {"width": camera.width, "height": camera.height, "blocks_x": self.blocks_x}
 
-    def of_pixels(self, request: RenderRequest) -> dict[str, Any]:
-        """The further arguments that both passes of compositing have in common."""
-        return {
-            "order": self.lists.order,
-            "closing": len(self.projected.row_counts),
-            "background": request.background,
-            "transmittance": self.transmittance,
-            "borders": self.borders,
-        }
+    @property
+    def of_blocks(self) -> Blocks:
+        lists = self.lists
+        return Blocks(lists.starts, lists.entries, self.projected.records, self.last)
 
-    def of_rows(self) -> dict[str, Tensor]:
-        """The arguments by which a kernel finds the rows of a Gaussian."""
-        return {
-            "row_counts": self.projected.row_counts,
-            "first_units": self.units.first,
-            "pair_ends": self.units.pair_ends,
-            "unit_widths": self.units.widths,
-        }
+    def of_pixels(self, request: RenderRequest) -> Pixels:
+        return Pixels(self.lists.order, request.background, self.transmittance, self.borders)
+
+    @property
+    def of_rows(self) -> Rows:
+        units = self.units
+        return Rows(self.projected.row_counts, units.first, units.pair_ends, units.widths)
 
 
 class TritonRasterizer(StagedRasterizer[TritonFrame]):
@@ -259,9 +246,11 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
         )
         split = min(SPLIT_BLOCKS, blocks)
         launch_grid(composite, blocks + split * (STEPS.value - 1))(
-            **frame.of_blocks(started.request),
-            **frame.of_pixels(started.request),
+            lists=frame.of_blocks,
+            pixels=frame.of_pixels(started.request),
             split=split,
+            closing=len(started.radii),
+            **frame.size(started.request),
             image=image,
             alpha=alpha,
             num_warps=1,
@@ -314,11 +303,13 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
         last_slots = scratch.take("last_slots", frame.blocks, torch.int64)
         inner = count_borders(lists.room.pairs)
         launch_grid(composite_backward, inner + frame.blocks)(
-            **frame.of_blocks(request),
-            **frame.of_pixels(request),
+            lists=frame.of_blocks,
+            pixels=frame.of_pixels(request),
+            slots=lists.slots,
             blocks=frame.blocks,
             inner=inner,
-            slots=lists.slots,
+            closing=count,
+            **frame.size(request),
             last_slots=last_slots,
             g_image=g_image,
             g_alpha=g_image if g_alpha is None else g_alpha,
@@ -328,23 +319,22 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
             num_warps=1,
         )
         _sum_units(frame, last_slots, rows)
-        tensors = gaussians.tensors()
         g_screen = allocate("g_screen", (count, 2), torch.float32)
         g_extra = None
         if request.extra is not None:
             g_extra = allocate("g_extra", (count, *self.extras[request.extra]), torch.float32)
         # An output that is not wanted has no memory; its pointer is any other, and is not used.
         launch(backproject, count, 128)(
-            **{name: tensors[name] for name in READ_AGAIN},
+            gaussians=Parameters(**gaussians.tensors()),
             count=count,
             camera=frame.view,
             record_ints=projected.records.view(torch.int32),
             color_slopes=projected.color_slopes,
-            **frame.of_rows(),
+            where=frame.of_rows,
             status=frame.units.status,
             **lists.room._asdict(),
             rows=rows,
-            **{f"g_{name}": gradient for name, gradient in zip(tensors, gradients, strict=True)},
+            gradients=Parameters(*gradients),
             g_screen=g_screen,
             g_absolute=g_screen if absolute is None else absolute,
             g_extra=g_screen if g_extra is None else g_extra,
@@ -374,7 +364,8 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
             rows = scratch.take("rows", frame.lists.room.pairs * ROW.value, torch.float32)
             last_slots = scratch.take("last_slots", frame.blocks, torch.int64)
             launch_grid(cover, frame.blocks)(
-                **frame.of_blocks(request),
+                lists=frame.of_blocks,
+                **frame.size(request),
                 slots=frame.lists.slots,
                 last_slots=last_slots,
                 values=given,
@@ -384,7 +375,7 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
             )
             _sum_units(frame, last_slots, rows)
             launch(sum_cover, count, 128)(
-                **frame.of_rows(),
+                where=frame.of_rows,
                 count=count,
                 rows=rows,
                 covered=covered,
@@ -428,10 +419,10 @@ def _project(
         memory.take("row_counts", count, torch.int32),
     )
     launch(project, count + 1, 128)(
-        **gaussians.detach().tensors(),
+        gaussians=Parameters(**gaussians.detach().tensors()),
         count=count,
         camera=view,
-        **projected._asdict(),
+        projected=projected,
         record_ints=projected.records.view(torch.int32),
         keys=keys,
         radii=radii,

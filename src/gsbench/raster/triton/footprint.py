@@ -24,14 +24,11 @@ from gsbench.raster.triton.projection import sum_rows
 
 @triton.jit(do_not_specialize=["width", "height", "blocks_x"])
 def cover(
-    starts,
-    entries,
+    lists,
     slots,
-    records,
     width,
     height,
     blocks_x,
-    last,
     values,
     rows_out,
     last_slots,
@@ -46,13 +43,13 @@ def cover(
     block = tl.program_id(0)
     steps = tl.arange(0, STEPS)
     inside, pixel, x, y = block_pixels(block, steps, blocks_x, width, height)
-    seen = tl.load(last + block * BLOCK_PIXELS + block_places(steps))
-    begin, end = tl.load(starts + block), tl.max(tl.max(seen, 0), 0)
+    seen = tl.load(lists.last + block * BLOCK_PIXELS + block_places(steps))
+    begin, end = tl.load(lists.starts + block), tl.max(tl.max(seen, 0), 0)
     store_last_slot(slots, last_slots, block, begin, end, True)
     given = tl.load(values + pixel, mask=inside & HAS_VALUES, other=0.0)
     columns = x[None, :] + (steps * LANE_COLUMNS).to(tl.float32)[:, None]
     for position in range(begin, end):
-        record = load_record(records, tl.load(entries + position))
+        record = load_record(lists.records, tl.load(lists.entries + position))
         power, _, dy = log2_alpha(record, steps, x, y)
         blended = (power >= LOG2_ALPHA_MIN) & (position < seen)
         dx = columns - record[0]
@@ -66,10 +63,7 @@ def cover(
 @triton.jit(do_not_specialize=["count"])
 def sum_cover(
     count,
-    row_counts,
-    first_units,
-    pair_ends,
-    unit_widths,
+    where,
     rows,
     covered,
     sums,
@@ -79,8 +73,8 @@ def sum_cover(
     """Write ``covered`` [N] int32, ``sums`` and ``distances`` [N] from the rows of units."""
     index = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
     inside = index < count
-    own_rows = tl.load(row_counts + index, mask=inside, other=0)
-    total, value, distance = sum_rows(index, own_rows, first_units, pair_ends, unit_widths, rows, 3)
+    own_rows = tl.load(where.counts + index, mask=inside, other=0)
+    total, value, distance = sum_rows(index, own_rows, where, rows, 3)
     tl.store(covered + index, total.to(tl.int32), mask=inside)
     tl.store(sums + index, value, mask=inside)
     tl.store(distances + index, distance, mask=inside)

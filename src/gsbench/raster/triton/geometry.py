@@ -131,72 +131,60 @@ def basis(direction, DEGREE: tl.constexpr):
 
 
 @triton.jit
-def _coefficients(sh_rest, index, k: tl.constexpr, mask):
-    """The k-th coefficients of red, green and blue, counted from degree 1."""
-    return load_vector(sh_rest + 3 * k, index * NUM_SH, mask)
+def _slopes(direction, DEGREE: tl.constexpr):
+    """The derivatives of `basis` by x, y and z of the direction; None is 0.
+
+    They are not projected to the tangent plane of the unit sphere.
+    """
+    x, y, z = direction
+    found = ((None, -F1, None), (None, None, F1), (-F1, None, None))
+    if DEGREE >= 2:
+        quadratic = (
+            (D0 * y, D0 * x, None),
+            (None, D1 * z, D1 * y),
+            (-2 * D2 * x, -2 * D2 * y, 4 * D2 * z),
+            (D3 * z, None, D3 * x),
+            (2 * D4 * x, -2 * D4 * y, None),
+        )
+        found = found + quadratic  # type: ignore[assignment]
+        if DEGREE >= 3:
+            xx, yy, zz = x * x, y * y, z * z
+            xy, yz, xz = x * y, y * z, x * z
+            cubic = (
+                (6 * T0 * xy, 3 * T0 * (xx - yy), None),
+                (T1 * yz, T1 * xz, T1 * xy),
+                (-2 * T2 * xy, T2 * (4 * zz - xx - 3 * yy), 8 * T2 * yz),
+                (-6 * T3 * xz, -6 * T3 * yz, T3 * (6 * zz - 3 * xx - 3 * yy)),
+                (T4 * (4 * zz - 3 * xx - yy), -2 * T4 * xy, 8 * T4 * xz),
+                (2 * T5 * xz, -2 * T5 * yz, T5 * (xx - yy)),
+                (3 * T6 * (xx - yy), -6 * T6 * xy, None),
+            )
+            found = found + cubic  # type: ignore[assignment]
+    return found
 
 
 @triton.jit
 def colors(direction, dc, sh_rest, index, mask, DEGREE: tl.constexpr):
     """The colours SH + 0.5, not clamped, of the Gaussians ``index`` at unit directions.
 
-    Also returns their derivatives by x, y and z of the direction, each for red, green and blue, not
-    yet projected to the tangent plane of the unit sphere. ``dc`` are the coefficients of degree 0.
-    The formulas are those of computeColorFromSH of 3DGS, with the constants of `gaussians.model`.
-    Each basis function k adds c_k times its value and its derivatives, which are written together.
+    Also returns their derivatives by x, y and z of the direction, each for red, green and blue; see
+    `_slopes`. ``dc`` are the coefficients of degree 0. The formulas are those of
+    computeColorFromSH of 3DGS, with the constants of `gaussians.model`.
     """
-    x, y, z = direction
     rgb = (dc[0] * F0 + 0.5, dc[1] * F0 + 0.5, dc[2] * F0 + 0.5)
-    zero = tl.zeros_like(x)
+    zero = tl.zeros_like(direction[0])
     by_x, by_y, by_z = (zero, zero, zero), (zero, zero, zero), (zero, zero, zero)
     if DEGREE >= 1:
-        values = basis(direction, DEGREE)
-        c = _coefficients(sh_rest, index, 0, mask)
-        rgb, by_y = plus(rgb, values[0], c), plus(by_y, -F1, c)
-        c = _coefficients(sh_rest, index, 1, mask)
-        rgb, by_z = plus(rgb, values[1], c), plus(by_z, F1, c)
-        c = _coefficients(sh_rest, index, 2, mask)
-        rgb, by_x = plus(rgb, values[2], c), plus(by_x, -F1, c)
-    if DEGREE >= 2:
-        c = _coefficients(sh_rest, index, 3, mask)
-        rgb, by_x, by_y = plus(rgb, values[3], c), plus(by_x, D0 * y, c), plus(by_y, D0 * x, c)
-        c = _coefficients(sh_rest, index, 4, mask)
-        rgb, by_y, by_z = plus(rgb, values[4], c), plus(by_y, D1 * z, c), plus(by_z, D1 * y, c)
-        c = _coefficients(sh_rest, index, 5, mask)
-        rgb, by_x = plus(rgb, values[5], c), plus(by_x, -2 * D2 * x, c)
-        by_y, by_z = plus(by_y, -2 * D2 * y, c), plus(by_z, 4 * D2 * z, c)
-        c = _coefficients(sh_rest, index, 6, mask)
-        rgb, by_x, by_z = plus(rgb, values[6], c), plus(by_x, D3 * z, c), plus(by_z, D3 * x, c)
-        c = _coefficients(sh_rest, index, 7, mask)
-        rgb = plus(rgb, values[7], c)
-        by_x = plus(by_x, 2 * D4 * x, c)
-        by_y = plus(by_y, -2 * D4 * y, c)
-    if DEGREE >= 3:
-        xx, yy, zz = x * x, y * y, z * z
-        xy, yz, xz = x * y, y * z, x * z
-        c = _coefficients(sh_rest, index, 8, mask)
-        rgb = plus(rgb, values[8], c)
-        by_x = plus(by_x, 6 * T0 * xy, c)
-        by_y = plus(by_y, 3 * T0 * (xx - yy), c)
-        c = _coefficients(sh_rest, index, 9, mask)
-        rgb, by_x = plus(rgb, values[9], c), plus(by_x, T1 * yz, c)
-        by_y, by_z = plus(by_y, T1 * xz, c), plus(by_z, T1 * xy, c)
-        c = _coefficients(sh_rest, index, 10, mask)
-        rgb, by_x = plus(rgb, values[10], c), plus(by_x, -2 * T2 * xy, c)
-        by_y, by_z = plus(by_y, T2 * (4 * zz - xx - 3 * yy), c), plus(by_z, 8 * T2 * yz, c)
-        c = _coefficients(sh_rest, index, 11, mask)
-        rgb, by_x = plus(rgb, values[11], c), plus(by_x, -6 * T3 * xz, c)
-        by_y, by_z = plus(by_y, -6 * T3 * yz, c), plus(by_z, T3 * (6 * zz - 3 * xx - 3 * yy), c)
-        c = _coefficients(sh_rest, index, 12, mask)
-        rgb, by_x = plus(rgb, values[12], c), plus(by_x, T4 * (4 * zz - 3 * xx - yy), c)
-        by_y, by_z = plus(by_y, -2 * T4 * xy, c), plus(by_z, 8 * T4 * xz, c)
-        c = _coefficients(sh_rest, index, 13, mask)
-        rgb, by_x = plus(rgb, values[13], c), plus(by_x, 2 * T5 * xz, c)
-        by_y, by_z = plus(by_y, -2 * T5 * yz, c), plus(by_z, T5 * (xx - yy), c)
-        c = _coefficients(sh_rest, index, 14, mask)
-        rgb = plus(rgb, values[14], c)
-        by_x = plus(by_x, 3 * T6 * (xx - yy), c)
-        by_y = plus(by_y, -6 * T6 * xy, c)
+        values, slopes = basis(direction, DEGREE), _slopes(direction, DEGREE)
+        for k in tl.static_range((DEGREE + 1) * (DEGREE + 1) - 1):
+            c = load_vector(sh_rest + 3 * k, index * NUM_SH, mask)  # of red, green and blue
+            rgb = plus(rgb, values[k], c)
+            if slopes[k][0] is not None:
+                by_x = plus(by_x, slopes[k][0], c)
+            if slopes[k][1] is not None:
+                by_y = plus(by_y, slopes[k][1], c)
+            if slopes[k][2] is not None:
+                by_z = plus(by_z, slopes[k][2], c)
     return rgb, by_x, by_y, by_z
 
 

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import weakref
 from collections import defaultdict
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -14,18 +12,6 @@ from torch import Tensor
 
 # Fuse products and sums to fma. It is the default of Triton only before 3.10.
 OPTIONS = {"enable_fp_fusion": True}
-
-_only_compiled = ContextVar("only_compiled", default=False)
-
-
-@contextmanager
-def only_compiled() -> Iterator[None]:
-    """Make launches in this context compile their kernels, but not run them."""
-    token = _only_compiled.set(True)
-    try:
-        yield
-    finally:
-        _only_compiled.reset(token)
 
 
 def launch(kernel: Any, count: int, group: int) -> Callable[..., None]:
@@ -50,10 +36,7 @@ def launch_grid(kernel: Any, *programs: int) -> Callable[..., None]:
     """
 
     def run(**arguments: Any) -> None:
-        if _only_compiled.get():
-            kernel.warmup(grid=programs, **OPTIONS, **arguments)
-        else:
-            kernel[programs](**OPTIONS, **arguments)
+        kernel[programs](**OPTIONS, **arguments)
 
     return run
 

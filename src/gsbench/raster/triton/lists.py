@@ -192,6 +192,17 @@ class Room(NamedTuple):
     pairs: int
 
 
+class Parameters(NamedTuple):
+    """The tensors of Gaussians, or their gradients; see `gsbench.gaussians.model.Gaussians`."""
+
+    means: Tensor
+    log_scales: Tensor
+    quaternions: Tensor
+    opacity_logits: Tensor
+    sh_dc: Tensor
+    sh_rest: Tensor
+
+
 class Projected(NamedTuple):
     """Results of projection for each of N Gaussians."""
 
@@ -219,6 +230,33 @@ class Lists(NamedTuple):
     starts: Tensor  # [blocks + 1] int32 first entry of each block
     entries: Tensor  # [P] int32 Gaussians, by block, front to back
     slots: Tensor  # [P] int64 slot of each entry
+
+
+class Rows(NamedTuple):
+    """The places of the rows of Gaussians, those of their units: see `sum_rows`."""
+
+    counts: Tensor  # [N] int32 number of units of each Gaussian
+    first_units: Tensor  # [N] int64
+    pair_ends: Tensor  # [R] int64
+    unit_widths: Tensor  # [R] int32
+
+
+class Blocks(NamedTuple):
+    """Inputs of all kernels that go through the lists of blocks."""
+
+    starts: Tensor  # [blocks + 1] int32
+    entries: Tensor  # [P] int32
+    records: Tensor  # [N + 1, 16]
+    last: Tensor  # [blocks * BLOCK_PIXELS] int32, end of the entries read before a pixel stopped
+
+
+class Pixels(NamedTuple):
+    """Memory of both passes of compositing, besides `Blocks`."""
+
+    order: Tensor  # [blocks] int64
+    background: Tensor  # [3]
+    transmittance: Tensor  # [blocks * BLOCK_PIXELS] the final one, by block, lane and step
+    borders: Tensor  # [count_borders(P) * BORDER] those that compositing of the pixel crossed
 
 
 def sort_by_depth(scratch: Workspace, projected: Projected, keys: Tensor) -> tuple[Tensor, Tensor]:

@@ -97,42 +97,36 @@ def _ellipse(quaternion, log_scale, axis_x, axis_y):
 
 @triton.jit(do_not_specialize=["count"])
 def project(
-    means,
-    log_scales,
-    quaternions,
-    opacity_logits,
-    sh_dc,
-    sh_rest,
+    gaussians,
     count,
     camera,
-    records,
+    projected,
     record_ints,
-    color_slopes,
     keys,
-    row_counts,
     radii,
     flags,
     DEGREE: tl.constexpr,
     GROUP: tl.constexpr,
 ):
-    """Project all Gaussians. Fills:
+    """Project all Gaussians (`Parameters`). Fills:
 
     - ``radii`` [N];
-    - ``records`` [N + 1, 16] of visible Gaussians (undefined for others), with an invisible record
-      at N; ``record_ints`` is the same memory;
-    - ``color_slopes`` [N, 9] of visible Gaussians, the derivatives of colour by the direction,
-      unless ``DEGREE`` is 0;
+    - of ``projected`` (`Projected`): the records of visible Gaussians (undefined for others), with
+      an invisible one at N, of which ``record_ints`` is the same memory; their ``color_slopes``,
+      the derivatives of colour by the direction, unless ``DEGREE`` is 0; and ``row_counts``, the
+      number of rows of blocks that the contour can touch;
     - ``keys`` [N], which sort Gaussians by depth, those that are not seen last;
-    - ``row_counts`` [N], the number of rows of blocks that the contour can touch;
     - ``flags`` [1], set to 1 if a value is not finite or a quaternion has length 0.
     """
+    records = projected.records
     v = load_camera(camera)
     index = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
     inside = index < count
-    mean, log_scale = load_vector(means, index, inside), load_vector(log_scales, index, inside)
-    dc = load_vector(sh_dc, index, inside)
-    quaternion, _, squared_norm = load_quaternion(quaternions, index, inside)
-    logit = tl.load(opacity_logits + index, mask=inside, other=0.0)
+    mean = load_vector(gaussians.means, index, inside)
+    log_scale = load_vector(gaussians.log_scales, index, inside)
+    dc = load_vector(gaussians.sh_dc, index, inside)
+    quaternion, _, squared_norm = load_quaternion(gaussians.quaternions, index, inside)
+    logit = tl.load(gaussians.opacity_logits + index, mask=inside, other=0.0)
     total = mean[0] + mean[1] + mean[2] + log_scale[0] + log_scale[1] + log_scale[2]
     total += squared_norm + logit + dc[0] + dc[1] + dc[2]
     bad = (squared_norm < MIN_SQUARED_NORM) | ~(tl.abs(total) < float("inf"))
@@ -174,16 +168,17 @@ def project(
     first_y = tl.maximum(first_y * BLOCK_ROWS, inner_y)
     past_y = tl.minimum(past_y * BLOCK_ROWS, outer_y)
     seen = visible & (growth * ALPHA_MIN < 1.0) & (first_x < past_x) & (first_y < past_y)
-    tl.store(row_counts + index, tl.where(seen, past_y - first_y, 0), mask=inside)
+    tl.store(projected.row_counts + index, tl.where(seen, past_y - first_y, 0), mask=inside)
     # The bits of positive float32 numbers sort like the numbers.
     tl.store(keys + index, tl.where(seen, z.to(tl.int32, bitcast=True), LAST_KEY), mask=inside)
 
     direction, _ = normalized(offset)
-    rgb, by_x, by_y, by_z = colors(direction, dc, sh_rest, index, seen, DEGREE)
+    rgb, by_x, by_y, by_z = colors(direction, dc, gaussians.sh_rest, index, seen, DEGREE)
     red, green, blue = rgb
     if DEGREE > 0:
         for c in tl.static_range(3):
-            store_vector(color_slopes + 3 * c, 3 * index, (by_x[c], by_y[c], by_z[c]), seen)
+            slopes = projected.color_slopes + 3 * c
+            store_vector(slopes, 3 * index, (by_x[c], by_y[c], by_z[c]), seen)
     bad |= seen & ~(tl.abs(red + green + blue) < float("inf"))
     clamped = (red < 0).to(tl.int32) + 2 * (green < 0).to(tl.int32) + 4 * (blue < 0).to(tl.int32)
 
@@ -238,13 +233,13 @@ def sum_units(
 
 
 @triton.jit
-def sum_rows(index, own_rows, first_units, pair_ends, unit_widths, rows, NUMBERS: tl.constexpr):
+def sum_rows(index, own_rows, where, rows, NUMBERS: tl.constexpr):
     """Sum the first ``NUMBERS`` columns of the ``rows`` of each Gaussian over its units.
 
-    ``own_rows`` is the number of units of each Gaussian. ``sum_units`` has already summed the pairs
-    of each unit into the row of its first pair.
+    ``own_rows`` is the number of units of each Gaussian, ``where`` are `Rows`. ``sum_units`` has
+    already summed the pairs of each unit into the row of its first pair.
     """
-    unit = tl.load(first_units + index, mask=own_rows > 0, other=0)
+    unit = tl.load(where.first_units + index, mask=own_rows > 0, other=0)
     zero = tl.zeros_like(own_rows).to(tl.float32)
     # Triton's tuples grow by ``+``; it knows neither ``*`` nor comprehensions.
     sums = ()
@@ -252,8 +247,8 @@ def sum_rows(index, own_rows, first_units, pair_ends, unit_widths, rows, NUMBERS
         sums = sums + (zero,)  # type: ignore[assignment]  # noqa: RUF005
     for k in range(0, tl.max(own_rows, 0)):
         active = k < own_rows
-        width = tl.load(unit_widths + unit + k, mask=active, other=0)
-        slot = tl.load(pair_ends + unit + k, mask=active, other=0) - width
+        width = tl.load(where.unit_widths + unit + k, mask=active, other=0)
+        slot = tl.load(where.pair_ends + unit + k, mask=active, other=0) - width
         grown = ()
         for n in tl.static_range(NUMBERS):
             own = tl.load(rows + slot * ROW + n, mask=width > 0, other=0.0)
@@ -276,28 +271,17 @@ def _turned(to, inverse_distance, g_rgb, color_slopes, index, mask, DEGREE: tl.c
 
 @triton.jit(do_not_specialize=["count", "units", "pairs"])
 def backproject(
-    means,
-    log_scales,
-    quaternions,
-    opacity_logits,
+    gaussians,
     count,
     camera,
     record_ints,
     color_slopes,
-    row_counts,
-    first_units,
-    pair_ends,
-    unit_widths,
+    where,
     status,
     units,
     pairs,
     rows,
-    g_means,
-    g_log_scales,
-    g_quaternions,
-    g_opacity_logits,
-    g_sh_dc,
-    g_sh_rest,
+    gradients,
     g_screen,
     g_absolute,
     g_extra,
@@ -306,7 +290,7 @@ def backproject(
     EXTRA: tl.constexpr,
     GROUP: tl.constexpr,
 ):
-    """Write the gradients of Gaussians that are seen: those with a row in ``row_counts``.
+    """Write the ``gradients`` of Gaussians that are seen: those with a row in ``where`` (`Rows`).
 
     Other gradients are not changed, except that ``g_screen``, ``g_absolute`` and ``g_extra``
     become 0. ``EXTRA`` is the function that writes ``g_extra``, for example that of
@@ -316,11 +300,12 @@ def backproject(
     index = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
     inside = index < count
     seeable = inside & lists_fit(status, units, pairs)
-    row_count = tl.load(row_counts + index, mask=seeable, other=0)
+    row_count = tl.load(where.counts + index, mask=seeable, other=0)
     seen = row_count > 0
-    sums = sum_rows(index, row_count, first_units, pair_ends, unit_widths, rows, 9 + 2 * ABSOLUTE)
+    sums = sum_rows(index, row_count, where, rows, 9 + 2 * ABSOLUTE)
     h, h_t, h_y, h_tt, h_ty, h_yy, red, green, blue = sums[:9]
-    mean, log_scale = load_vector(means, index, seen), load_vector(log_scales, index, seen)
+    mean = load_vector(gaussians.means, index, seen)
+    log_scale = load_vector(gaussians.log_scales, index, seen)
     offset = from_camera(mean, v)
 
     # Colour. A channel below 0 was clamped and has no gradient.
@@ -330,12 +315,12 @@ def backproject(
         tl.where(clamped & 2 != 0, 0.0, green),
         tl.where(clamped & 4 != 0, 0.0, blue),
     )
-    store_vector(g_sh_dc, index, stretched(g_rgb, F0), seen)
+    store_vector(gradients.sh_dc, index, stretched(g_rgb, F0), seen)
     to, inverse_distance = normalized(offset)
     tangent = _turned(to, inverse_distance, g_rgb, color_slopes, index, seen, DEGREE)
 
     # Repeat the geometry of the forward pass.
-    quaternion, inverse_norm, _ = load_quaternion(quaternions, index, seen)
+    quaternion, inverse_norm, _ = load_quaternion(gaussians.quaternions, index, seen)
     x, y, z = through(view_axes(v), offset)
     inverse_z = 1.0 / tl.where(seen, z, 1.0)
     free_x, free_y = x * inverse_z, y * inverse_z
@@ -360,19 +345,19 @@ def backproject(
         free = image_rows(free_x, free_y, inverse_z, v)
         EXTRA(g_extra, index, q00 - a * h, q01, q11 - e * h, shear, free, seen, inside)
     g_scales, turn, s0, s1 = covariance_gradients(q00, q01, q11, n0, n1, shear, scales)
-    store_vector(g_log_scales, index, g_scales, seen)
+    store_vector(gradients.log_scales, index, g_scales, seen)
     g_quaternion = quaternion_gradient(quaternion, turn, inverse_norm + inverse_norm)
-    place = g_quaternions + 4 * index
+    place = gradients.quaternions + 4 * index
     for k in tl.static_range(4):
         tl.store(place + k, g_quaternion[k], mask=seen)
 
     # The mean: through A = J W and the position on the image, and through the colour.
     a0, a1 = through(matrix, s0), through(matrix, s1)
     position = position_gradient(a0, a1, g_column, g_row, free_x, free_y, inverse_z, v)
-    store_vector(g_means, index, plus(position, 1.0, tangent), seen)
+    store_vector(gradients.means, index, plus(position, 1.0, tangent), seen)
 
     # d log(alpha) / d logit = 1 - opacity
-    g_logit = h / (tl.exp(tl.load(opacity_logits + index, mask=seen, other=0.0)) + 1.0)
-    tl.store(g_opacity_logits + index, g_logit, mask=seen)
+    g_logit = h / (tl.exp(tl.load(gaussians.opacity_logits + index, mask=seen, other=0.0)) + 1.0)
+    tl.store(gradients.opacity_logits + index, g_logit, mask=seen)
     # Last, when few other values need registers.
-    store_gradients(to, g_rgb, g_sh_rest, index, seen, DEGREE)
+    store_gradients(to, g_rgb, gradients.sh_rest, index, seen, DEGREE)

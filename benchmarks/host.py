@@ -1,4 +1,4 @@
-"""The host's cost of a training step, measured without a GPU.
+"""The host's cost of a training step, measured without a GPU: ``python -m benchmarks.host``.
 
 All kernels are replaced by launches that do nothing, and tensors are tiny, so that only the host's
 work remains: Python, torch's operations, autograd. A recorded graph becomes a call that does
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import ctypes
 import itertools
+import json
 import statistics
 import time
 from collections.abc import Iterator
@@ -96,14 +97,14 @@ class NullDevice:
         trainer.step = 3  # full degree of harmonics
         if way != "autograd":
             recorded = way == "recorded"
-            trainer.direct = DirectStep(
+            trainer.fast = DirectStep(
                 TritonRasterizer(),
                 TritonLoss(options.ssim_weight),
                 trainer.background,
                 recorded,
                 options.visible_adam,
             )
-            trainer.direct._pool = _NullPool()  # type: ignore[assignment]
+            vars(trainer.fast)["pool"] = _NullPool()
 
     def step(self) -> None:
         self.trainer.iterate(UNUSED_FOLDER)
@@ -170,3 +171,7 @@ def time_host() -> list[dict[str, Any]]:
             }
         )
     return rows
+
+
+if __name__ == "__main__":
+    print(json.dumps(time_host(), indent=2))

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsbench.errors import InputError
-from gsbench.eval.matching import match_by_order, match_pictures
+from gsbench.scene.names import match_by_order, match_pictures
 from tests.helpers import refusal
 
 PHOTOGRAPHS = ["DSC08000.JPG", "DSC08008.JPG", "DSC08016.JPG"]
