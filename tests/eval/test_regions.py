@@ -23,7 +23,7 @@ def test_a_pixel_has_the_depth_of_the_point_that_is_projected_nearest():
     points = rng.uniform([-2, -2, -3], [2, 2, 6], (40, 3))
     depths = depths_of_points(points, camera())
     shown = []
-    for x, y, z in points + [0, 0, 1]:
+    for x, y, z in points + np.array([0, 0, 1]):
         place = 10 * x / z + 6, 10 * y / z + 4.5
         if z > 0 and 0 <= place[0] < 12 and 0 <= place[1] < 9:
             shown.append((*place, z))

@@ -39,7 +39,7 @@ def parts_of(fps, evaluator=None, **changes):
         "rasterizer": ReferenceRasterizer(),
         "device": torch.device("cpu"),
         "train": SimpleNamespace(background=(0.1, 0.2, 0.3)),
-        "eval": SimpleNamespace(maps=False, fps=fps),
+        "eval": SimpleNamespace(maps=False, fps=fps, regions=None),
         "measured_earlier": [],
         "user_code": UserCode(),
         "program": None,

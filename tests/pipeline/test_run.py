@@ -143,6 +143,7 @@ def made(monkeypatch):
     monkeypatch.setattr(trials, "init_step", init)
     monkeypatch.setattr(trials, "Sfm", lambda threads: f"Sfm on {threads}")
     monkeypatch.setattr(trials, "Views", lambda *given: ("views", *given))
+    monkeypatch.setattr(trials, "check_capture", note("check", None))
     monkeypatch.setattr(trials, "train_step", note("train", step(TRAIN)))
     monkeypatch.setattr(trials, "external_step", note("external", step(TRAIN)))
     monkeypatch.setattr(trials, "ground_truth_step", note("truth", step(GROUND_TRUTH)))
@@ -166,7 +167,7 @@ def test_the_steps_of_photographs_follow_each_other(made, tmp_path):
     assert own.photographs == own.capture == "given"
     init = step(INIT, of=str(made.parts.initializer))
     assert [word for word, *_ in made.told] == split(
-        "read masking normalizing init train truth evaluate"
+        "read masking normalizing init check train truth evaluate"
     )
     by_name = {name: rest for name, *rest in made.told}
     assert by_name["read"] == [None]
@@ -303,7 +304,7 @@ def running(tmp_path, monkeypatch):
     monkeypatch.setattr(trials, "TrialSteps", Steps)
     monkeypatch.setattr(trials, "results_of", results_of)
     monkeypatch.setattr(trials, "_publish", lambda folder, *given: [folder / "init_report.json"])
-    monkeypatch.setattr(trials, "source_files", lambda capture, store: [])
+    monkeypatch.setattr(trials, "source_files", lambda *given: [])
     monkeypatch.setattr(torch, "set_num_threads", lambda count: state.seen.update(threads=count))
     return state
 

@@ -90,14 +90,14 @@ def test_pixels_of_an_undistorted_view_follow_the_lens():
     assert np.abs(chosen - expected)[inside].max() <= 2  # one pixel
 
 
-def test_a_kind_that_no_photograph_has_is_refused(scene_folder):
-    capture = read_colmap("x", scene_folder)
+def test_a_kind_that_no_photograph_has_is_refused(make_scene):
+    capture = read_colmap("x", make_scene())
     with refusal("scene.beside=depth: no photograph .* there are: none"):
         files_beside(capture, ["depth"])
 
 
-def test_views_have_depth_in_the_units_of_the_training(scene_folder, tmp_path):
-    capture = read_colmap("x", scene_folder)
+def test_views_have_depth_in_the_units_of_the_training(make_scene, tmp_path):
+    capture = read_colmap("x", make_scene())
     first, second = capture.image_names[:2]
     for name, value in ((first, 3000), (second, 5000)):
         path = tmp_path / f"{name}.png"

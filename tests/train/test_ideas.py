@@ -1,8 +1,10 @@
 """Loss, terms, schedule and optimiser of the user's: what they read, what they change, errors."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 
@@ -324,3 +326,54 @@ def test_a_resumed_training_with_parts_of_the_users_gives_the_same_bits(lab):
     assert [json.loads(line)["step"] for line in lab.text(METRICS, "killed").splitlines()] == [
         record["step"] for record in lab.records(METRICS, "whole")
     ]
+
+
+# ---- pictures beside the photographs
+
+
+def with_beside(lab):
+    """The scene with a depth and normals beside each training view, of its own size."""
+    views = []
+    for number, view in enumerate(lab.scene.train, 1):
+        size = view.image.shape[:2]
+        depth = np.full(size, number, np.float32)
+        normals = np.full((*size, 3), number, np.uint8)
+        views.append(replace(view, beside={"depth": depth, "normals": normals}))
+    return replace(lab.scene, train=tuple(views))
+
+
+@pytest.mark.parametrize("divisor", [1, 2])
+def test_a_term_reads_the_pictures_beside_the_photograph(lab, divisor):
+    seen = []
+
+    class Beside:
+        def __call__(self, step):
+            view = step.view
+            assert view.depth.shape == view.photograph.shape[:2]
+            assert view.more["normals"].shape == view.photograph.shape
+            names = [one.name for one in lab.scene.train]
+            assert view.depth.unique().tolist() == [names.index(view.name) + 1]
+            assert (view.more["normals"] == view.depth[..., None]).all()
+            seen.append(view.photograph.shape)
+            return 0 * step.render.image.mean()
+
+    start, settings = cloud(lab.truth), options(iterations=12)
+    scene, parts = with_beside(lab), Ideas.of(terms=[(Beside(), 1.0)])
+    trainer = Trainer(scene, start, NoDensifier(), lab.rasterizer, settings, 0, ideas=parts)
+    if divisor > 1:
+        trainer.resolution = SimpleNamespace(
+            scale=lambda step: divisor if step < 6 else 1, position_step=lambda step: step
+        )
+    trainer.run(lab.folder)
+    assert len(seen) == 12
+    assert len(set(seen)) == divisor  # sizes
+
+
+def test_without_pictures_beside_it_a_view_has_no_depth(lab):
+    class Bare:
+        def __call__(self, step):
+            assert step.view.depth is None
+            assert not step.view.more
+            return 0 * step.render.image.mean()
+
+    trained(lab, parts={"terms": [(Bare(), 1.0)]}, iterations=2)

@@ -32,6 +32,7 @@ from gsbench.pipeline.parts import Parts
 from gsbench.pipeline.results import results_of
 from gsbench.pipeline.steps.evaluate import evaluate_step
 from gsbench.pipeline.steps.external import external_step
+from gsbench.pipeline.steps.regions import check_capture, region_masks
 from gsbench.pipeline.steps.scene import (
     CaptureSource,
     Views,
@@ -114,8 +115,9 @@ class TrialSteps:
             reference = init_step(store, self.capture, Sfm(threads=parts.threads))
             yield reference
         init = init_step(store, self.capture, parts.initializer, reference, parts.user_code)
-        yield init
         self.views = Views(store, self.capture, init, parts.scene)
+        check_capture(self.views, parts)
+        yield init
         program = parts.program
         if program is None:
             trained = train_step(self.views, parts)
@@ -226,7 +228,7 @@ def _run(trial: Trial, folder: TrialFolder) -> TrialRecord:
         results = results_of(values, capture, scene, parts.raster, entries, code, asked)
         published = _publish(folder.path, entries, capture.normalization)
         kept = {name: entry.path for name, entry in entries.items() if name != keys.CAPTURE.name}
-        sources = source_files(trial_steps.photographs, store)
+        sources = source_files(trial_steps.photographs, parts, store)
         was_done = folder.write_finished(values, results, sources, kept, published)
         (folder.path / layout.BUILDING).unlink(missing_ok=True)
     size = "" if results.num_gaussians is None else f"  {results.num_gaussians} Gaussians"
@@ -257,12 +259,14 @@ def _questions(
     return asked
 
 
-def source_files(capture: Capture, store: Store) -> list[Path]:
+def source_files(capture: Capture, parts: Parts, store: Store) -> list[Path]:
     """The user's files from which a capture was read; none for a scene that gsbench made."""
     if capture.images.resolve().is_relative_to(store.root.resolve()):
         return []
     files = [capture.images / name for name in capture.image_names]
-    files += [*capture.masks.values(), *capture.read_from]
+    files += [*capture.masks.values(), *capture.depths.values(), *capture.read_from]
+    beside = [*capture.more.values(), *region_masks(capture, parts).values()]
+    files += [file for own in beside for file in own.values()]
     if capture.model is not None:
         files += model_files(capture.model)
     return [file.resolve() for file in files]

@@ -49,8 +49,8 @@ def read_beside(path: Path, kind: str, depth_scale: float | None = None) -> Pixe
     """The pixels of a file: depth in world units [H, W] float32, others uint8 [H, W, C].
 
     Depth is ``.npy`` with float32 values, or a picture of one channel; integers are steps of
-    ``depth_scale`` world units (None: a thousandth). Values that are not finite and above 0 become 0, which means that
-    the depth is not known. Raises InputError for a file that cannot be read.
+    ``depth_scale`` world units (None: a thousandth). Values that are not finite and above 0 become
+    0, which means that the depth is not known. Raises InputError for a file that cannot be read.
     """
     if kind != DEPTH:
         with open_image(path) as image:

@@ -99,8 +99,6 @@ def flat_camera(camera: CameraModel) -> Camera:
         return to_pinhole(camera)
     import pycolmap
 
-    from gsbench.scene.colmap import plain_camera
-
     options = pycolmap.UndistortCameraOptions()
     return to_pinhole(plain_camera(pycolmap.undistort_camera(options, _colmap_camera(camera))))
 

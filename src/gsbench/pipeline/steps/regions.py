@@ -25,16 +25,22 @@ if TYPE_CHECKING:
     from gsbench.pipeline.parts import Parts
 
 
+def check_capture(views: Views, parts: Parts) -> None:
+    """Raise InputError, before hours of work, if the capture lacks what settings ask for."""
+    _ = views.inputs, region_inputs(views, parts)
+
+
 def region_inputs(views: Views, parts: Parts) -> dict[str, Any] | None:
     """The inputs on which regions depend, besides the capture; None without regions.
 
     Raises InputError, before any training, if the scene cannot have them.
     """
-    wanted, capture = parts.eval.regions, views.capture
+    wanted = parts.eval.regions
     if not wanted:
         return None
+    capture = views.capture
     if wanted != DISTANCE:
-        return digests(_masks(views, parts))
+        return digests(region_masks(capture, parts))
     depths = _sensor_depths(capture)
     if not depths and (capture.model is None or not len(read_cloud(capture.model).points)):
         raise InputError(
@@ -48,12 +54,13 @@ def region_inputs(views: Views, parts: Parts) -> dict[str, Any] | None:
 
 def regions_of(views: Views, parts: Parts) -> Mapping[str, Regions]:
     """The regions of each test view as masks [H, W]; empty without ``eval.regions``."""
-    wanted, capture, test = parts.eval.regions, views.capture, views.scene.test
+    wanted = parts.eval.regions
     if not wanted:
         return {}
+    capture, test = views.capture, views.scene.test
     lenses = lenses_of(views.store.path(views.init) / MODEL_FOLDER)
     if wanted != DISTANCE:
-        masks = _masks(views, parts)
+        masks = region_masks(capture, parts)
         return {
             view.name: {
                 name: pixels_of_view(read_mask(files[view.name]), lenses[view.name], view.camera)
@@ -74,10 +81,11 @@ def regions_of(views: Views, parts: Parts) -> Mapping[str, Regions]:
     return regions_by_distance(_depths_in_model(capture, test))
 
 
-def _masks(views: Views, parts: Parts) -> dict[str, dict[str, Path]]:
-    """The mask file of each test view, by region."""
-    folders, names = parts.eval.regions, views.capture.test_names
-    assert isinstance(folders, dict)
+def region_masks(capture: Capture, parts: Parts) -> dict[str, dict[str, Path]]:
+    """The mask file of each test view, by region; empty without masks."""
+    folders, names = parts.eval.regions, capture.test_names
+    if not isinstance(folders, dict):
+        return {}
     root = Path(parts.scene.path or "").expanduser()
     return {
         region: find_masks(
