@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from functools import partial
 from shlex import split
+from types import SimpleNamespace
 
 import pytest
 
@@ -160,15 +161,16 @@ def test_versions_cover_python_and_the_installed_packages():
 
 
 def test_source_files_are_the_users_files_of_a_capture(tmp_path):
+    parts = SimpleNamespace(eval=SimpleNamespace(regions=None))
     store, model = Store(tmp_path / "store"), {"cameras.bin", "images.bin", "points3D.bin"}
     write_all(dict.fromkeys(model, ""), tmp_path / "model")
     capture = Capture("own", tmp_path, ("a.png", "b.png"), (), None, False, "0")
     images = [tmp_path / "a.png", tmp_path / "b.png"]
-    assert source_files(capture, store) == images
+    assert source_files(capture, parts, store) == images
     mask, listed = tmp_path / "m.png", tmp_path / "transforms.json"
     more = replace(capture, masks={"a.png": mask}, read_from=(listed,))
-    assert source_files(more, store) == [*images, mask, listed]
-    with_model = source_files(replace(capture, model=tmp_path / "model"), store)
+    assert source_files(more, parts, store) == [*images, mask, listed]
+    with_model = source_files(replace(capture, model=tmp_path / "model"), parts, store)
     assert with_model[:2] == images
     assert {path.name for path in with_model[2:]} >= model
-    assert source_files(replace(capture, images=store.root / "scene/key"), store) == []
+    assert source_files(replace(capture, images=store.root / "scene/key"), parts, store) == []
