@@ -205,6 +205,7 @@ def test_an_idea_whose_trials_fail_does_not_count_as_tried(home, trainings, caps
     assert attempt(f"{SPLIT}=0.02", "--json") == 1
     shown = json.loads(capsys.readouterr().out)
     assert (shown["result"], shown["tried"], shown["kept"]) == ("failed", 0, [])
+    assert shown["reason"] == "a typing error"
     trainings.fails = set()
     assert attempt(f"{SPLIT}=0.02") == 0
     assert results(home) == {"adc": "kept"}
