@@ -22,7 +22,7 @@ QUICK = [
 
 def test_a_trial_is_trained_again_after_an_edit_of_the_loss(gsbench, tmp_path):
     copy = tmp_path / "copy/src/gsbench"
-    shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(PACKAGE, copy)  # with byte code, which is that of unchanged files
     shutil.copytree(conf_dir(), tmp_path / "copy/conf")
     changes = {"PYTHONPATH": str(copy.parent), "GSBENCH_RUNS": str(tmp_path / "runs")}
 
