@@ -186,6 +186,9 @@ def _rounded(value: Any) -> Any:
 log = logging.getLogger(__name__)
 
 
+# ---- a search by another sweeper, which gets values of validation views and asks no question
+
+
 @dataclass
 class Goal:
     """The space that another sweeper searches, and the trials of its points, which lie in ``home``.
