@@ -19,9 +19,8 @@ from gsbench.init.colmap.database import (
     write_keypoints,
     write_matches,
 )
-from gsbench.init.colmap.features import extract_sift
 from gsbench.init.colmap.mapping import map_images
-from gsbench.init.colmap.matches import match_sift, verification_options, verify_pairs
+from gsbench.init.colmap.matches import extract_sift, match_sift, verification_options, verify_pairs
 from gsbench.init.networks.features import Features, FeatureSettings
 from gsbench.init.networks.models import extract_features
 from gsbench.logs import no_progress

@@ -235,7 +235,7 @@ def test_each_file_of_a_model_with_rigs_is_read_to_its_end(rigs, stem):
     )
     for content in torn:
         file.write_bytes(content)
-        with refusal(f"{rigs}.*: (copy or export|wanted is|rename)"):
+        with refusal(f"{rigs}.*: (copy or export|a line must be|rename)"):
             read_model(rigs)
 
 

@@ -77,7 +77,7 @@ def test_experiments_have_the_kind_of_model_development(runs):
 def test_a_tracker_whose_package_is_missing_is_refused_before_any_work(monkeypatch):
     monkeypatch.setitem(sys.modules, "wandb", None)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with refusal(r"tracking=wandb needs a package: pip install .*\[wandb\]"):
+    with refusal(r"tracking=wandb needs the package wandb: pip install .*\[wandb\]"):
         check_trackers([compose_one(["tracking=wandb"])])
     check_trackers([compose_one(["tracking=none"])])
 

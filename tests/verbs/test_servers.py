@@ -258,4 +258,4 @@ def test_the_viewer_shows_one_or_two_trials_until_ctrl_c(runs, monkeypatch, caps
     ]
     assert "one or two trials can be viewed, not 3" in refused("view a b c")
     monkeypatch.setattr(servers.importlib.util, "find_spec", lambda name: None)
-    assert "the viewer needs viser: " in refused("view a")
+    assert "the viewer needs the package viser: " in refused("view a")

@@ -131,7 +131,7 @@ def test_watching_looks_again_until_all_trials_have_ended(runs, monkeypatch, cap
     looks = []
     for state in ("running", "waiting", "done"):
         columns = {key: [0] for key in ("done", "running", "failed", "waiting")}
-        looks.append(pd.DataFrame(columns | {state: [1], SPEED: [8.25]}, index=["adc[lr=1]"]))
+        looks.append(pd.DataFrame(columns | {state: [1234], SPEED: [8.25]}, index=["adc[lr=1]"]))
         looks[-1].attrs["seconds_left"] = 120.0
     waited = []
     monkeypatch.setattr(trials, "progress_frame", lambda *_: looks.pop(0))
@@ -139,7 +139,7 @@ def test_watching_looks_again_until_all_trials_have_ended(runs, monkeypatch, cap
     trials._watch(runs, "x")
     assert waited == [trials.SECONDS_BETWEEN_LOOKS] * 2
     said = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert "adc[lr=1] 1 0 0 0 8.25" in said
+    assert "adc[lr=1] 1234 0 0 0 8.25" in said
     assert "about 2 min left" in said
 
 

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from gsbench.analysis.differences import (
     conditions_between_scenes,
-    describe_code,
     differing_code,
     differing_conditions,
     differing_settings,
@@ -22,7 +21,7 @@ from gsbench.analysis.results import Experiment, TrialResult, group_by
 from gsbench.analysis.trial_result import Planned, Trained
 from gsbench.errors import InputError
 from gsbench.runs.config_hash import is_hashed
-from gsbench.words import command
+from gsbench.runs.nested import SHOWN
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -154,11 +153,11 @@ def where_words(where: Mapping[str, str]) -> str:
 def check_averageable(trials: Sequence[TrialResult], where: str) -> None:
     """Raise ``InputError`` with the differing keys unless each scene's trials are repetitions."""
     if code := differing_code(trials):
-        listed = "; ".join(describe_code(*part) for part in code.items())
-        status = command("status", trials[0].experiment)
+        versions = {part.short: [one[:SHOWN] for one in made] for part, made in code.items()}
+        listed = "; ".join(f"{part}: {' | '.join(own)}" for part, own in versions.items())
         raise InputError(
             f"the table cell {where} would average trials made by different versions of {listed}: "
-            f"`{status}` names the superseded ones, `{status} --forget-superseded` removes them"
+            "train them again with one of them"
         )
     by_scene = group_by(trials, lambda trial: trial.scene)
     for scene, group in by_scene.items():

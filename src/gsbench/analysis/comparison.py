@@ -28,9 +28,9 @@ from gsbench.analysis.verdicts import (
     judge,
 )
 from gsbench.runs.commands import Question, code_in, questions_elsewhere
+from gsbench.runs.experiments import DEFAULT_METRIC
 from gsbench.runs.layout import LEDGER, TUNING
 
-DEFAULT_METRIC = "psnr"
 OLD_LEDGER = f"the ledger of an earlier gsbench decided ({LEDGER})"
 
 

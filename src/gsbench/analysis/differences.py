@@ -6,13 +6,12 @@ ADC. All are read from the trials' recorded configurations and code.
 """
 
 import itertools
-import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from gsbench.analysis.notes import Note
-from gsbench.analysis.results import Arm, TrialPair, TrialResult, group_by, seeds_text
+from gsbench.analysis.results import Arm, TrialPair, TrialResult, group_by
 from gsbench.analysis.trial_result import Trained
 from gsbench.analysis.trial_settings import canonical
 from gsbench.gaussians.paper_values import RATES
@@ -207,32 +206,6 @@ def differing_code(trials: Iterable[TrialResult]) -> dict[Part, Versions]:
         more = f" and {counted(len(packages) - 1, 'more package')}" if len(packages) > 1 else ""
         differing[Part("package", f"{first.name}{more}")] = versions
     return differing
-
-
-def describe_code(part: Part, versions: Mapping[str, Sequence[TrialResult]]) -> str:
-    """The versions of a part of the code in one line, the oldest first.
-
-    For example ``mine.Patient: 3fa9c1d2 (garden seeds 0, 1; 2026-11-21 18:40) | …``.
-    """
-    ordered = sorted(versions.items(), key=lambda item: max(trial.finished for trial in item[1]))
-    texts = [
-        f"{version:.{SHOWN}} ({_scenes_and_seeds(trials)}; {_when(trials)})"
-        for version, trials in ordered
-    ]
-    return f"{part.short}: {' | '.join(texts)}"
-
-
-def _scenes_and_seeds(trials: Sequence[TrialResult]) -> str:
-    """``garden seeds 0, 1; room seed 0``"""
-    by_scene = sorted(group_by(trials, lambda trial: trial.scene).items())
-    return "; ".join(f"{scene} {seeds_text(own)}" for scene, own in by_scene)
-
-
-def _when(trials: Sequence[TrialResult]) -> str:
-    """The time at which trials were finished, to the minute, or the first and the last time."""
-    times = sorted(trial.finished for trial in trials)
-    minutes = [time.strftime("%Y-%m-%d %H:%M", time.localtime(finished)) for finished in times]
-    return minutes[0] if minutes[0] == minutes[-1] else f"{minutes[0]} to {minutes[-1]}"
 
 
 def ingredients(one: Mapping[str, Any], other: Mapping[str, Any]) -> tuple[str, ...]:

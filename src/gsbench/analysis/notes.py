@@ -50,7 +50,6 @@ SENTENCES: dict[str, str] = {
         "{least:n seed} of each scene can count: there are no more of {scenes:few} (others have up "
         "to {most})"
     ),
-    "no value": "{reason}",
     # ---- questions that cannot be tested
     "equal": (
         "both arms of {pairs:n pair} of trials are equal to the last bit: the settings that differ "
@@ -59,7 +58,6 @@ SENTENCES: dict[str, str] = {
     # ---- arms and trials in no verdict
     "no partner": "{arm} is not compared: nothing was trained to compare it with.",
     "unused": "Not in the verdict on {arm}, whose question did not name them: {trials:few}.",
-    "waits": "a look waits for all of its trials",
     # ---- arms that are unlike in more than was asked
     "scenes differ": "Scenes of {arms:all} differ in more than the scene: {differences}.",
     "unequal counts": (
@@ -95,7 +93,6 @@ SENTENCES: dict[str, str] = {
         "differ had no effect, so there is nothing to compare."
     ),
     # ---- gates
-    "failed": "failed: {reasons:few}",
     "other machine": (
         "deviation: the baseline ran on another kind of machine ({baseline:all}) than the new "
         "trials ({new:all}); this alone changes last digits and, after long training, results"

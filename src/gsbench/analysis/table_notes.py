@@ -36,7 +36,6 @@ HEAVIEST = (
     "worthless",
     "unusable",
     "unused",
-    "edited",
     "limit not reached",
     "unequal counts",
     "no partner",

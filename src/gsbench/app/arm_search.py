@@ -17,7 +17,7 @@ from gsbench.config.command_words import check_makes_trials
 from gsbench.config.compose import Trial
 from gsbench.config.overrides import bare_key
 from gsbench.errors import InputError
-from gsbench.runs.experiments import SearchPoint, TuningRecord
+from gsbench.runs.experiments import DEFAULT_METRIC, SearchPoint, TuningRecord
 from gsbench.runs.nested import flatten
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ from dataclasses import field
 
 from omegaconf import DictConfig, OmegaConf
 
-from gsbench.app.sweep import BASIC, DEFAULT_METRIC, Sweep, better_direction
+from gsbench.app.sweep import BASIC, Sweep, better_direction
 from gsbench.config.command_words import grid_points
 from gsbench.config.overrides import is_sweep, key_of, parse_word
 from gsbench.errors import GsbenchError
@@ -184,6 +184,9 @@ def _rounded(value: Any) -> Any:
 
 
 log = logging.getLogger(__name__)
+
+
+# ---- a search by another sweeper, which gets values of validation views and asks no question
 
 
 @dataclass

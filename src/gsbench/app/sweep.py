@@ -23,7 +23,6 @@ from gsbench.pipeline.metric_facts import facts_for
 
 OWN = "gsbench"  # the name of the launcher and of the sweeper in Hydra
 BASIC = "basic"  # Hydra's own sweeper, which expands lists, and its launcher
-DEFAULT_METRIC = "psnr"
 # the errors of Hydra for a user's words and files
 HYDRA_ERRORS = (HydraException, OmegaConfBaseException, OSError)
 

@@ -12,7 +12,6 @@ their folders.
 
 from __future__ import annotations
 
-import importlib.util
 import itertools
 import logging
 from collections.abc import Mapping, Sequence
@@ -30,7 +29,7 @@ from gsbench.app.arm_search import (
     own_values,
     words_of_values,
 )
-from gsbench.app.sweep import DEFAULT_METRIC, Run, Sweep, better_direction
+from gsbench.app.sweep import Run, Sweep, better_direction
 from gsbench.config.command_words import grid_points
 from gsbench.config.compose import Composer, Trial
 from gsbench.config.overrides import bare_key, key_of, parse_word
@@ -38,10 +37,15 @@ from gsbench.config.schema import TUNE, TuneSettings
 from gsbench.errors import GsbenchError, InputError
 from gsbench.eval.facts import known_keys
 from gsbench.files import checked_runs_folder, make_runs_folder, write_json
-from gsbench.runs.experiments import TuningRecord, make_home, metric_and_question
+from gsbench.runs.experiments import (
+    DEFAULT_METRIC,
+    TuningRecord,
+    make_home,
+    metric_and_question,
+)
 from gsbench.runs.layout import TUNING
 from gsbench.settings import check_values
-from gsbench.system.install import install_command
+from gsbench.system.install import require_package
 from gsbench.words import command, counted, did_you_mean, listed
 
 if TYPE_CHECKING:
@@ -184,8 +188,7 @@ def _plan(
 
     Raises InputError for what cannot be searched.
     """
-    if importlib.util.find_spec("optuna") is None:
-        raise InputError(f"a search needs Optuna: {install_command('search')}")
+    require_package("optuna", "search", "a search")
     homes = {trial.files.home for trial in trials}
     if len(homes) > 1:
         raise InputError(

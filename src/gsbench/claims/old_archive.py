@@ -1,6 +1,5 @@
 """Archives of the first version: JSON lines of all trials, as the files that they were made of."""
 
-import csv
 import io
 import json
 from typing import Any
@@ -20,7 +19,7 @@ from gsbench.runs.layout import (
 )
 
 # errors of contents that no gsbench wrote
-NOT_AN_ARCHIVE = (KeyError, TypeError, ValueError, AttributeError, RecursionError, csv.Error)
+NOT_AN_ARCHIVE = (KeyError, TypeError, ValueError, AttributeError, RecursionError)
 PICTURES_FOLDER = "pictures"
 
 
@@ -64,17 +63,13 @@ def as_files(name: str, contents: dict[str, bytes]) -> dict[str, bytes]:
 
 def _tables(content: bytes) -> dict[str, str]:
     """The table of each trial's views, by its folder."""
-    reader = csv.DictReader(io.StringIO(content.decode()))
-    columns = [column for column in reader.fieldnames or () if column != "trial"]
-    texts: dict[str, io.StringIO] = {}
-    for row in reader:
-        folder = row.pop("trial")
-        stream = texts.setdefault(folder, io.StringIO())
-        writer = csv.DictWriter(stream, columns, lineterminator="\n")
-        if not stream.tell():
-            writer.writeheader()
-        writer.writerow(row)
-    return {folder: stream.getvalue() for folder, stream in texts.items()}
+    import pandas as pd  # here, since it is slow to import
+
+    frame = pd.read_csv(io.BytesIO(content), dtype=str, keep_default_na=False)
+    return {
+        str(folder): own.drop(columns="trial").to_csv(index=False, lineterminator="\n")
+        for folder, own in frame.groupby("trial", sort=False)
+    }
 
 
 def _lines(content: bytes) -> list[dict[str, Any]]:

@@ -124,6 +124,8 @@ def packages_allowed_at(place: Sequence[str]) -> tuple[str, ...]:
     return ()
 
 
+# ---- programs, shell lines, options of Slurm, and variables
+
 # import paths of one class
 EXTERNAL = ("gsbench.densify.External", "gsbench.external.settings.External")
 # the permissions for shell lines, and for unusual options of Slurm
@@ -233,6 +235,8 @@ def check_launch(launch: Mapping[str, Any], allowed: Sequence[str]) -> None:
         if not str(value).isprintable() or not key.isprintable():
             raise InputError(f"{key} must be one line, got {value!r}")
 
+
+# ---- limits of ${…}, by whomever it was written
 
 # Resolvers that make only texts and numbers. Resolvers that turn texts into mappings (oc.create,
 # oc.decode, oc.dict) could create a `_target_` after the check; resolvers of plug-ins could do

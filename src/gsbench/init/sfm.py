@@ -58,8 +58,7 @@ class SfmDense(Sfm):
 def match_by_sift(task: DatabaseTask, job: Job, progress: Progress, timer: Timer) -> dict[str, int]:
     """Write SIFT features and their verified matches into the database; returns counts."""
     from gsbench.init.colmap.database import colmap_masks, database_counts, strongest_descriptors
-    from gsbench.init.colmap.features import extract_sift
-    from gsbench.init.colmap.matches import match_sift
+    from gsbench.init.colmap.matches import extract_sift, match_sift
 
     sift = job.options
     assert isinstance(sift, SiftOptions)

@@ -157,6 +157,8 @@ def _unavailable_now(options: str) -> Collection[str]:
     return make_evaluator(EvalConfig(**json.loads(options))).awaited
 
 
+# ---- a first guess from the size of pictures, as long as no finished trial tells more
+
 # Seconds of a step, measured (docs/measurements.md). On one thread of a CPU: projecting, sorting,
 # their gradients and Adam for each Gaussian, compositing, its gradient and the loss for each pixel.
 # On an H100: 100,000 and 1 million Gaussians took 1.3 and 3.0 ms.

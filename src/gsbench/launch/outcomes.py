@@ -50,6 +50,8 @@ def outcome_of_error(folder: Path, error: Exception) -> Outcome:
     return Outcome(folder, "failed", f"{text}; the traceback is in {folder / LOG}")
 
 
+# ---- failures that other trials would repeat, so that these are not started
+
 SCENE = ("scene",)
 CLOUD = (*SCENE, "init")
 ALL = (*CLOUD, "densify", "raster", "train", "eval", "device")

@@ -40,7 +40,7 @@ from gsbench.runs.commands import (
     drop,
     read_history,
 )
-from gsbench.runs.experiments import QUESTIONS, metric_and_question
+from gsbench.runs.experiments import DEFAULT_METRIC, QUESTIONS, metric_and_question
 from gsbench.runs.layout import RESULTS, SEED, TUNING
 from gsbench.runs.nested import flatten
 from gsbench.settings import check_values
@@ -48,7 +48,6 @@ from gsbench.words import did_you_mean
 
 log = logging.getLogger(__name__)
 
-DEFAULT_METRIC = "psnr"
 DIRECTIONS = {"higher": 1, "lower": -1, "same": 0}
 
 

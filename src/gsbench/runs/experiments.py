@@ -164,6 +164,9 @@ class Arm:
         return name == own and all(str(config.get(key)) == value for key, value in self.variant)
 
 
+DEFAULT_METRIC = "psnr"  # of questions and searches
+
+
 def metric_and_question(primary: str) -> tuple[str, str]:
     """The metric and the question that ``eval.primary`` names; the question is "" for both.
 

@@ -30,10 +30,10 @@ UNIT_TOLERANCE = 1e-9  # a quaternion whose length differs from 1 by no more is 
 # A binary record: what stands before its list, the length of the list, and bytes of an entry. The
 # name of an image, ended by a zero, comes before the length.
 COUNT = struct.Struct("<Q")
-POINT = struct.Struct("<Q3d3Bd")  # id, place, colour, error
 BINARY = {
     "images": (struct.Struct("<I7dI"), COUNT, 24),  # id, pose, camera; x, y, id of the 3D point
-    "points3D": (POINT, COUNT, 8),  # the ids of an image and of its 2D point
+    # id, place, colour, error; the ids of an image and of its 2D point
+    "points3D": (struct.Struct("<Q3d3Bd"), COUNT, 8),
     "frames": (struct.Struct("<II7d"), struct.Struct("<I"), 16),  # id, rig, pose; data ids
 }
 NUMBER = r" [-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
@@ -140,7 +140,7 @@ def _check_lines(kind: str, lines: list[str]) -> None:
     for line in lines:
         words = " ".join(["", *line.split()])
         if not re.fullmatch(pattern, words):
-            raise InputError(f"wanted is {wanted}, with decimal points, not {words[1:80]!r}")
+            raise InputError(f"a line must be {wanted}, with decimal points, not {words[1:80]!r}")
 
 
 def _read(folder: Path, bare: bool = False) -> pycolmap.Reconstruction:

@@ -1,5 +1,6 @@
 """The installation of gsbench: its folder, how to install extras, and its state in git."""
 
+import importlib.util
 import json
 import os
 import re
@@ -11,6 +12,7 @@ from typing import Any
 from urllib.parse import urlsplit
 from urllib.request import url2pathname
 
+from gsbench.errors import InputError
 from gsbench.system.programs import NEUTRAL, safe_environment
 
 DISTRIBUTION = "gsbench-3dgs"  # the name on the package index, where "gsbench" is another project
@@ -26,6 +28,12 @@ def install_command(extra: str = "") -> str:
     if root is None:
         return f"pip install '{installed_from() or DISTRIBUTION}{extras}'"
     return f"pip install -e '{'.' if root == Path.cwd() else root}{extras}'"
+
+
+def require_package(name: str, extra: str, what: str) -> None:
+    """Raise InputError if the package ``name``, which ``what`` needs, is not installed."""
+    if importlib.util.find_spec(name) is None:
+        raise InputError(f"{what} needs the package {name}: {install_command(extra)}")
 
 
 def installed_from() -> Path | None:

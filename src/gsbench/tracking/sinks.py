@@ -1,6 +1,5 @@
 """The contract of a tracker, and TensorBoard and Weights & Biases; MLflow is in `mlflow_sink`."""
 
-import importlib.util
 import os
 import shutil
 import uuid
@@ -9,11 +8,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
-from gsbench.errors import InputError
 from gsbench.files import require_no_links
 from gsbench.parsing import Count, Record
 from gsbench.runs import layout
-from gsbench.system.install import install_command
+from gsbench.system.install import require_package
 from gsbench.tracking.trial import NOTE, Picture, Scalar, TrackedTrial
 
 Status = Literal["FINISHED", "FAILED", "KILLED"]
@@ -87,19 +85,11 @@ class Sink(Protocol):
         """Show that the trial has ended; ``reason`` is that of a failure."""
 
 
-def require_package(name: str) -> None:
-    """Raise InputError if the tracker's package ``name`` is not installed."""
-    if importlib.util.find_spec(name) is None:
-        raise InputError(
-            f"tracking={name} needs a package: {install_command(name)} (or pip install {name})"
-        )
-
-
 class TensorBoard:
     """The event files of a trial. They cannot be edited, so a continued trial starts anew."""
 
     def __init__(self) -> None:
-        require_package("tensorboard")
+        require_package("tensorboard", "tensorboard", "tracking=tensorboard")
 
     def open(self, trial: TrackedTrial, run: Run) -> str:
         folder = trial.folder.runs / layout.TENSORBOARD / trial.path
@@ -153,7 +143,7 @@ class WandB:
     uri: str | None = None
 
     def __post_init__(self) -> None:
-        require_package("wandb")
+        require_package("wandb", "wandb", "tracking=wandb")
 
     def open(self, trial: TrackedTrial, run: Run) -> str:
         if self.uri:

@@ -5,7 +5,6 @@ import json
 import re
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -34,9 +33,7 @@ from gsbench.analysis.results import (
     Arm,
     Experiment,
     TrialResult,
-    load_all_trials,
     load_experiment,
-    newest_code,
 )
 from gsbench.analysis.table_formats import FORMATS, csv_of
 from gsbench.analysis.tables import DEFAULT_ROWS, build_table, format_cell, with_agreement
@@ -276,8 +273,7 @@ def explain_cell(address: str, runs: Path) -> str:
     if len(parts) != 4 or not all(parts):
         raise InputError(f"{address!r} is not {CELL}")
     name, scene, metric, arm = parts
-    everything = load_all_trials(runs, name)
-    experiment = newest_code(everything)
+    experiment = load_experiment(runs, name)
     trials = _trials_at(experiment, scene, arm)
     shown = quantity(metric, trials)
     check_averageable(trials, f"scene={scene} {arm}")
@@ -295,8 +291,8 @@ def explain_cell(address: str, runs: Path) -> str:
     lines += ["", "Conditions", *(f"  {key}: {value}" for key, value in conditions)]
     lines += _trials_lines(trials, shown)
     place = trials[0].path.parent
-    of_cell = [trial for trial in everything.trials if trial.path.parent == place]
-    versions = newest_code(replace(everything, trials=tuple(of_cell))).versions
+    is_older = any(trial.path.parent == place for trial in experiment.older)
+    versions = experiment.versions if is_older else ()
     start = f"{place.relative_to(runs).as_posix()}/"
     if left_out := [*(line for line in experiment.faults if line.startswith(start)), *versions]:
         lines += ["", "Left out", *(f"  {line}" for line in left_out)]

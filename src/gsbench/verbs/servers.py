@@ -18,7 +18,7 @@ from gsbench.errors import InputError
 from gsbench.files import require_no_links
 from gsbench.runs.experiments import experiment_home, list_experiments
 from gsbench.runs.layout import DATABASE
-from gsbench.system.install import install_command
+from gsbench.system.install import require_package
 from gsbench.system.isolate import end_descendants
 from gsbench.system.programs import NEUTRAL, own_folder, safe_environment
 from gsbench.system.stopping import stop_on_signals
@@ -49,8 +49,7 @@ def view(argv: Sequence[str], runs: Path) -> int:
     options = parser.parse_args(argv)
     if len(options.trial) > 2:
         raise InputError(f"one or two trials can be viewed, not {len(options.trial)}")
-    if importlib.util.find_spec("viser") is None:
-        raise InputError(f"the viewer needs viser: {install_command('view')}")
+    require_package("viser", "view", "the viewer")
 
     from gsbench.system.device import select_device
     from gsbench.train.proof import create_proven

@@ -143,7 +143,7 @@ def _progress_view(name: str, frame: pd.DataFrame) -> Group:
     for column in frame.columns:
         table.add_column("it/s" if column == SPEED else column, justify="right")
     for arm, row in frame.iterrows():
-        table.add_row(escape(str(arm)), *(f"{value:.3g}" for value in row))
+        table.add_row(escape(str(arm)), *(f"{round(value, 2):g}" for value in row))
     left = frame.attrs["seconds_left"]
     return Group(table, f"about {readable_time(left)} left" if left else "")
 

@@ -14,7 +14,7 @@ from PIL.TiffImagePlugin import IFDRational
 
 from gsbench.init import Sfm
 from gsbench.init.colmap import database as made
-from gsbench.init.colmap import features, matches
+from gsbench.init.colmap import matches
 from gsbench.init.reconstruction import report_lenses, report_unused
 from gsbench.scene.images import (
     DIGITAL_ZOOM,
@@ -245,7 +245,7 @@ def test_features_are_extracted_from_eight_images_at_a_time_or_two_per_thread(
     masks = images if threads == 4 else None
     own = {"max_num_features": 70, "peak_threshold": 0.01, "edge_threshold": 9.0, "first_octave": 1}
     settings, tell = Sfm(max_image_size=500, **own), lambda *state: told.append(state)
-    features.extract_sift(Path("x.db"), images, names, settings, threads, tell, masks)
+    matches.extract_sift(Path("x.db"), images, names, settings, threads, tell, masks)
     assert [name for call in calls for name in call["image_names"]] == names
     assert told == [("extract", done, 40) for done in (*range(0, 40, each), 40)]
     for call in calls:

@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 from gsbench.init import MODEL_FOLDER, Sfm
 from gsbench.init.base import Timer
 from gsbench.init.colmap.database import DatabaseTask, create_database, unknown_camera_groups
-from gsbench.init.colmap.features import extract_sift
-from gsbench.init.colmap.matches import distribute_parts, divide_pairs, match_sift
+from gsbench.init.colmap.matches import distribute_parts, divide_pairs, extract_sift, match_sift
 from gsbench.init.colmap.pairs import best_pairs
 from gsbench.init.sfm import match_by_sift
 from gsbench.logs import no_progress
@@ -136,7 +135,7 @@ def test_auto_matches_only_the_pairs_that_a_preview_proposes(
     task = DatabaseTask(*files, names, pairs, bare_photos, tmp_path)
     monkeypatch.setattr("gsbench.init.colmap.pairs.ALL_PAIRS_UP_TO", 5)
     monkeypatch.setattr("gsbench.init.colmap.pairs.best_pairs", partial(best_pairs, partners=2))
-    monkeypatch.setattr("gsbench.init.colmap.features.extract_sift", lambda *_: None)
+    monkeypatch.setattr("gsbench.init.colmap.matches.extract_sift", lambda *_: None)
     job = SimpleNamespace(options=Sfm(threads=1, pairs="auto"))
     counts = match_by_sift(task, job, no_progress, Timer())
     assert counts["pairs_selected"] + counts["pairs_left_out"] == len(pairs)

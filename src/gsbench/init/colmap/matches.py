@@ -1,13 +1,14 @@
-"""COLMAP's matching of SIFT features and its verification of matched pairs.
+"""COLMAP's SIFT features, their matching, and the verification of matched pairs.
 
-Matching uses several cores by processes instead of threads:
+All of it calls native code that can abort: run it isolated.
 
-COLMAP's matcher is not safe with two threads in one process. Its nearest-neighbour search (faiss)
-calls a BLAS that pycolmap's wheels build for one thread and without locks. Two simultaneous calls
-can corrupt each other's numbers: rarely, and mostly on a busy machine, a pair loses some or most of
-its matches. With one thread for each process, matches are repeatable to the bit. Each call builds a
-search index for each of its images, which costs more than matching a pair, so the pairs are divided
-into parts with few images.
+Matching uses several cores by processes instead of threads, since COLMAP's matcher is not safe with
+two threads in one process. Its nearest-neighbour search (faiss) calls a BLAS that pycolmap's wheels
+build for one thread and without locks. Two simultaneous calls can corrupt each other's numbers:
+rarely, and mostly on a busy machine, a pair loses some or most of its matches. With one thread for
+each process, matches are repeatable to the bit; COLMAP's brute force took 24 times as long. Each
+call builds a search index for each of its images, which costs more than matching a pair, so the
+pairs are divided into parts with few images.
 """
 
 from __future__ import annotations
@@ -225,3 +226,47 @@ def verify_pairs(
             pycolmap.verify_matches(path, list_file, options)
             progress("verify", start + len(part), len(pairs))
     list_file.unlink(missing_ok=True)
+
+
+# COLMAP reports no progress within a call, so it is called for a few images at a time
+IMAGES_PER_CALL = 8
+IMAGES_PER_THREAD = 2  # least number in a call, so that all threads have work
+
+
+def extract_sift(
+    database: Path,
+    images: Path,
+    names: Sequence[str],
+    sift: SiftOptions,
+    threads: int,
+    progress: Progress,
+    masks: Path | None = None,
+) -> None:
+    """Detect and describe keypoints in the database's images ``names``.
+
+    ``masks`` is a folder of masks, named as COLMAP expects. Black pixels get no keypoints.
+    """
+    options = pycolmap.FeatureExtractionOptions()
+    options.use_gpu = False
+    options.num_threads = threads
+    options.max_image_size = sift.max_image_size
+    options.sift.max_num_features = sift.max_num_features
+    options.sift.peak_threshold = sift.peak_threshold
+    options.sift.edge_threshold = sift.edge_threshold
+    options.sift.first_octave = sift.first_octave
+    reading = pycolmap.ImageReaderOptions()
+    if masks is not None:
+        reading.mask_path = masks
+    progress("extract", 0, len(names))
+    batch_size = max(IMAGES_PER_CALL, IMAGES_PER_THREAD * threads)
+    for start in range(0, len(names), batch_size):
+        batch = list(names[start : start + batch_size])
+        pycolmap.extract_features(
+            database,
+            images,
+            image_names=batch,
+            reader_options=reading,
+            extraction_options=options,
+            device=pycolmap.Device.cpu,
+        )
+        progress("extract", start + len(batch), len(names))
