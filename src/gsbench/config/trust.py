@@ -61,15 +61,10 @@ CLASS_KEYS = (TARGET, "class", "()")  # Hydra's and logging's keys of import pat
 # Keys whose texts start nothing: resources, names and directions, and how a log line looks. In a
 # plug-in any other text may be a line for a shell, a module or a server whose answers are
 # unpickled; in a logger, a file to append to.
-PLUGIN_TEXTS = SBATCH_RESOURCES | {
-    "name",
-    "direction",
-    "study_name",
-    "timeout",
-    "pre_dispatch",
-    "backend",
+FREE_KEYS = SBATCH_RESOURCES | {
+    *("name", "direction", "study_name", "timeout", "pre_dispatch", "backend"),
+    *("level", "format", "datefmt", "style", "handlers", "formatter"),
 }
-LOGGING_TEXTS = ("level", "format", "datefmt", "style", "handlers", "formatter")
 # streams; a Ray cluster of this machine
 FREE_TEXTS = ("ext://sys.stdout", "ext://sys.stderr", "auto", "local")
 # parts of a sweeper that are words of its jobs, checked as such
@@ -227,7 +222,6 @@ def _check_text(where: str, node: str, key: str, text: str, allowed: Sequence[st
 
     Call it only for a text that no installed package wrote.
     """
-    is_logging = node.endswith("_logging")
     if key in CLASS_KEYS:
         if not is_allowed(text, allowed):
             advice = permission_advice([text.split(".")[0]], allowed)
@@ -235,18 +229,11 @@ def _check_text(where: str, node: str, key: str, text: str, allowed: Sequence[st
                 f"{where}={text} is not what a package set; if you trust that code, {advice}"
             )
         return
-    if (
-        is_allowed(f"hydra.{node}", allowed)
-        or where.startswith("hydra.sweeper.tune.")
-        or text in FREE_TEXTS
-    ):
+    is_tuning = where.startswith("hydra.sweeper.tune.")
+    if is_allowed(f"hydra.{node}", allowed) or is_tuning or text in FREE_TEXTS:
         return
     # In any text, logging imports the name after ext://.
-    if (
-        "://" in text
-        or not text.isprintable()
-        or key not in (LOGGING_TEXTS if is_logging else PLUGIN_TEXTS)
-    ):
+    if "://" in text or not text.isprintable() or key not in FREE_KEYS:
         advice = permission_advice([f"hydra.{node}"], allowed)
         raise InputError(
             f"{where}={text!r} could start code or write a file; if you trust it, {advice}"
