@@ -66,7 +66,7 @@ class EvalConfig:
     at: Annotated[list[PositiveInt], Predicate(all_different), doc(AT_RULE)] = field(
         default_factory=list
     )
-    # measure apart: distance (near, middle, far), or {NAME: folder of masks below scene.path}
+    # parts of the test views that are measured apart; folders lie below scene.path
     regions: Annotated[dict[str, PathName] | Literal["distance"], doc(REGIONS_RULE)] | None = None
     # the metric of the verdict; psnr@far: in a region; psnr@extrapolation: for one of two splits
     primary: str | None = "psnr"
