@@ -177,6 +177,7 @@ def test_a_verb_runs_and_writes_what_the_page_says(row, place, environment, tmp_
         "PYTHONPATH": os.pathsep.join([str(hook), str(PAGE.parents[1] / "src")]),
         "TMPDIR": str(tmp_path / "scratch"),
         "AWS_SECRET_ACCESS_KEY": SECRET,
+        "PYTHONDONTWRITEBYTECODE": "1",
     }
     (tmp_path / "scratch").mkdir()
     assert run(["export", "--results", FINISHED, "--out", "a.zip"]) == 0

@@ -103,17 +103,6 @@ def test_an_imported_file_keeps_its_digest_until_it_is_loaded_again(home):
     assert not has_changed_since_import("own_code")
 
 
-def test_a_module_of_another_folder_is_found_even_if_its_namesake_is_imported(home):
-    (home / "own_code.py").write_text(CLASS)
-    importlib.import_module("own_code")
-    other = home / "elsewhere"
-    write(other / "own_code.py", "class Other: ...\n")
-    assert module_digest("own_code", str(other)) == digest(other / "own_code.py")
-    assert module_digest("own_code", str(home)) == digest(home / "own_code.py")
-    (home / "own_code.py").unlink()
-    assert module_digest("own_code", str(home)) is None
-
-
 def test_imported_modules_that_are_not_named_are_listed(home):
     (home / "own_code.py").write_text(
         "import sys\nsys.path.insert(0, 'lib')\nimport late, json.tool, helper\n" + CLASS

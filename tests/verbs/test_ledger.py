@@ -205,6 +205,7 @@ def test_an_idea_whose_trials_fail_does_not_count_as_tried(home, trainings, caps
     assert attempt(f"{SPLIT}=0.02", "--json") == 1
     shown = json.loads(capsys.readouterr().out)
     assert (shown["result"], shown["tried"], shown["kept"]) == ("failed", 0, [])
+    assert shown["reason"] == "a typing error"
     trainings.fails = set()
     assert attempt(f"{SPLIT}=0.02") == 0
     assert results(home) == {"adc": "kept"}
@@ -444,6 +445,16 @@ def test_show_prints_the_rule_and_a_line_for_each_idea(home, said):
     )
     assert bad.startswith("2. bad against baseline: dropped: looks worse; psnr −")
     assert bad.endswith("; 2 seeds of all ideas")
+
+
+def test_ideas_with_other_code_are_not_superseded(home, tmp_path, said):
+    for module in ("mine1", "mine2"):
+        text = f"from gsbench.densify import ADC\nclass Mine(ADC): name = {module!r}\n"
+        (tmp_path / f"{module}.py").write_text(text)
+        own = f"densify._target_={module}.Mine densify.name=mine allow_targets=[{module}]"
+        attempt(*split(own), f"{SPLIT}=0.02")
+    assert results(home) == {"mine": "kept", "mine-2": "kept"}
+    assert "superseded" not in said("status night")
 
 
 def test_names_of_ledgers_and_ideas_are_not_given_twice(home, trainings, refused):

@@ -93,7 +93,10 @@ def states_of_experiment(home: Path) -> list[TrialState]:
 def states_now(home: Path) -> list[TrialState]:
     """The same, with finished trials that no table counts as ``superseded``; reads all results."""
     states = states_of_experiment(home)
-    older = {trial.path for trial in newest_code(read_experiment(home)).older}
+    experiment = read_experiment(home)
+    older = {trial.path for trial in newest_code(experiment).older}
+    if experiment.history.ledger is not None:
+        older = set()  # each idea has its own code, and its trials are its result
     return [
         replace(state, state="superseded", note=EARLIER_CODE)
         if state.state == "done" and state.folder in older

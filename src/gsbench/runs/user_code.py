@@ -11,7 +11,7 @@ import sys
 import sysconfig
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
-from importlib.machinery import ModuleSpec, PathFinder
+from importlib.machinery import ModuleSpec
 from pathlib import Path
 from typing import Any
 
@@ -70,15 +70,14 @@ def user_modules(values: Mapping[str, Any]) -> dict[str, str]:
     return {name: digest for name, digest in digests.items() if digest is not None}
 
 
-def module_digest(name: str, folder: str | None = None) -> str | None:
+def module_digest(name: str) -> str | None:
     """The sha256 of a top-level module: of its file, or of all code in its package.
 
     None if it is not found. A module that this process has imported keeps its digest: that is
-    the code that runs. With ``folder``, the module is found as by a program that is started
-    there, without regard to what this process has imported.
+    the code that runs.
     """
-    loaded = sys.modules.get(name) if folder is None else None
-    spec = _find_spec(name, folder) if loaded is None else loaded.__spec__
+    loaded = sys.modules.get(name)
+    spec = _find_spec(name) if loaded is None else loaded.__spec__
     if spec is None:
         return None
     if loaded is None:
@@ -108,12 +107,10 @@ def unnamed_modules(before: Collection[str], named: Collection[str]) -> list[str
     )
 
 
-def _find_spec(name: str, folder: str | None = None) -> ModuleSpec | None:
+def _find_spec(name: str) -> ModuleSpec | None:
     """A top-level module as Python would find it, without importing it."""
     importlib.invalidate_caches()  # a finder caches the content of folders, and files may be newer
     try:
-        if folder is not None:
-            return PathFinder.find_spec(name, [*sys.path, folder])
         return importlib.util.find_spec(name) if name else None
     except (ImportError, ValueError):
         return None

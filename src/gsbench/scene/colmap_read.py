@@ -44,8 +44,8 @@ TEXT = {
     "images": (rf" \d+(?:{NUMBER}){{7}} \d+ \S.*", "id, pose, id of a camera, name"),
     "2D points": (
         rf"(?:{NUMBER}{NUMBER} -?\d+)* ?",
-        "x, y, id of a 3D point for each 2D point in a second line of each image, which may be "
-        "empty",
+        "x, y, id of a 3D point for its 2D points (each image needs a second line for them, which "
+        "may be empty)",
     ),
     "points3D": (
         rf" \d+(?:{NUMBER}){{3}}(?:{BYTE}){{3}} [-+.\w]+(?: \d+ \d+)*",

@@ -69,12 +69,19 @@ def _push(sums, value):
 
     The first of the returned sums is complete.
     """
-    found = ()
-    for k in tl.static_range(2 * RADIUS):
-        apart: tl.constexpr = RADIUS - k if k < RADIUS else k - RADIUS
-        own = tl.fma(value, _weight(apart), sums[k + 1])
-        found = found + (own,)  # type: ignore[assignment]  # noqa: RUF005
-    return found + (value * W5,)  # noqa: RUF005
+    return (
+        tl.fma(value, W5, sums[1]),
+        tl.fma(value, W4, sums[2]),
+        tl.fma(value, W3, sums[3]),
+        tl.fma(value, W2, sums[4]),
+        tl.fma(value, W1, sums[5]),
+        tl.fma(value, W0, sums[6]),
+        tl.fma(value, W1, sums[7]),
+        tl.fma(value, W2, sums[8]),
+        tl.fma(value, W3, sums[9]),
+        tl.fma(value, W4, sums[10]),
+        value * W5,
+    )
 
 
 @triton.jit

@@ -177,6 +177,7 @@ def try_idea(options: argparse.Namespace, home: Path) -> int:
     # An idea of which something is known cannot be tried anew as if it were not.
     if fails and book.is_measured(idea):
         raise GsbenchError(f"{idea}: {fails}; to go on, give the same command again")
+    fails = fails and (book.failure(idea) or fails)
     if options.json:
         failed = {"result": FAILED, "reason": fails} if fails else {}
         print(json.dumps(_facts(book, idea) | failed | _left(book)))

@@ -166,11 +166,7 @@ def _project(memory, begin, end, gaussians, degree, v, outputs):
         m0, m1 = scaled(times(axis_x, matrix), scales), scaled(times(axis_y, matrix), scales)
         visible = visible & (dot(m0, m0) + dot(m1, m1) < MAX_VARIANCE)
         xx, xy, yy, a = spread(m0, m1)
-        # radius = ceil(3 sqrt(largest eigenvalue)), as preprocessCUDA of 3DGS computes it. The
-        # discriminant (trace / 2)^2 - det is written as a sum of squares, so it is never negative.
-        half = (xx - yy) * HALF
-        largest = (xx + yy) * HALF + square_root(maximum(half * half + xy * xy, EIGENVALUE_FLOOR))
-        radius = minimum(ceil(square_root(largest) * SIGMA_EXTENT), MAX_RADIUS)
+        radius = _radius(xx, xy, yy)
         first_x, past_x = _tile_range(column - radius, column + radius, v.tiles_x)
         first_y, past_y = _tile_range(row - radius, row + radius, v.tiles_y)
         visible = visible & (first_x < past_x) & (first_y < past_y)
@@ -192,13 +188,7 @@ def _project(memory, begin, end, gaussians, degree, v, outputs):
         if todo == 0:
             continue
 
-        # Colour = SH + 1/2, clamped to at least 0 (3DGS, computeColorFromSH).
-        red, green, blue = dc[0] * F0 + HALF, dc[1] * F0 + HALF, dc[2] * F0 + HALF
-        if degree > 0:
-            further = _harmonics(degree, offset, todo, start, gaussians.sh_rest, floats)
-            red += further[0]
-            green += further[1]
-            blue += further[2]
+        red, green, blue = _color(degree, dc, offset, todo, start, gaussians.sh_rest, floats)
         bad += select(seen, (red + green + blue) * ZERO, ZERO)
         clamped = select(red < ZERO, splat(ONE), ZERO)
         clamped += select(green < ZERO, splat(TWO), ZERO) + select(blue < ZERO, splat(FOUR), ZERO)
@@ -223,15 +213,7 @@ def _project(memory, begin, end, gaussians, degree, v, outputs):
             as_integers(clamped),
         )
         store_columns(rows, 0, entries)
-        while todo != 0:
-            lane = lowest_bit(todo)
-            todo &= todo - np.uint64(1)
-            store(records, out * at.RECORD, load(rows, lane * np.uint64(LANES)))
-            # The bits of positive float32 numbers sort like the numbers. Equal depths sort by
-            # index.
-            depth = np.uint64(record_ints[out * at.RECORD + at.DEPTH])
-            keys[out] = (depth << np.uint64(32)) | np.uint64(out)
-            out += 1
+        out = _append(out, todo, rows, records, record_ints, keys)
     flags[VISIBLE] = out - begin
     sound = mask_bits(absolute(bad) <= ZERO)  # False for NaN
     flags[BAD_VALUE] = 0 if short == 0 and sound == ALL_LANES else 1
@@ -240,6 +222,43 @@ def _project(memory, begin, end, gaussians, degree, v, outputs):
 @inlined
 def _zero_if_finite(vector):
     return vector[0] * ZERO + vector[1] * ZERO + vector[2] * ZERO
+
+
+@inlined
+def _radius(xx, xy, yy):
+    """ceil(3 sqrt(largest eigenvalue)), px, as preprocessCUDA of 3DGS computes it.
+
+    The discriminant (trace / 2)^2 - det is written as a sum of squares, so it is never negative.
+    """
+    half = (xx - yy) * HALF
+    largest = (xx + yy) * HALF + square_root(maximum(half * half + xy * xy, EIGENVALUE_FLOOR))
+    return minimum(ceil(square_root(largest) * SIGMA_EXTENT), MAX_RADIUS)
+
+
+@inlined
+def _append(out, todo, rows, records, record_ints, keys):
+    """Append the ``rows`` of the lanes ``todo`` to the ``out`` records; return their new number."""
+    while todo != 0:
+        lane = lowest_bit(todo)
+        todo &= todo - np.uint64(1)
+        store(records, out * at.RECORD, load(rows, lane * np.uint64(LANES)))
+        # The bits of positive float32 numbers sort like the numbers. Equal depths sort by index.
+        depth = np.uint64(record_ints[out * at.RECORD + at.DEPTH])
+        keys[out] = (depth << np.uint64(32)) | np.uint64(out)
+        out += 1
+    return out
+
+
+@inlined
+def _color(degree, dc, offset, todo, start, sh_rest, memory):
+    """Red, green and blue: SH + 1/2, not clamped yet (3DGS, computeColorFromSH)."""
+    red, green, blue = dc[0] * F0 + HALF, dc[1] * F0 + HALF, dc[2] * F0 + HALF
+    if degree > 0:
+        further = _harmonics(degree, offset, todo, start, sh_rest, memory)
+        red += further[0]
+        green += further[1]
+        blue += further[2]
+    return red, green, blue
 
 
 @inlined
