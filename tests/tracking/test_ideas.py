@@ -214,7 +214,8 @@ def test_a_browser_shows_a_row_for_each_idea(tmp_path, monkeypatch):
                 found = browser.call("Runtime.evaluate", expression=script, returnByValue=True)
                 return found["result"].get("value") or ""
 
-            browser.wait_until(lambda picture: "volumetric" in text(picture), "a row for each idea")
+            for name in ("volumetric", "\nadc\n"):
+                browser.wait_until(lambda picture, name=name: name in text(picture), name)
             lines = text(None).splitlines()
             assert "adc" in lines
             assert not [line for line in lines if line.startswith("adc · courtyard")]

@@ -64,8 +64,8 @@ def view(argv: Sequence[str], runs: Path) -> int:
         [TrialPainter(load_viewed(trial, device), rasterizer) for trial in trials], options.port
     )
     with stop_on_signals():
-        print(f"{viewer.url}  (Ctrl+C ends it)", flush=True)
         try:
+            print(f"{viewer.url}  (Ctrl+C ends it)", flush=True)
             threading.Event().wait()
         except KeyboardInterrupt:
             print("stopped")
