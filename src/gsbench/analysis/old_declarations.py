@@ -6,7 +6,7 @@ declaration and by the versions of an arm's code.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import field, replace
 
 from gsbench.analysis.cells import with_variants
@@ -14,7 +14,7 @@ from gsbench.analysis.quantities import asked_quantity
 from gsbench.analysis.questions import Asked, choose_pairs, draft, level_of
 from gsbench.analysis.results import Experiment, TrialResult
 from gsbench.parsing import Amount, Count, Record
-from gsbench.runs.commands import ERROR_RATE, Question, code_in
+from gsbench.runs.commands import ERROR_RATE, Digest, Question, code_in
 from gsbench.runs.experiments import Arm, unix_time
 from gsbench.runs.layout import DECLARED
 from gsbench.runs.rows import read_rows
@@ -123,13 +123,44 @@ def _of_sweep(
             continue
         question = draft(baseline, idea, own, terms)
         of_idea = [trial for trial in own if trial.arm == idea]
-        seeds = dict(question.seeds)
+        digests, seeds = dict(question.digests), dict(question.seeds)
         if planned is not None:  # failed ones, too
             seeds |= {one.scene: planned[one.key] for one in of_idea if one.scene in seeds}
+            digests, of_missing = _of_missing(question, planned, own)
+            seeds |= of_missing
         late = min(trial.measured for trial in of_idea) < moment
+        question = replace(question, digests=digests, seeds=seeds, rule=OLD)
         level, why = declaration.error_rate / len(pairs), LATE if late else ""
-        questions.append(replace(question, seeds=seeds, level=level, rule=OLD, untested=why))
+        questions.append(replace(question, level=level, untested=why))
     return questions
+
+
+def _of_missing(
+    question: Question, planned: Mapping[str, tuple[int, ...]], trials: Sequence[TrialResult]
+) -> tuple[dict[str, tuple[Digest, Digest]], dict[str, tuple[int, ...]]]:
+    """The digests of a question, with the declared scenes of which an arm has no trial yet.
+
+    Returns also the seeds of these scenes. Without them a sweep would be decided by the scenes that
+    happen to be trained first. A declaration has keys of trials, not arms: arms that differ in
+    swept settings only have one name, and each of them lacks what one of them lacks.
+    """
+    measured = {(trial.scene, trial.arm): trial.digest for trial in trials}
+    keys = [tuple(key.split("/")) for key in planned if key.count("/") == 2]
+    lacking = {scene for scene, name, digest in keys} - question.seeds.keys()
+    digests, seeds = dict(question.digests), {}
+    for scene in sorted(lacking):
+        sides = []
+        for arm in (question.baseline, question.idea):
+            own = [
+                f"{scene}/{name}/{end}"
+                for where, name, end in keys
+                if (where, name) == (scene, arm.name)
+            ]
+            sides.append(([measured[scene, arm]] if (scene, arm) in measured else own, own))
+        if all(own for _, own in sides):
+            digests[scene] = sides[0][0][0], sides[1][0][0]
+            seeds[scene] = planned[sides[1][1][0]]
+    return digests, seeds
 
 
 def _version(question: Question, trials: Sequence[TrialResult]) -> int:
