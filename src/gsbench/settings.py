@@ -45,7 +45,8 @@ def is_address(value: str) -> bool:
     return re.fullmatch(r"[a-z][a-z0-9+.-]*://\S*", value) is not None and value.isprintable()
 
 
-FolderName = Annotated[str, Predicate(is_folder_name), doc("a plain folder name")]
+FOLDER_RULE = f"a plain folder name of at most {MAX_NAME_BYTES} bytes"
+FolderName = Annotated[str, Predicate(is_folder_name), doc(FOLDER_RULE)]
 Address = Annotated[str, Predicate(is_address), doc("an address such as http://HOST:PORT")]
 TargetName = Annotated[
     str,

@@ -359,7 +359,15 @@ def test_html_is_well_formed_and_escaped(make_experiment):
 
 
 def test_latex_escapes_what_is_special():
-    assert escape_latex("a_b & 5 % ± 1 → #1") == "a\\_b \\& 5 \\% $\\pm$ 1 ? \\#1"
+    assert escape_latex("a_b & 5 % ± 1 → #1") == "a\\_b \\& 5 \\% $\\pm$ 1 $\\to$ \\#1"
+
+
+def test_latex_keeps_names_of_any_script_and_says_what_they_need(make_experiment):
+    table = build_table(make_experiment())
+    assert "xelatex" not in to_latex(table)
+    source = to_latex(replace(table, title="李明 and é"))
+    assert "李明 and é" in source
+    assert source.splitlines()[1] == "% needs xelatex or lualatex, and a font with 明李"
 
 
 def has_latex():

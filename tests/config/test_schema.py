@@ -211,7 +211,7 @@ def test_hash_follows_the_source_of_a_users_class(base, place, tmp_path, monkeyp
         ({"tracking": "none"}, "tracking must be chosen, as tracking=NAME"),
         ({"densify._target_": None}, "densify._target_ must be the import path of a class"),
         ({"init.name": "a/b"}, "init.name must be a plain folder name"),
-        ({"name": "Store"}, "name must be a plain folder name, and none of store"),
+        ({"name": "Store"}, "name must be a plain folder name of at most 100 bytes, and none of store"),
         ({"seed": 2**63 - 1, "device": "cuda:17", "threads": 4096}, None),
         ({"device": "cuda:1234"}, "device must be auto, cpu, cuda or cuda:1"),
         ({"launch.wait": False}, "needs launch=slurm, not serial"),

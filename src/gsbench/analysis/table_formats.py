@@ -199,7 +199,10 @@ def to_latex(table: Table) -> str:
         start = "\\par\\smallskip\\begin{minipage}{\\linewidth}\\footnotesize"
         added = f"{start}\n{notes}\n\\end{{minipage}}\n"
         text = text.replace("\\end{table}", f"{added}\\end{{table}}")
-    return f"% needs \\usepackage{{booktabs{',array' if table.wrapped else ''}}}\n{text}"
+    needs = f"% needs \\usepackage{{booktabs{',array' if table.wrapped else ''}}}\n"
+    if foreign := "".join(sorted({letter for letter in text if ord(letter) > LATIN_1})):
+        needs += f"% needs xelatex or lualatex, and a font with {foreign}\n"
+    return needs + text
 
 
 def to_html_page(table: Table) -> str:
@@ -214,6 +217,7 @@ FORMATS: dict[str, tuple[str, Callable[[Table], str]]] = {  # name -> file suffi
     "html": ("html", to_html_page),
 }
 
+LATIN_1 = 255  # the last character that pdflatex has in its usual fonts
 WRAPPED_SHARE = 0.7  # share of a LaTeX line for the columns of a ``wrapped`` table
 
 _LATEX = str.maketrans(
@@ -243,6 +247,7 @@ _LATEX = str.maketrans(
         "≠": "$\\neq$",
         "≤": "$\\leq$",
         "≥": "$\\geq$",
+        "→": "$\\to$",
         "Δ": "$\\Delta$",
         "·": "$\\cdot$",
         "²": "$^2$",
@@ -255,9 +260,8 @@ _LATEX = str.maketrans(
 
 
 def escape_latex(text: str) -> str:
-    """Text as LaTeX source; a character that plain LaTeX does not have becomes a question mark."""
-    text = printable(" ".join(text.split()))
-    return text.translate(_LATEX).encode("latin-1", "replace").decode("latin-1")
+    """Text as LaTeX source."""
+    return printable(" ".join(text.split())).translate(_LATEX)
 
 
 def _latex_text(entry: TableEntry) -> str:

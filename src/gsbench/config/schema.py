@@ -28,6 +28,7 @@ from gsbench.runs.layout import IN_RUNS
 from gsbench.runs.nested import GSBENCH, entries_of
 from gsbench.scene.options import SceneConfig
 from gsbench.settings import (
+    FOLDER_RULE,
     MAX_INTEGER,
     MISSING,
     Address,
@@ -51,7 +52,7 @@ CLASS_DEFAULTS = Path(__file__).with_name("class_defaults.json")
 ExperimentName = Annotated[
     str,
     Predicate(lambda name: is_folder_name(name) and name.casefold() not in IN_RUNS),
-    doc(f"a plain folder name, and none of {', '.join(IN_RUNS)}"),
+    doc(f"{FOLDER_RULE}, and none of {', '.join(IN_RUNS)}"),
 ]
 DeviceName = Annotated[
     str,

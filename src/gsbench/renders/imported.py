@@ -45,7 +45,7 @@ from gsbench.runs.package_code import states_of
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS, RENDERS_ALONE, Code, TrialRecord
 from gsbench.scene.images import png_name
-from gsbench.settings import is_folder_name
+from gsbench.settings import FOLDER_RULE, is_folder_name
 
 log = logging.getLogger(__name__)
 
@@ -99,7 +99,7 @@ def find_destination(
     if seed < 0:
         raise InputError(f"--seed {seed}: must be 0 or more")
     if scene is not None and not is_folder_name(scene):
-        raise InputError(f"--scene {scene}: must be a plain folder name")
+        raise InputError(f"--scene {scene}: must be {FOLDER_RULE}")
     if scene is not None and truth.scene not in (None, scene):
         raise InputError(
             f"--scene {scene}: the photographs are {truth.what}, of the scene {truth.scene}: "
