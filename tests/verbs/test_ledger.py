@@ -438,7 +438,8 @@ def test_show_prints_the_rule_and_a_line_for_each_idea(home, said):
     attempt(f"{SPLIT}=0.04", "--as", "bad")
     *rule, good, bad = said("ledger show night").splitlines()
     assert "2 of 40 planned ideas were tried, and 1 kept" in " ".join(rule)
-    # of the three looks at four seeds, the first two have a fifth of the level each
+    # Of the three looks at four seeds, the first two have a fifth of the level each. The new seeds
+    # follow from all lines before, and so from the code: one of these two looks decides.
     assert re.fullmatch(
         r"1\. good against baseline: kept: better; psnr \+\S+ \(.*\); 3 new seeds, level 2\.3 %",
         good,
