@@ -15,7 +15,7 @@ from gsbench.gaussians.paper_values import LearningRates
 from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.raster import create_rasterizer
 from gsbench.raster.contract import Case
-from gsbench.raster.depth import render_depth
+from gsbench.raster.depth import median_depth, render_depth
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.train.ideas import Ideas
 from gsbench.train.trainer import Trainer
@@ -94,6 +94,62 @@ def test_the_gradient_of_depth_is_that_of_finite_differences():
             with torch.no_grad():
                 slope = (value(gaussians.means + step) - value(gaussians.means - step)) / 2e-6
             assert float(gradient[row, axis]) == pytest.approx(float(slope), rel=1e-4, abs=1e-6)
+
+
+def test_median_depth_is_that_of_the_gaussian_at_half_transmittance(case):
+    """Against blending pixel by pixel, Gaussian by Gaussian."""
+    gaussians, camera = case.gaussians(), case.camera()
+    rasterizer, black = ReferenceRasterizer(), torch.zeros(3, dtype=torch.float64)
+    z = gaussians.means @ gaussians.means.new_tensor(camera.rotation[2])
+    z = z + float(camera.translation[2])
+    expected = torch.zeros(18, 24, dtype=torch.float64)
+    with torch.no_grad():
+        for member in z.argsort(descending=True).tolist():
+            # what is in front of a Gaussian, and it: their opacity rises with each
+            front = gaussians.select((z <= z[member]).nonzero().flatten())
+            alpha = rasterizer.render(front, camera, 0, black).alpha
+            expected = torch.where(alpha >= 0.5, z[member], expected)
+        depth = median_depth(rasterizer, gaussians, camera)
+    assert (depth > 0).any()
+    assert torch.equal(depth > 0, expected > 0)
+    assert torch.allclose(depth, expected)
+
+
+def test_median_depth_of_the_cpu_is_that_of_the_reference():
+    case = Case(90, 70, 3000, sh_degree=0)
+    gaussians = case.gaussians().map(torch.Tensor.float)
+    rasterizer = create_rasterizer("cpu", torch.device("cpu"))
+    ours = median_depth(rasterizer, gaussians, case.camera())
+    expected = median_depth(ReferenceRasterizer(), gaussians, case.camera())
+    assert ((expected > 0).float().mean() > 0.2) & (expected > 0).any()
+    # where the transmittance is a half to the last bits, the executors may choose differently
+    assert (ours == expected).float().mean() >= 0.999
+
+
+def test_only_the_chosen_gaussians_have_a_gradient_of_the_median_depth():
+    case = Case(24, 18, 5, sh_degree=0)
+    gaussians, camera = case.gaussians(), case.camera()
+    gaussians.means.requires_grad_(True)
+    depth = median_depth(ReferenceRasterizer(), gaussians, camera)
+    depth.sum().backward()
+    axis = gaussians.means.new_tensor(camera.rotation[2])
+    z = (gaussians.means @ axis + float(camera.translation[2])).detach()
+    counts = (depth.detach()[..., None] == z).sum((0, 1))  # [N] pixels of each Gaussian
+    assert torch.allclose(gaussians.means.grad, counts[:, None] * axis)
+    assert 0 < int((counts > 0).sum()) < len(z) + 1
+
+
+def test_a_term_that_asks_for_it_reads_the_median_depth(lab):
+    @dataclass
+    class Median:
+        needs_median_depth = True
+
+        def __call__(self, step):
+            assert step.render.depth is None
+            assert step.render.median_depth.shape == step.photograph.shape[:2]
+            return step.render.median_depth.mean()
+
+    trained(lab, parts={"terms": [(Median(), 0.1)]}, iterations=2)
 
 
 # ---- terms and losses

@@ -22,7 +22,7 @@ from gsbench.gaussians.ply import write_ply
 from gsbench.gaussians.trainable import StepAll, TrainableGaussians
 from gsbench.raster import Rasterizer
 from gsbench.raster.base import RenderOutput
-from gsbench.raster.depth import render_depth
+from gsbench.raster.depth import median_depth, render_depth
 from gsbench.raster.executors import find_executor, lacks
 from gsbench.runs.layout import CURVES, EVENTS, HISTOGRAMS
 from gsbench.scene.beside import DEPTH, resized
@@ -121,7 +121,11 @@ class Trainer:
         self.scene = scene
         self.densifier = densifier
         self.ideas = ideas
-        self.needs_depth = ideas.needs_depth or densifier.needs_depth
+        readers = [densifier, *ideas.named.values()]
+        self.needs_depth, self.needs_median_depth = (
+            any(getattr(part, name, False) for part in readers)
+            for name in ("needs_depth", "needs_median_depth")
+        )
         self.shows_view = "view" in signature(densifier.observe).parameters
         self.rasterizer = rasterizer
         self.options = options
@@ -133,7 +137,7 @@ class Trainer:
         self.loss = PhotometricLoss(options.ssim_weight, torch.get_num_threads())
         self.fast, step_all = fast_steps(rasterizer, self.loss, options, self.background)
         self.used: FastStep | None = None  # by this iteration
-        if ideas.reads_renders or ideas.optimizer is not None or self.needs_depth:
+        if ideas.reads_renders or ideas.optimizer is not None or self._adds_depth:
             self.fast = None  # such parts need autograd
         self.gaussians = TrainableGaussians(
             initial, options, scene.extent, step_all, ideas.optimizer
@@ -302,7 +306,7 @@ class Trainer:
                 regularizer,
             )
         render = self.render(index)
-        depth_points = self._add_depth(render, cameras[index]) if self.needs_depth else None
+        depth_points = self._add_depth(render, cameras[index]) if self._adds_depth else None
         total, scalars = self._loss(render, index, replace_ignored(render.image, target, mask))
         total.backward()
         if depth_points is not None and depth_points.grad is not None:
@@ -342,9 +346,21 @@ class Trainer:
             scalars.append(value)
         return total, scalars
 
-    def _add_depth(self, render: RenderOutput, camera: Camera) -> Tensor:
-        """Add the depth to a render; returns the projected means [N, 2] that get its gradient."""
-        render.depth, of_depth = render_depth(self.rasterizer, self.gaussians.values, camera)
+    @property
+    def _adds_depth(self) -> bool:
+        return self.needs_depth or self.needs_median_depth
+
+    def _add_depth(self, render: RenderOutput, camera: Camera) -> Tensor | None:
+        """Add the depths that parts ask for to a render.
+
+        Returns the projected means [N, 2] that get the gradient of the expected depth.
+        """
+        gaussians = self.gaussians.values
+        if self.needs_median_depth:
+            render.median_depth = median_depth(self.rasterizer, gaussians, camera)
+        if not self.needs_depth:
+            return None
+        render.depth, of_depth = render_depth(self.rasterizer, gaussians, camera)
         return of_depth.screen_points
 
     def _view(self, index: int) -> TrainedView:

@@ -23,6 +23,7 @@ from gsbench.raster.cpu.binning import (
 )
 from gsbench.raster.cpu.composite import (
     LOG2_ALPHA_MIN,
+    choose_median_tiles,
     composite_backward_tiles,
     composite_tiles,
     cover_tiles,
@@ -38,6 +39,7 @@ from gsbench.raster.staged import (
     StagedRasterizer,
     raise_for_values,
 )
+from gsbench.scene.types import Camera
 from gsbench.system.resources import available_cores
 
 # Fixed numbers, so that results have the same bits for any number of threads. Each shard of tiles
@@ -306,6 +308,20 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
             for shards in (covered, sums, distances)
         )
         return Footprint(next(totals), view_depths(gaussians, request.camera), *totals)
+
+    def median_gaussians(self, gaussians: Gaussians, camera: Camera) -> Tensor:
+        """The Gaussian at which the transmittance falls to a half, [H, W]; -1 where none is."""
+        black = torch.zeros(3)
+        request = RenderRequest(camera, 0, black, None, None, Lifetime())
+        frame = self.forward(gaussians.detach(), request)[3].frame
+        chosen = np.empty(camera.height * camera.width, np.int64)
+
+        def choose(first: int, past: int) -> None:
+            _, begin, end, _ = _tiles(frame, first, past)
+            choose_median_tiles(begin, end, frame, chosen)
+
+        self._runner.run(TILE_SHARDS, choose)
+        return torch.from_numpy(chosen.reshape(camera.height, camera.width))
 
 
 def _edges(count: int) -> NDArray[np.int64]:
