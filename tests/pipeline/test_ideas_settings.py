@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from gsbench.config.compose import compose_one
+from gsbench.config.compose import Composer, compose_one
 from gsbench.pipeline.parts import Parts
 from gsbench.pipeline.trial import TrialSteps
 from gsbench.runs.store import Store
@@ -88,3 +88,19 @@ def test_another_program_has_its_own_loss():
     words += ["train.loss._target_=termmodule.Faint", "allow_targets=[termmodule,brush]"]
     with refusal("train.loss: another program has its own loss"):
         compose_one(words)
+
+
+def test_all_arms_of_a_command_train_by_autograd_if_one_does(module):
+    words = [*SMALL, ALLOWED]
+    plain, own = [*words, "seed=0"], [*words, "seed=0", term(weight=1)]
+    composer = Composer(words)
+
+    def by_autograd(*jobs):
+        return [one.values["train"].get("by_autograd", False) for one in composer.trials(jobs)]
+
+    assert by_autograd(plain, plain) == [False, False]
+    assert by_autograd(own, own) == [False, False]
+    assert by_autograd(plain, own) == [True, True]
+    alone, _ = composer.trials([plain, own])
+    assert alone.folder == composer.trials([plain])[0].folder
+    assert "train.by_autograd=true" in alone.overrides  # a job of a cluster composes these

@@ -10,7 +10,6 @@ from torch.optim.adam import adam
 from gsbench.densify import NoDensifier, Volumetric
 from gsbench.gaussians.trainable import ParameterState, Update
 from gsbench.raster.cpu.layout import CHUNK
-from gsbench.train import trainer
 from gsbench.train.adam_cpu import CpuAdam, FusedStep
 from tests.train.lab import EVENTS, STATEFUL, same, small
 
@@ -52,10 +51,6 @@ def test_numbers_without_a_gradient_yet_keep_their_bits(active):
         assert torch.equal(one, other)
 
 
-def by_autograd(*parts):
-    return None, CpuAdam(1)
-
-
 @pytest.mark.parametrize("kind", ["none", "volumetric", *STATEFUL])
 def test_a_fused_training_has_the_bits_of_one_by_autograd(kind, lab, monkeypatch):
     more = {"none": NoDensifier, "volumetric": lambda: small(Volumetric, volume_threshold=0.01)}
@@ -71,8 +66,9 @@ def test_a_fused_training_has_the_bits_of_one_by_autograd(kind, lab, monkeypatch
         "steepgs",
     ):  # others look at the model in some steps
         assert len(calls) > 100
-    monkeypatch.setattr(trainer, "fast_steps", by_autograd)
-    plain = lab.train(make(), "plain")
+    calls.clear()
+    plain = lab.train(make(), "plain", by_autograd=True)
+    assert not calls
     assert same(fused, plain)
     assert lab.text(EVENTS, "fused") == lab.text(EVENTS, "plain")
 
@@ -82,10 +78,8 @@ def test_chunks_have_the_bits_of_the_whole(lab, monkeypatch):
     results = []
     many = lab.truth.select(torch.arange(len(lab.truth)).repeat(-(-3 * CHUNK // len(lab.truth))))
     monkeypatch.setattr(lab, "truth", many)
-    for fuse in (True, False):
-        if not fuse:
-            monkeypatch.setattr(trainer, "fast_steps", by_autograd)
-        results.append(lab.train(NoDensifier(), str(fuse), iterations=6))
+    for plain in (False, True):
+        results.append(lab.train(NoDensifier(), str(plain), iterations=6, by_autograd=plain))
     assert len(results[0]) > 2 * CHUNK
     assert same(*results)
 

@@ -39,6 +39,7 @@ from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.user_code import PERMISSIONS
 from gsbench.settings import check_values
 from gsbench.system.programs import allow_modules
+from gsbench.train.options import BY_AUTOGRAD
 
 MADE_GROUPS = tuple(f"hydra/{name}" for name in MADE_NODES)
 # stands for the seed while settings are resolved that all seeds share: reading it is an error
@@ -155,6 +156,9 @@ class Composer:
                 again = None if seed is None else self._trial(words, words)
                 trial = again or self._trial_of_hydra(words, number)
             trials.append(trial if seed is None else with_seed(trial, seed))
+        # Times compare ideas only if all arms train in the same way.
+        if len({_by_autograd(trial.values["train"]) for trial in trials}) > 1:
+            return self.trials([[*words, f"train.{BY_AUTOGRAD}=true"] for words in jobs])
         return trials
 
     def trial(self, overrides: Sequence[str]) -> Trial:
@@ -254,6 +258,11 @@ class Composer:
             if "${" in word:
                 override = parse_word(word)
                 check_texts({override.key_or_group: override.value()}, self.allowed)
+
+
+def _by_autograd(train: Mapping[str, Any]) -> bool:
+    """Return whether a part of the training needs steps of plain autograd, or a setting asks."""
+    return any(train.get(name) for name in (BY_AUTOGRAD, "loss", "terms", "optimizer"))
 
 
 def _swept_groups(sweeper: DictConfig) -> set[str]:

@@ -41,7 +41,7 @@ from gsbench.settings import (
     is_folder_name,
 )
 from gsbench.system.resources import trials_at_once
-from gsbench.train.options import IDEAS, TrainConfig, scale_steps
+from gsbench.train.options import BY_AUTOGRAD, IDEAS, TrainConfig, scale_steps
 
 NO_DENSIFIER = "gsbench.densify.NoDensifier"
 TUNE = "hydra.sweeper.tune"
@@ -333,7 +333,7 @@ def groups_keep_their_schemas(values: dict[str, Any]) -> None:
     # configurations keep their hashes.
     later = (
         ("scene", ("_target_", "beside", "depth_scale")),
-        ("train", IDEAS),
+        ("train", (*IDEAS, BY_AUTOGRAD)),
         ("eval", ("regions",)),
     )
     for group, names in later:

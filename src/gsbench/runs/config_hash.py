@@ -22,6 +22,7 @@ PURPOSES = {
     **dict.fromkeys(("scene.accept", "densify.switches"), READING),
     **dict.fromkeys(("eval.primary", "eval.baseline", "eval.controls"), READING),
     "train.steps_scaler": READING,  # it has been applied to the steps
+    "train.by_autograd": READING,
     **dict.fromkeys(("scene.path", "hydra", "experiment"), PLACE),
     **dict.fromkeys(("eval", "scene.name", "raster.name", "densify.name", "train.name"), APART),
     **dict.fromkeys(("init.name", "init.device", "init.weights", "init.download"), APART),

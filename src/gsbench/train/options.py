@@ -23,6 +23,8 @@ STEPS = (
     "volume_histogram",
 )
 
+BY_AUTOGRAD = "by_autograd"
+
 
 @dataclass
 class TrainConfig(LearningRates):
@@ -48,6 +50,9 @@ class TrainConfig(LearningRates):
     step_after_refine: bool = False
     # DashGaussian (train/resolution.py): training starts on small images
     resolution_schedule: Literal["none", "pictures"] = "none"
+    # steps of plain autograd, as trainings with a loss, term or optimiser of your own have them:
+    # the same bits, in more time; a command with such a training gives it to all
+    by_autograd: bool = False
     visible_adam: bool = False  # the optimiser updates visible Gaussians only; not in the baseline
     # time budget; training ends with the iteration that reaches it
     max_seconds: PositiveFloat | None = None

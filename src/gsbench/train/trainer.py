@@ -137,8 +137,9 @@ class Trainer:
         self.loss = PhotometricLoss(options.ssim_weight, torch.get_num_threads())
         self.fast, step_all = fast_steps(rasterizer, self.loss, options, self.background)
         self.used: FastStep | None = None  # by this iteration
-        if ideas.reads_renders or ideas.optimizer is not None or self._adds_depth:
-            self.fast = None  # such parts need autograd
+        needs_autograd = ideas.reads_renders or ideas.optimizer is not None or self._adds_depth
+        if options.by_autograd or needs_autograd:
+            self.fast = None
         self.gaussians = TrainableGaussians(
             initial, options, scene.extent, step_all, ideas.optimizer
         )
