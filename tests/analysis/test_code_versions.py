@@ -124,3 +124,28 @@ def test_explain_names_the_commit_and_the_edited_packages(tmp_path):
     said = explain_cell("exp:garden:psnr:adc", tmp_path / "other")
     assert "commit    0123abcd\n" in said
     assert "since the last release" not in said
+
+
+def test_a_module_that_only_one_arm_has_makes_no_version(tmp_path):
+    """A sweep over ``train.terms=[],[…]``: the baseline has no module, the idea has one."""
+    term = {"train.terms": [{"_target_": "mine.Term", "weight": 0.1}]}
+    for seed in (0, 1):
+        finished_at(write_trial(tmp_path, seed, "aaaaaaaa", psnr=27.0), 1000)
+        finished_at(write_trial(tmp_path, seed, "bbbbbbbb", term, psnr=28.0, _code=code(OLD)), 2000)
+    experiment = loaded(tmp_path)
+    assert not experiment.warnings
+    assert len(experiment.trials) == 4
+    # an edit of the term folds the trials with it, and leaves the baseline
+    finished_at(write_trial(tmp_path, 0, "cccccccc", term, psnr=29.0, _code=code(NEW)), 3000)
+    experiment = loaded(tmp_path)
+    assert sorted(trial.metrics["psnr"] for trial in experiment.trials) == [27, 27, 29]
+    assert len(experiment.older) == 2
+
+
+def test_an_idea_of_two_modules_leaves_the_arm_with_one(tmp_path):
+    both = code(OLD)
+    both["sources"]["term"] = "7" * 64
+    finished_at(write_trial(tmp_path, 0, "aaaaaaaa", MINE, psnr=27.0, _code=code(OLD)), 1000)
+    more = MINE | {"train.terms": [{"_target_": "term.Term", "weight": 0.1}]}
+    finished_at(write_trial(tmp_path, 0, "bbbbbbbb", more, psnr=28.0, _code=both), 2000)
+    assert not loaded(tmp_path).warnings

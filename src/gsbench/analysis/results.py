@@ -23,6 +23,7 @@ from gsbench.runs.experiments import experiment_home, trial_folders
 from gsbench.runs.freshness import Change, code_changes
 from gsbench.runs.layout import CONFIG, FAILED, PER_VIEW, RESULTS, SEED
 from gsbench.runs.nested import SHOWN
+from gsbench.runs.package_code import edited
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import UnfinishedError
 from gsbench.words import command, counted, some_of
@@ -219,42 +220,80 @@ def newest_code(experiment: Experiment) -> Experiment:
     The code of an idea is that of its newest question; without one, that of the trial which was
     finished last. A warning for each part of the code names the earlier versions.
     """
-    code: dict[str, str] = {}
-    for question in experiment.history.questions:
-        for arm, side in ((question.baseline, 0), (question.idea, 1)):
-            digests = [both[side] for both in question.digests.values() if both[side]]
-            if digests:
-                code[arm.name] = code_in(digests[-1])
     older: list[TrialResult] = []
     # {(part, version that counts): {earlier version: its trials}}
     replaced: dict[tuple[str, str], dict[str, list[TrialResult]]] = {}
 
-    def fold(made: Sequence[TrialResult], now: Sequence[TrialResult], name: str) -> None:
+    def fold(made: Sequence[TrialResult], now: TrialResult | None, name: str) -> None:
         older.extend(made)
-        change = _change_of_code(made[0], now[0]) if now else Change("code", name, now="newer")
+        change = _change_of_code(made[0], now) if now else Change("code", name, now="newer")
         earlier = replaced.setdefault((change.name, change.now), {})
         earlier.setdefault(change.made, []).extend(made)
 
+    asked = _asked_code(experiment)
     for name, own in group_by(experiment.trials, lambda t: f"{t.init}-{t.densify}").items():
-        versions = group_by(own, lambda trial: code_in(trial.digest))
-        newest = code.get(name, max(versions, key=lambda version: _last(versions[version])))
-        for version, made in versions.items():
-            if version != newest:
-                fold(made, versions.get(newest, []), name)
+        by_code = group_by(own, lambda trial: code_in(trial.digest))
+        questions = asked.get(name, [])
+        finished = sorted(by_code, key=lambda code: _last(by_code[code]))
+        current: list[TrialResult] = []
+        # The newest code comes first; what contradicts it is earlier code.
+        for code in dict.fromkeys(reversed([*finished, *questions])):
+            made = by_code.get(code, [])
+            if not made:
+                continue
+            newer = next((one for one in current if _contradicts(one, made[0])), None)
+            if newer is not None or _awaits_other_code(questions, by_code):
+                fold(made, newer, name)
+            else:
+                current += made
         # an update of gsbench: the trials of a scene and settings that it repeated
-        same = group_by(versions.get(newest, []), lambda t: (t.scene, settings_text(t.config)))
+        same = group_by(current, lambda t: (t.scene, settings_text(t.config)))
         for repeated in same.values():
             stages = group_by(repeated, lambda trial: frozenset(trial.code.items()))
             last = max(stages.values(), key=_last)
             for made in stages.values():
                 if made is not last:
-                    fold(made, last, name)
+                    fold(made, last[0], name)
     if not older:
         return experiment
     left_out = {trial.path for trial in older}
     kept = tuple(trial for trial in experiment.trials if trial.path not in left_out)
     lines = tuple(_versions_line(*part, earlier) for part, earlier in replaced.items())
     return replace(experiment, trials=kept, older=(*experiment.older, *older), versions=lines)
+
+
+def _asked_code(experiment: Experiment) -> dict[str, list[str]]:
+    """The code of the questions about each arm's name, the newest last."""
+    found: dict[str, list[str]] = {}
+    for question in experiment.history.questions:
+        for arm, side in ((question.baseline, 0), (question.idea, 1)):
+            digests = [both[side] for both in question.digests.values() if both[side]]
+            found.setdefault(arm.name, []).extend(map(code_in, digests[-1:]))
+    return found
+
+
+def _awaits_other_code(questions: Sequence[str], by_code: Mapping[str, list[TrialResult]]) -> bool:
+    """Return whether the newest question is about a later version of all trials' code.
+
+    No trial with its code has ended, so its modules are not known. It is a version of what is there
+    if that has a module of the user's; otherwise its idea may be what brings one.
+    """
+    modules = {frozenset(made[0].record.code.sources) for made in by_code.values()}
+    is_waiting = bool(questions) and questions[-1] not in by_code
+    return is_waiting and len(modules) == 1 and frozenset() not in modules
+
+
+def _contradicts(one: TrialResult, other: TrialResult) -> bool:
+    """Return whether two trials of an arm have different versions of the same code.
+
+    Settings of one densifier may name different modules of the user's, as a term does that the
+    baseline lacks: a module that only one of them has makes no version.
+    """
+    first, second = one.record.code, other.record.code
+    shared = first.sources.keys() & second.sources.keys()
+    return edited(first.packages) != edited(second.packages) or any(
+        first.sources[name] != second.sources[name] for name in shared
+    )
 
 
 def _last(trials: Sequence[TrialResult]) -> float:
@@ -272,7 +311,7 @@ def _versions_line(part: str, now: str, earlier: Mapping[str, Sequence[TrialResu
     """``sw: 6 trials of sfm-mine made by earlier versions of mine: 3fa9c1d2 (4), …``"""
     trials = [trial for made in earlier.values() for trial in made]
     arms = sorted({f"{trial.init}-{trial.densify}" for trial in trials})
-    versions = [f"{version:.{SHOWN}} ({len(made)})" for version, made in earlier.items()]
+    versions = [f"{version:.{SHOWN}} ({len(made)})" for version, made in reversed(earlier.items())]
     return (
         f"{trials[0].experiment}: {counted(len(trials), 'trial')} of {some_of(arms)} made by "
         f"earlier versions of {part}: {', '.join(versions)}; the trials that count have "
