@@ -28,6 +28,7 @@ STEPS = np.arange(12, dtype=np.uint16).reshape(3, 4) * 1000
         ("a.npy", STEPS.astype(np.float64), STEPS),
         ("a.npy", STEPS.astype(np.int32), STEPS / 1000),
         ("a.npy", np.array([[np.nan, np.inf], [-1.0, 2.0]]), [[0, 0], [0, 2]]),
+        ("a.npy", STEPS[..., None].astype(np.float32), STEPS),
     ],
 )
 def test_depth_is_in_world_units_and_0_where_it_is_not_known(tmp_path, name, values, expected):
@@ -67,7 +68,7 @@ def test_pixels_of_a_view_are_the_nearest_of_the_picture():
     picture = np.arange(6 * 8).reshape(6, 8)
     lens = CameraModel("PINHOLE", 80, 60, (70.0, 70.0, 40.0, 30.0))
     view = to_pinhole(lens).resized(20, 15)
-    chosen = pixels_of_view(picture, lens, view)
+    chosen = pixels_of_view(picture, lens, view, "a.png")
     for row in range(15):
         for column in range(20):
             assert (
@@ -84,10 +85,20 @@ def test_pixels_of_an_undistorted_view_follow_the_lens():
     bitmap = pycolmap.Bitmap.from_array(ramp)
     flat, _ = pycolmap.undistort_image(pycolmap.UndistortCameraOptions(), bitmap, source)
     expected = np.array(flat.to_array()).astype(int)
-    chosen = pixels_of_view(ramp, lens, flat_camera(lens)).astype(int)
+    chosen = pixels_of_view(ramp, lens, flat_camera(lens), "a.png").astype(int)
     assert chosen.shape == expected.shape
     inside = (slice(2, -2), slice(2, -2))  # COLMAP blends the border with black
     assert np.abs(chosen - expected)[inside].max() <= 2  # one pixel
+
+
+def test_a_picture_of_another_shape_is_refused():
+    lens = CameraModel("PINHOLE", 480, 268, (400.0, 400.0, 240.0, 134.0))
+    view = to_pinhole(lens).resized(96, 54)
+    for size in ((134, 240), (67, 120), (34, 60), (300, 537)):
+        assert pixels_of_view(np.zeros(size), lens, view, "a.npy").shape == (54, 96)
+    for size in ((134, 160), (268, 400), (480, 268)):
+        with refusal("a.npy: is .* px, and its photograph 480x268"):
+            pixels_of_view(np.zeros(size), lens, view, "a.npy")
 
 
 def test_a_kind_that_no_photograph_has_is_refused(make_scene):
@@ -120,3 +131,13 @@ def test_views_have_depth_in_the_units_of_the_training(make_scene, tmp_path):
     plain = load_scene(capture, capture.model, Store(tmp_path / "cache"), max_size=32)
     assert not any(view.beside for view in plain.train)
     assert_array_equal(plain.train[0].image, scene.train[0].image)
+
+
+def test_depth_that_no_view_knows_is_refused(make_scene, tmp_path, caplog):
+    capture = read_colmap("x", make_scene())
+    first = capture.image_names[0]
+    np.save(tmp_path / "a.npy", np.full((30, 40), -1.0))
+    capture = replace(capture, depths={first: tmp_path / "a.npy"})
+    with refusal("scene.beside=depth: no view has a known depth"):
+        load_scene(capture, capture.model, Store(tmp_path / "cache"), beside=["depth"])
+    assert "scene.beside=depth: only 1 of 6 photographs have it" in caplog.text

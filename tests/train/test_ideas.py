@@ -433,3 +433,15 @@ def test_without_pictures_beside_it_a_view_has_no_depth(lab):
             return 0 * step.render.image.mean()
 
     trained(lab, parts={"terms": [(Bare(), 1.0)]}, iterations=2)
+
+
+def test_an_error_of_a_term_names_it_and_says_how_to_ask_for_depth(lab):
+    class Careless:
+        def __call__(self, step):
+            return step.render.depth.mean()
+
+    words = (
+        "iteration 1: the term Careless of train.terms raised AttributeError: .*needs_depth = True"
+    )
+    with pytest.raises(TrainingError, match=words):
+        trained(lab, parts={"terms": [(Careless(), 1.0)]}, iterations=2)

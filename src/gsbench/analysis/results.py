@@ -311,7 +311,9 @@ def _versions_line(part: str, now: str, earlier: Mapping[str, Sequence[TrialResu
     """``sw: 6 trials of sfm-mine made by earlier versions of mine: 3fa9c1d2 (4), …``"""
     trials = [trial for made in earlier.values() for trial in made]
     arms = sorted({f"{trial.init}-{trial.densify}" for trial in trials})
-    versions = [f"{version:.{SHOWN}} ({len(made)})" for version, made in reversed(earlier.items())]
+    versions = [
+        f"{version:.{SHOWN}} ({len(made)})" for version, made in reversed(list(earlier.items()))
+    ]
     return (
         f"{trials[0].experiment}: {counted(len(trials), 'trial')} of {some_of(arms)} made by "
         f"earlier versions of {part}: {', '.join(versions)}; the trials that count have "

@@ -97,8 +97,8 @@ class EvalConfig:
             if (region or AT in self.primary) and region not in ["", *self.region_names]:
                 names = [*self.region_names, *QUESTIONS.values()]
                 raise InputError(
-                    f"eval.primary={self.primary}: after {AT} comes a region of eval.regions, "
-                    f"interpolation or extrapolation ({', '.join(names)})"
+                    f"eval.primary={self.primary}: after {AT} comes one of {', '.join(names)}; "
+                    "eval.regions=distance adds near, middle and far"
                 )
             if region and metric.startswith(LPIPS):
                 raise InputError(

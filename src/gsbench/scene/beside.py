@@ -63,10 +63,13 @@ def read_beside(path: Path, kind: str, depth_scale: float | None = None) -> Pixe
     else:
         with open_image(path) as image:
             values = _decoded(path, image)
+    if values.ndim == 3 and values.shape[2] == 1:
+        values = values[..., 0]
     if values.ndim != 2 or values.dtype.kind not in "uif":
         raise InputError(
             f"{path}: a depth map has one number for each pixel, this has {values.dtype} "
-            f"{list(values.shape)}: save it as 16-bit grey, 32-bit float TIFF, or .npy"
+            f"{list(values.shape)}: save it as 16-bit grey, 32-bit float TIFF, or .npy of height x "
+            "width"
         )
     step = 1.0 if values.dtype.kind == "f" else depth_scale or MILLIMETRE
     depth = values.astype(np.float32) * np.float32(step)
@@ -91,12 +94,20 @@ def resized(picture: Pixels, width: int, height: int) -> Pixels:
     return picture[np.ix_(rows.astype(int), columns.astype(int))]
 
 
-def pixels_of_view(picture: Pixels, lens: CameraModel, view: Camera) -> Pixels:
+def pixels_of_view(picture: Pixels, lens: CameraModel, view: Camera, source: Path) -> Pixels:
     """The pixels of ``picture`` [h, w, …] nearest to those of an undistorted view: [H, W, …].
 
     The picture covers the photograph of ``lens`` and may have another size. Pixels of the view that
-    lie outside the photograph are 0.
+    lie outside the photograph are 0. Raises InputError that names ``source``, the picture's file,
+    if the picture has another shape.
     """
+    height, width = picture.shape[:2]
+    # Both sides of a smaller picture were rounded to whole pixels.
+    if abs(width * lens.height - height * lens.width) > max(lens.width, lens.height):
+        raise InputError(
+            f"{source}: is {width}x{height} px, and its photograph {lens.width}x{lens.height}: "
+            "give a picture of the whole photograph, of the same shape"
+        )
     if not lens.distorted:
         return resized(picture, view.width, view.height)
     import pycolmap  # slow to load, and not needed for pinhole images

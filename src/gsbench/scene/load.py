@@ -10,6 +10,7 @@ length. It runs on pixels in memory, so images are not compressed as JPEG again.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -48,6 +49,8 @@ from gsbench.system.resources import in_threads
 
 PrincipalPoint = Literal["used", "centred"]
 CAMERAS_FILE = "cameras.json"
+log = logging.getLogger(__name__)
+
 INTRINSICS = ("width", "height", "fx", "fy", "cx", "cy")
 # images per isolated process: limits what a crash loses, and progress is reported after each chunk
 _CHUNK = 16
@@ -142,7 +145,7 @@ def load_scene(
         for kind, own in files.items():
             if name in own:
                 picture = read_beside(own[name], kind, depth_scale)
-                found[kind] = pixels_of_view(picture, lenses[name], camera)
+                found[kind] = pixels_of_view(picture, lenses[name], camera, own[name])
         if DEPTH in found:
             found[DEPTH] *= np.float32(scale)
         return found
@@ -162,6 +165,18 @@ def load_scene(
 
     names = [name for name in capture.image_names if name in entries]
     views = list(in_threads(view, names))
+    for kind, own in files.items():
+        if len(own) < len(names):
+            log.warning(
+                "scene.beside=%s: only %d of %d photographs have it", kind, len(own), len(names)
+            )
+    if DEPTH in files and not any(
+        view.beside[DEPTH].any() for view in views if DEPTH in view.beside
+    ):
+        raise InputError(
+            "scene.beside=depth: no view has a known depth: depths are finite numbers above 0, in "
+            "world units or in steps of scene.depth_scale"
+        )
     held_out = set(capture.test_names)
     return Scene(
         name=capture.name,

@@ -55,11 +55,11 @@ def check_masks(rows: Sequence[Photograph]) -> None:
             given("mask-of-other-size", size != row.size, str(row.mask), name=row.name, **texts)
 
 
-def read_mask(path: Path) -> Mask:
+def read_mask(path: Path, may_be_black: bool = False) -> Mask:
     """Read a mask [H, W]: False where the file is black.
 
     Raises InputError for a file that is no mask: with colours, with many greys, or black
-    everywhere.
+    everywhere unless it ``may_be_black``.
     """
     with open_image(path) as image:
         try:
@@ -84,7 +84,8 @@ def read_mask(path: Path) -> Mask:
             )
         pixels = pixels.max(axis=2)
     mask: Mask = pixels != 0
-    given("black-mask", float(mask.mean()), str(path))
+    if not may_be_black:
+        given("black-mask", float(mask.mean()), str(path))
     given("grey-mask", float((mask & (pixels != pixels.max())).mean()), str(path))
     return mask
 

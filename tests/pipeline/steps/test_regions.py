@@ -101,6 +101,14 @@ def test_masks_give_regions_by_name(case):
     assert region_inputs(views, parts) != before
 
 
+def test_a_view_may_lack_a_region(case):
+    views, parts = case
+    parts.eval.regions = {"sky": "masks"}
+    black = np.zeros(SIZE[::-1], np.uint8)
+    pictures(Path(parts.scene.path) / "masks", dict.fromkeys(NAMES, black))
+    assert not regions_of(views, parts)["a.png"]["sky"].any()
+
+
 def test_distances_of_a_scene_without_points_are_refused(case, tmp_path):
     views, parts = case
     for model in (None, tmp_path / "bare"):

@@ -63,7 +63,12 @@ def regions_of(views: Views, parts: Parts) -> Mapping[str, Regions]:
         masks = region_masks(capture, parts)
         return {
             view.name: {
-                name: pixels_of_view(read_mask(files[view.name]), lenses[view.name], view.camera)
+                name: pixels_of_view(
+                    read_mask(files[view.name], may_be_black=True),
+                    lenses[view.name],
+                    view.camera,
+                    files[view.name],
+                )
                 for name, files in masks.items()
             }
             for view in test
@@ -74,7 +79,7 @@ def regions_of(views: Views, parts: Parts) -> Mapping[str, Regions]:
         if view.name not in files:
             return np.zeros((view.camera.height, view.camera.width), np.float32)
         picture = read_beside(files[view.name], DEPTH, scale)
-        return pixels_of_view(picture, lenses[view.name], view.camera)
+        return pixels_of_view(picture, lenses[view.name], view.camera, files[view.name])
 
     if files:
         return regions_by_distance({view.name: depth_of(view) for view in test})
