@@ -5,7 +5,6 @@ that belong together share one name. A densifier class adds the ingredients in w
 ADC. All are read from the trials' recorded configurations and code.
 """
 
-import itertools
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
@@ -259,12 +258,17 @@ def compared_trials(trials: Iterable[TrialResult], first: Arm, second: Arm) -> l
     Without a common scene it is one pair. Raises KeyError for an arm without trials.
     """
     by_arm = group_by(trials, lambda trial: trial.arm)
-    everywhere = list(itertools.product(by_arm[first], by_arm[second]))
-    shared = [pair for pair in everywhere if pair[0].scene == pair[1].scene]
-    by_scene = group_by(shared, lambda pair: pair[0].scene).values()
-    return [
-        min(own, key=lambda pair: pair[0].seed != pair[1].seed) for own in by_scene or [everywhere]
-    ]
+    ones, others = by_arm[first], by_arm[second]
+    here, there = (group_by(own, lambda trial: trial.scene) for own in (ones, others))
+    shared = [_first_pair(own, there[scene]) for scene, own in here.items() if scene in there]
+    return shared or [_first_pair(ones, others)]
+
+
+def _first_pair(ones: Sequence[TrialResult], others: Sequence[TrialResult]) -> TrialPair:
+    """The first trials of one seed, else the first ones."""
+    of_seed = {trial.seed: trial for trial in reversed(others)}
+    pairs = ((one, of_seed[one.seed]) for one in ones if one.seed in of_seed)
+    return next(pairs, (ones[0], others[0]))
 
 
 def ingredients_note(names: Sequence[str], first: Arm, second: Arm) -> Note:

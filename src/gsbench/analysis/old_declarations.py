@@ -12,7 +12,7 @@ from dataclasses import field, replace
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.quantities import asked_quantity
 from gsbench.analysis.questions import Asked, choose_pairs, draft, level_of
-from gsbench.analysis.results import Experiment, TrialResult
+from gsbench.analysis.results import Experiment, TrialResult, group_by
 from gsbench.parsing import Amount, Count, Record
 from gsbench.runs.commands import ERROR_RATE, Digest, Question, code_in
 from gsbench.runs.experiments import Arm, unix_time
@@ -145,21 +145,17 @@ def _of_missing(
     swept settings only have one name, and each of them lacks what one of them lacks.
     """
     measured = {(trial.scene, trial.arm): trial.digest for trial in trials}
-    keys = [tuple(key.split("/")) for key in planned if key.count("/") == 2]
-    lacking = {scene for scene, name, digest in keys} - question.seeds.keys()
+    keys = group_by([key for key in planned if key.count("/") == 2], lambda key: key.split("/")[0])
+    arms = question.baseline, question.idea
     digests, seeds = dict(question.digests), {}
-    for scene in sorted(lacking):
-        sides = []
-        for arm in (question.baseline, question.idea):
-            own = [
-                f"{scene}/{name}/{end}"
-                for where, name, end in keys
-                if (where, name) == (scene, arm.name)
-            ]
-            sides.append(([measured[scene, arm]] if (scene, arm) in measured else own, own))
-        if all(own for _, own in sides):
-            digests[scene] = sides[0][0][0], sides[1][0][0]
-            seeds[scene] = planned[sides[1][1][0]]
+    for scene in sorted(keys.keys() - question.seeds.keys()):
+        own = [[key for key in keys[scene] if key.split("/")[1] == arm.name] for arm in arms]
+        if all(own):
+            # a key stands for the digest of what is not trained yet
+            first, second = (
+                measured.get((scene, arm), of_arm[0]) for arm, of_arm in zip(arms, own, strict=True)
+            )
+            digests[scene], seeds[scene] = (first, second), planned[own[1][0]]
     return digests, seeds
 
 

@@ -213,7 +213,7 @@ def _metric(key: str, step: str, trials: Sequence[TrialResult]) -> Quantity:
     base, _, region = key.partition(AT)
     records = [trial.record.metric_facts.get(base) for trial in trials if key in trial.metrics]
     facts = find_metric(base) or from_record(base, records[0] if records else None)
-    facts = in_region(facts, region) if region else facts
+    facts = in_region(facts, region)
     name, read = facts.name, lambda trial: trial.metrics.get(key)
     if step:
         measured = sorted({int(at) for trial in trials for at in trial.record.metrics_at})

@@ -234,26 +234,27 @@ def newest_code(experiment: Experiment) -> Experiment:
     for name, own in group_by(experiment.trials, lambda t: f"{t.init}-{t.densify}").items():
         by_code = group_by(own, lambda trial: code_in(trial.digest))
         questions = asked.get(name, [])
-        finished = sorted(by_code, key=lambda code: _last(by_code[code]))
+        is_awaited = _awaits_other_code(questions, by_code)
+        newest: list[TrialResult] = []  # one of each code that counts
         current: list[TrialResult] = []
         # The newest code comes first; what contradicts it is earlier code.
-        for code in dict.fromkeys(reversed([*finished, *questions])):
-            made = by_code.get(code, [])
-            if not made:
+        for code in dict.fromkeys([*reversed(questions), *_newest_first(by_code)]):
+            if code not in by_code:  # asked about, and not trained yet
                 continue
-            newer = next((one for one in current if _contradicts(one, made[0])), None)
-            if newer is not None or _awaits_other_code(questions, by_code):
+            made = by_code[code]
+            newer = next((one for one in newest if _contradicts(one, made[0])), None)
+            if newer is not None or is_awaited:
                 fold(made, newer, name)
             else:
+                newest.append(made[0])
                 current += made
         # an update of gsbench: the trials of a scene and settings that it repeated
         same = group_by(current, lambda t: (t.scene, settings_text(t.config)))
         for repeated in same.values():
             stages = group_by(repeated, lambda trial: frozenset(trial.code.items()))
-            last = max(stages.values(), key=_last)
-            for made in stages.values():
-                if made is not last:
-                    fold(made, last[0], name)
+            last, *earlier = _newest_first(stages)
+            for one in earlier:
+                fold(stages[one], stages[last][0], name)
     if not older:
         return experiment
     left_out = {trial.path for trial in older}
@@ -296,9 +297,11 @@ def _contradicts(one: TrialResult, other: TrialResult) -> bool:
     )
 
 
-def _last(trials: Sequence[TrialResult]) -> float:
-    """When the last of the trials was finished."""
-    return max(trial.finished for trial in trials)
+def _newest_first(groups: Mapping[K, Sequence[TrialResult]]) -> list[K]:
+    """The keys of groups of trials, by the time at which the last of each was finished."""
+    if len(groups) == 1:  # the time takes a file of each trial
+        return list(groups)
+    return sorted(groups, key=lambda key: max(one.finished for one in groups[key]), reverse=True)
 
 
 def _change_of_code(made: TrialResult, newest: TrialResult) -> Change:
