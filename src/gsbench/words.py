@@ -4,6 +4,7 @@ import difflib
 import re
 import shlex
 import string
+import traceback
 import unicodedata
 from collections.abc import Iterable, Sequence
 from dataclasses import fields
@@ -229,3 +230,10 @@ class _Form(string.Formatter):
 
 
 FORM = _Form()
+
+
+def raised(error: Exception) -> str:
+    """The error of a user's code with its place, in one line: ``KeyError 'a' (b.py, line 3)``."""
+    frame = traceback.extract_tb(error.__traceback__)[-1]
+    message = " ".join(f"{type(error).__name__} {str(error)[:200]}".split())
+    return f"{message} ({frame.filename}, line {frame.lineno})"

@@ -161,7 +161,7 @@ def test_versions_cover_python_and_the_installed_packages():
 
 
 def test_source_files_are_the_users_files_of_a_capture(tmp_path):
-    parts = SimpleNamespace(eval=SimpleNamespace(regions=None))
+    parts = SimpleNamespace(eval=SimpleNamespace(regions=None), scene=SimpleNamespace(beside=[]))
     store, model = Store(tmp_path / "store"), {"cameras.bin", "images.bin", "points3D.bin"}
     write_all(dict.fromkeys(model, ""), tmp_path / "model")
     capture = Capture("own", tmp_path, ("a.png", "b.png"), (), None, False, "0")

@@ -1,7 +1,6 @@
 """The evaluator: it applies a protocol's metrics and the user's own to pairs of images."""
 
 import math
-import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -37,6 +36,7 @@ from gsbench.eval.ssim import ssim
 from gsbench.eval.structure import STRUCTURAL, load_structural
 from gsbench.runs.experiments import AT
 from gsbench.weights import MissingWeightsError
+from gsbench.words import raised
 
 
 @dataclass(frozen=True)
@@ -257,7 +257,7 @@ class Evaluator:
                     if isinstance(metric, MaskedMetric) and not key.startswith(LPIPS)
                 ]
         for key, metric, within in measures:
-            if not self.unavailable.keys().isdisjoint((key, key.partition(AT)[0])):
+            if is_left_out(key, self.unavailable):
                 continue
             try:
                 value = self._measure(key.partition(AT)[0], metric, image, target, within)
@@ -286,12 +286,7 @@ class Evaluator:
         except Exception as error:
             if key not in self.own:
                 raise
-            frame = traceback.extract_tb(error.__traceback__)[-1]
-            message = " ".join(f"{type(error).__name__} {str(error)[:200]}".split())
-            raise InputError(
-                f"eval.extra.{key} raised {message} ({frame.filename}, line {frame.lineno}): "
-                "correct it"
-            ) from error
+            raise InputError(f"eval.extra.{key} raised {raised(error)}: correct it") from error
         if isinstance(value, Tensor | np.ndarray | np.generic) and math.prod(value.shape) == 1:
             value = value.item()
         if isinstance(value, bool) or not isinstance(value, Real):
@@ -339,5 +334,10 @@ def summarize(
     return {
         key: float(np.mean([view[key] for view in views if key in view]))
         for key in shared
-        if unavailable.keys().isdisjoint((key, key.partition(AT)[0]))
+        if not is_left_out(key, unavailable)
     }
+
+
+def is_left_out(key: str, unavailable: Mapping[str, str]) -> bool:
+    """Return whether a metric is ``unavailable``, by itself or as the metric of a region."""
+    return key in unavailable or key.partition(AT)[0] in unavailable

@@ -123,11 +123,13 @@ def find_metric(key: str) -> MetricFacts | None:
     """The facts about gsbench's metric ``key``, such as ``psnr`` or ``psnr@far``, or None."""
     metric, _, region = key.partition(AT)
     facts = next((facts for facts in ALL if facts.key == metric), None)
-    return facts if facts is None or not region else in_region(facts, region)
+    return None if facts is None else in_region(facts, region)
 
 
 def in_region(facts: MetricFacts, region: str) -> MetricFacts:
-    """The facts about a metric that is measured in one region of each view (``eval.regions``)."""
+    """The facts about a metric that is measured in one ``region`` of each view, or in all if ""."""
+    if not region:
+        return facts
     return replace(facts, key=f"{facts.key}{AT}{region}", label=f"{facts.label} {region}")
 
 

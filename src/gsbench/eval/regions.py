@@ -46,18 +46,11 @@ def regions_by_distance(depths: Mapping[str, Depth]) -> dict[str, Regions]:
     known = np.concatenate([depth[depth > 0] for depth in depths.values()])
     if not len(known):
         return {name: {} for name in depths}
-    first, second = np.quantile(known, [1 / 3, 2 / 3])
+    limits = np.quantile(known, [1 / 3, 2 / 3])
+    parts = {name: np.digitize(depth, limits, right=True) for name, depth in depths.items()}
     return {
-        name: dict(
-            zip(
-                DISTANCES,
-                [
-                    (depth > 0) & (depth <= first),
-                    (depth > first) & (depth <= second),
-                    depth > second,
-                ],
-                strict=True,
-            )
-        )
-        for name, depth in depths.items()
+        name: {
+            region: (depths[name] > 0) & (part == number) for number, region in enumerate(DISTANCES)
+        }
+        for name, part in parts.items()
     }

@@ -103,7 +103,7 @@ def setting_in(message: str, values: dict[str, Any]) -> str:
 
 
 def _values(trial: Trial, read: Sequence[str]) -> dict[str, Any]:
-    """What a trial's configuration says about the groups ``read``."""
+    """The settings of a trial in the groups ``read``, without those of `NOT_NAMED`."""
     return {
         group: {key: value for key, value in values.items() if key not in NOT_NAMED}
         if isinstance(values := trial.values.get(group), dict)

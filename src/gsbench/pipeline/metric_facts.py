@@ -19,5 +19,5 @@ def facts_for(metric: str, values: Mapping[str, Any]) -> MetricFacts:
     from gsbench.pipeline.parts import build_metrics
 
     name, _, region = metric.partition(AT)
-    facts = facts_of(name, build_metrics(values["eval"], values["allow_targets"])[name])
-    return in_region(facts, region) if region else facts
+    metrics = build_metrics(values["eval"], values["allow_targets"])
+    return in_region(facts_of(name, metrics[name]), region)

@@ -32,7 +32,7 @@ from gsbench.pipeline.parts import Parts
 from gsbench.pipeline.results import results_of
 from gsbench.pipeline.steps.evaluate import evaluate_step
 from gsbench.pipeline.steps.external import external_step
-from gsbench.pipeline.steps.regions import check_capture, region_masks
+from gsbench.pipeline.steps.regions import check_capture, files_read
 from gsbench.pipeline.steps.scene import (
     CaptureSource,
     Views,
@@ -264,9 +264,7 @@ def source_files(capture: Capture, parts: Parts, store: Store) -> list[Path]:
     if capture.images.resolve().is_relative_to(store.root.resolve()):
         return []
     files = [capture.images / name for name in capture.image_names]
-    files += [*capture.masks.values(), *capture.depths.values(), *capture.read_from]
-    beside = [*capture.more.values(), *region_masks(capture, parts).values()]
-    files += [file for own in beside for file in own.values()]
+    files += [*capture.masks.values(), *files_read(capture, parts), *capture.read_from]
     if capture.model is not None:
         files += model_files(capture.model)
     return [file.resolve() for file in files]

@@ -9,16 +9,8 @@ from torch import Tensor
 
 from gsbench.gaussians.model import C0, Gaussians
 from gsbench.raster.base import MEDIAN, Rasterizer, RenderOutput
-from gsbench.raster.reference import (
-    blending_weights,
-    members_of_tiles,
-    pixel_centres,
-    project,
-    tile_rectangles,
-)
+from gsbench.raster.reference import tiles_of
 from gsbench.scene.types import Camera
-
-AT_ONCE = 64  # Gaussians: most pixels are half opaque behind far fewer than their tile has
 
 
 def depth_colors(gaussians: Gaussians, camera: Camera) -> Gaussians:
@@ -68,24 +60,9 @@ def median_depth(rasterizer: Rasterizer, gaussians: Gaussians, camera: Camera) -
 @torch.no_grad()
 def median_gaussians(gaussians: Gaussians, camera: Camera) -> Tensor:
     """The Gaussian at which the transmittance falls to a half, [H, W]; -1 where none is."""
-    like = gaussians.means
-    chosen = torch.full((camera.height, camera.width), -1, device=like.device)
-    projected = project(gaussians, camera)
-    tiles = members_of_tiles(projected.depths, *tile_rectangles(projected, camera), camera)
-    for members, tile in tiles:
-        pixels = pixel_centres(tile, like)
-        left = torch.ones_like(pixels[:, 0])  # [P] transmittance
-        first = torch.full_like(left, -1, dtype=torch.int64)
-        for part in members.split(AT_ONCE):
-            index = projected.index[part]
-            means = projected.means[part].expand(len(pixels), -1, -1)  # [P, K, 2]
-            opacities = gaussians.opacities[index]
-            weights = blending_weights(pixels, means, projected.conics[part], opacities)
-            behind = left[:, None] * (1 - weights.cumsum(1))  # [P, K]
-            reached = (behind <= MEDIAN) & (first < 0)[:, None]
-            first = torch.where(reached.any(1), index[reached.int().argmax(1)], first)
-            left = behind[:, -1]
-            if bool((first >= 0).all()):
-                break
-        chosen[tile] = first.reshape(chosen[tile].shape)
+    chosen = torch.full((camera.height, camera.width), -1, device=gaussians.means.device)
+    for tile in tiles_of(gaussians, camera):
+        is_behind = tile.weights.cumsum(1) >= 1 - MEDIAN  # [P, K]
+        first = torch.where(is_behind.any(1), tile.rows[is_behind.int().argmax(1)], -1)
+        chosen[tile.place] = first.reshape(chosen[tile.place].shape)
     return chosen

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from gsbench.errors import InputError
-from gsbench.files import file_sha256
+from gsbench.files import DAMAGE, file_sha256
 from gsbench.scene.images import open_image
 from gsbench.scene.types import Camera, CameraModel, Capture
 from gsbench.words import listed
@@ -58,7 +58,7 @@ def read_beside(path: Path, kind: str, depth_scale: float | None = None) -> Pixe
     if path.suffix.lower() == ".npy":
         try:
             values: Pixels = np.load(path, allow_pickle=False)
-        except (OSError, ValueError, EOFError) as error:
+        except DAMAGE as error:
             raise InputError(f"{path}: is no array of numpy ({error}): save it again") from error
     else:
         with open_image(path) as image:
@@ -124,6 +124,13 @@ def pixels_of_view(picture: Pixels, lens: CameraModel, view: Camera, source: Pat
     chosen = picture[down, across]
     chosen[~inside] = 0
     return chosen.reshape(view.height, view.width, *picture.shape[2:])
+
+
+def view_of_file(
+    path: Path, kind: str, lens: CameraModel, view: Camera, depth_scale: float | None = None
+) -> Pixels:
+    """`pixels_of_view` of the file ``path``, as `read_beside` reads it."""
+    return pixels_of_view(read_beside(path, kind, depth_scale), lens, view, path)
 
 
 def digests(files: Mapping[str, Mapping[str, Path]]) -> dict[str, dict[str, str]]:

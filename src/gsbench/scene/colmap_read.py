@@ -117,7 +117,7 @@ def _check_file(file: Path) -> None:
 
 
 def _records(stem: str, data: bytes) -> Iterator[tuple[int, int]]:
-    """Where each record of a binary file starts, and where its list does."""
+    """Yield the offsets of each record of a binary file and of its list."""
     head, length, entry = BINARY[stem]
     (count,), offset = COUNT.unpack_from(data), COUNT.size
     for _ in range(count):

@@ -28,7 +28,7 @@ from gsbench.parsing import MAX_NUMBER, Count, Number, Record, read_typed
 from gsbench.runs.keys import VIEWS, Step, step_of
 from gsbench.runs.store import Store
 from gsbench.runs.trial_record import Oddity
-from gsbench.scene.beside import DEPTH, files_beside, pixels_of_view, read_beside
+from gsbench.scene.beside import DEPTH, files_beside, view_of_file
 from gsbench.scene.colmap_files import model_files
 from gsbench.scene.images import (
     Resample,
@@ -47,10 +47,10 @@ from gsbench.system.install import version_of
 from gsbench.system.isolate import CrashError, run_isolated
 from gsbench.system.resources import in_threads
 
-PrincipalPoint = Literal["used", "centred"]
-CAMERAS_FILE = "cameras.json"
 log = logging.getLogger(__name__)
 
+PrincipalPoint = Literal["used", "centred"]
+CAMERAS_FILE = "cameras.json"
 INTRINSICS = ("width", "height", "fx", "fy", "cx", "cy")
 # images per isolated process: limits what a crash loses, and progress is reported after each chunk
 _CHUNK = 16
@@ -144,8 +144,7 @@ def load_scene(
         found = {}
         for kind, own in files.items():
             if name in own:
-                picture = read_beside(own[name], kind, depth_scale)
-                found[kind] = pixels_of_view(picture, lenses[name], camera, own[name])
+                found[kind] = view_of_file(own[name], kind, lenses[name], camera, depth_scale)
         if DEPTH in found:
             found[DEPTH] *= np.float32(scale)
         return found

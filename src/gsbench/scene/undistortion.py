@@ -62,17 +62,22 @@ def flatten(cameras: Sequence[CameraModel]) -> list[Flattened]:
 
     COLMAP's native code can abort, so run it isolated.
     """
-    import pycolmap
-
     found = []
     for camera in cameras:
-        source = _colmap_camera(camera)
-        try:
-            pinhole = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), source)
-        except (ValueError, RuntimeError) as error:
-            raise InputError(_no_pinhole(camera)) from error
+        source, pinhole = _colmap_camera(camera), _pinhole_of(camera)
         found.append((folded_share(source, pinhole), pinhole.width, pinhole.height))
     return found
+
+
+def _pinhole_of(camera: CameraModel) -> pycolmap.Camera:
+    """COLMAP's camera of the undistorted photograph; raises InputError if there is none."""
+    import pycolmap
+
+    try:
+        options = pycolmap.UndistortCameraOptions()
+        return pycolmap.undistort_camera(options, _colmap_camera(camera))
+    except (ValueError, RuntimeError) as error:
+        raise InputError(_no_pinhole(camera)) from error
 
 
 def _colmap_camera(camera: CameraModel) -> pycolmap.Camera:
@@ -95,12 +100,7 @@ def _no_pinhole(camera: CameraModel) -> str:
 
 def flat_camera(camera: CameraModel) -> Camera:
     """The pinhole camera, at the origin, of what `undistort` makes of a photograph."""
-    if not camera.distorted:
-        return to_pinhole(camera)
-    import pycolmap
-
-    options = pycolmap.UndistortCameraOptions()
-    return to_pinhole(plain_camera(pycolmap.undistort_camera(options, _colmap_camera(camera))))
+    return to_pinhole(plain_camera(_pinhole_of(camera)) if camera.distorted else camera)
 
 
 def undistort(image: NDArray[np.uint8], camera: CameraModel) -> tuple[NDArray[np.uint8], Camera]:

@@ -8,7 +8,6 @@ class with a state has ``state_dict()`` and ``load_state_dict(state)``: checkpoi
 from __future__ import annotations
 
 import math
-import traceback
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -22,7 +21,7 @@ from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.trainable import Optimizer
 from gsbench.raster.base import RenderOutput
 from gsbench.scene.types import Camera
-from gsbench.words import NamesAttributes
+from gsbench.words import NamesAttributes, raised
 
 
 @dataclass(frozen=True)
@@ -172,11 +171,9 @@ def value_of(part: Term, step: Step, label: str) -> Tensor:
     try:
         value = part(step)
     except Exception as error:  # it may raise anything
-        frame = traceback.extract_tb(error.__traceback__)[-1]
         raise TrainingError(
-            f"iteration {step.iteration}: {label} raised {type(error).__name__}: {error} "
-            f"({frame.filename}, line {frame.lineno}); render.depth needs needs_depth = True on "
-            "the class, view.depth needs scene.beside=[depth]"
+            f"iteration {step.iteration}: {label} raised {raised(error)}; render.depth needs "
+            "needs_depth = True on the class, view.depth needs scene.beside=[depth]"
         ) from error
     if not isinstance(value, Tensor) or value.dim() != 0:
         shape = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__

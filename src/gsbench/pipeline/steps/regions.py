@@ -4,21 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from gsbench.errors import InputError
 from gsbench.eval.regions import DISTANCE, Depth, Regions, depths_of_points, regions_by_distance
-from gsbench.init.base import MODEL_FOLDER, read_cloud
+from gsbench.init.base import MODEL_FOLDER
 from gsbench.pipeline.steps.scene import Views
-from gsbench.scene.beside import DEPTH, digests, pixels_of_view, read_beside
-from gsbench.scene.colmap import posed_by_name, read_model
+from gsbench.scene.beside import DEPTH, digests, files_beside, pixels_of_view, view_of_file
+from gsbench.scene.colmap import model_points, posed_by_name, read_model
 from gsbench.scene.colmap_files import require_subfolder
 from gsbench.scene.load import lenses_of
 from gsbench.scene.masks import find_masks, read_mask
-from gsbench.scene.types import Capture, View
+from gsbench.scene.types import Array, CameraModel, Capture, View
 from gsbench.scene.undistortion import flat_camera
 
 if TYPE_CHECKING:
@@ -42,7 +43,7 @@ def region_inputs(views: Views, parts: Parts) -> dict[str, Any] | None:
     if wanted != DISTANCE:
         return digests(region_masks(capture, parts))
     depths = _sensor_depths(capture)
-    if not depths and (capture.model is None or not len(read_cloud(capture.model).points)):
+    if not depths and not len(_own_model(capture.model, capture.fingerprint).points):
         raise InputError(
             f"eval.regions={DISTANCE}: the scene {capture.name} has no depth maps and no model "
             "with points of its own, which all arms would share: give a COLMAP model (gsbench "
@@ -58,6 +59,9 @@ def regions_of(views: Views, parts: Parts) -> Mapping[str, Regions]:
     if not wanted:
         return {}
     capture, test = views.capture, views.scene.test
+    files = _sensor_depths(capture)
+    if wanted == DISTANCE and not files:
+        return regions_by_distance(_depths_in_model(capture, test))
     lenses = lenses_of(views.store.path(views.init) / MODEL_FOLDER)
     if wanted != DISTANCE:
         masks = region_masks(capture, parts)
@@ -73,17 +77,23 @@ def regions_of(views: Views, parts: Parts) -> Mapping[str, Regions]:
             }
             for view in test
         }
-    files, scale = _sensor_depths(capture), parts.scene.depth_scale
 
     def depth_of(view: View) -> Depth:
         if view.name not in files:
-            return np.zeros((view.camera.height, view.camera.width), np.float32)
-        picture = read_beside(files[view.name], DEPTH, scale)
-        return pixels_of_view(picture, lenses[view.name], view.camera, files[view.name])
+            return _unknown(view)
+        scale = parts.scene.depth_scale
+        return view_of_file(files[view.name], DEPTH, lenses[view.name], view.camera, scale)
 
-    if files:
-        return regions_by_distance({view.name: depth_of(view) for view in test})
-    return regions_by_distance(_depths_in_model(capture, test))
+    return regions_by_distance({view.name: depth_of(view) for view in test})
+
+
+def files_read(capture: Capture, parts: Parts) -> list[Path]:
+    """The user's files that regions and ``scene.beside`` read, besides photographs and model."""
+    read = [*files_beside(capture, parts.scene.beside).values()]
+    read += [*region_masks(capture, parts).values()]
+    if parts.eval.regions == DISTANCE:
+        read.append(_sensor_depths(capture))
+    return [file for own in read for file in own.values()]
 
 
 def region_masks(capture: Capture, parts: Parts) -> dict[str, dict[str, Path]]:
@@ -106,20 +116,36 @@ def _sensor_depths(capture: Capture) -> dict[str, Path]:
     return {name: capture.depths[name] for name in capture.test_names if name in capture.depths}
 
 
+class _OwnModel(NamedTuple):
+    """The points [P, 3] of a scene's own model, and cameras and poses by photograph."""
+
+    points: Array
+    placed: Mapping[str, tuple[CameraModel, Array, Array]]
+
+
+# Read before the training, to refuse a scene, and after it. The fingerprint covers its content.
+@lru_cache(maxsize=1)
+def _own_model(folder: Path | None, fingerprint: str) -> _OwnModel:
+    if folder is None:
+        return _OwnModel(np.empty((0, 3)), {})
+    model = read_model(folder)
+    return _OwnModel(model_points(model)[0], posed_by_name(model))
+
+
+def _unknown(view: View) -> Depth:
+    return np.zeros((view.camera.height, view.camera.width), np.float32)
+
+
 def _depths_in_model(capture: Capture, test: tuple[View, ...]) -> dict[str, Depth]:
     """The depth of the scene's own points in each test view, by the scene's own cameras."""
     # The cameras of the trial may come from another model, with another scale.
-    assert capture.model is not None
-    points = read_cloud(capture.model).points
-    placed = posed_by_name(read_model(capture.model))
-    depths = {}
-    for view in test:
-        height, width = view.camera.height, view.camera.width
+    points, placed = _own_model(capture.model, capture.fingerprint)
+
+    def depth_of(view: View) -> Depth:
         if view.name not in placed:
-            depths[view.name] = np.zeros((height, width), np.float32)
-            continue
+            return _unknown(view)
         lens, rotation, translation = placed[view.name]
-        camera = flat_camera(lens).resized(width, height)
-        posed = replace(camera, rotation=rotation, translation=translation)
-        depths[view.name] = depths_of_points(points, posed)
-    return depths
+        camera = flat_camera(lens).resized(view.camera.width, view.camera.height)
+        return depths_of_points(points, replace(camera, rotation=rotation, translation=translation))
+
+    return {view.name: depth_of(view) for view in test}

@@ -201,7 +201,7 @@ class Views:
         if options.beside:
             self._beside = {"beside": options.beside, "depth_scale": options.depth_scale}
 
-    @property
+    @cached_property
     def inputs(self) -> dict[str, Any]:
         """The inputs on which the views depend, besides the cameras, which come from ``init``."""
         names = sha256_of(list(self.capture.test_names))
