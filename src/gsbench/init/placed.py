@@ -6,7 +6,7 @@ The points are those of the reference, random, or from a file. A file holds poin
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass
 from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -88,7 +88,7 @@ class PlacedCloud(Initializer):
             model,
             ("pycolmap", "numpy"),
             scale_to_reference=1.0,
-            settings={entry.name: getattr(self, entry.name) for entry in fields(self)},
+            settings=asdict(self),  # type: ignore[call-overload]
             seconds=timer.rounded(),
             training_points=points,
         )

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 
 from gsbench.gaussians.paper_values import VOLUME_THRESHOLD
 from gsbench.init.base import Gauge, PoseErrors
@@ -149,7 +150,7 @@ def _centered(points: Array) -> Array:
     return points - points.mean(axis=0)
 
 
-def _spread(centers: Array) -> Array:
+def _spread(centers: Array) -> NDArray[np.floating]:
     """The singular values [3] of centres around their mean, largest first."""
     return np.linalg.svd(_centered(centers), compute_uv=False)
 
