@@ -244,7 +244,7 @@ def test_panoramas_are_refused_unless_they_are_accepted(tmp_path, size, refused)
     capture = read_photos("toy", tmp_path, accept=["panorama"])
     assert [(odd.rule, odd.refused) for odd in capture.oddities] == [("panorama", True)] * refused
     with refusal("scene.accept=panoramas is no rule: .*did you mean panorama"):
-        SceneConfig("toy", "photos", path="/x", accept=["panoramas"])
+        SceneConfig(name="toy", kind="photos", path="/x", accept=["panoramas"])
 
 
 def test_prepared_views_of_an_accepted_lens_are_judged_again(make_scene, tmp_path):

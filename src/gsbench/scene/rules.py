@@ -8,7 +8,7 @@ and its measure. The site shows the table (scripts/reference.py).
 import logging
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -210,7 +210,7 @@ def _panoramas(raw: Any) -> Iterable[Finding]:
 
 def _fixed(*row: Any) -> Rule:
     """A rule that refuses what is not fine, and cannot be accepted."""
-    return Rule(*row, usable=row[3], fixed=True)
+    return replace(Rule(*row), usable=row[3], fixed=True)
 
 
 ELSEWHERE = "the cloud may lie in other coordinates, or have another scale, than the cameras"
