@@ -65,23 +65,6 @@ def test_known_poses_give_points_on_the_true_surfaces(shared, courtyard):
         assert_array_equal(found.matrix(), image.cam_from_world().matrix())
 
 
-def test_colours_are_those_of_the_photographs(shared, courtyard):
-    _, output = shared
-    model = pycolmap.Reconstruction(output / MODEL_FOLDER)
-    pixels = {
-        name: np.asarray(Image.open(courtyard.images / name)) for name in courtyard.image_names
-    }
-    differences = []
-    for point in model.points3D.values():
-        seen = []
-        for element in point.track.elements:
-            image = model.images[element.image_id]
-            x, y = image.points2D[element.point2D_idx].xy
-            seen.append(pixels[image.name][int(y), int(x)])
-        differences.append(np.abs(np.mean(seen, axis=0) - point.color).max())
-    assert np.median(differences) < 12
-
-
 def test_output_is_complete_and_the_work_folder_is_gone(shared):
     report, output = shared
     assert read_json(output / REPORT_FILE) == report.to_dict()
