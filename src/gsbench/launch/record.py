@@ -221,5 +221,6 @@ def remove(home: Path, folders: Iterable[Path]) -> None:
         require_no_links(home.parent, folder, below=True)
         # first: a half-deleted trial must not look complete
         (folder / RESULTS).unlink(missing_ok=True)
-        shutil.rmtree(folder)
+        if folder.is_dir():
+            shutil.rmtree(folder)
     drop(home, folders)
