@@ -32,7 +32,6 @@ from gsbench.launch.outcomes import Outcome
 from gsbench.launch.states import QueuedJob, current_user, read_submission, record_submission
 from gsbench.runs.commands import digest_of
 from gsbench.runs.config_hash import config_hash
-from gsbench.system import programs
 from gsbench.system.locks import BusyError
 from gsbench.system.stopping import Stopped
 from tests.helpers import refusal, write
@@ -251,16 +250,6 @@ def test_a_stopped_job_ends_and_is_requeued_when_its_time_is_up(
     assert ended.value.code == 128 + number
     assert requeued == ([(number, None)] if name == "SIGUSR2" else [])
     assert job.checkpoint().function is job
-
-
-def test_a_job_gets_the_search_path_and_the_gpus_of_its_sweep(tmp_path, monkeypatch):
-    monkeypatch.setattr(sys, "path", ["", "a", "b"])
-    monkeypatch.setattr(programs._allowed, "folders", {"mine": "/there"})
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3")
-    one = trial(tmp_path)
-    assert TrialJob(one) == TrialJob(
-        one, ["a", "b"], {"mine": "/there"}, "3", digest_of(one.values)
-    )
 
 
 def test_a_job_whose_code_changed_since_its_command_fails_and_runs_nothing(

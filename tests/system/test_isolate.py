@@ -10,7 +10,6 @@ import psutil
 import pytest
 from numpy.testing import assert_array_equal
 
-from gsbench.errors import InputError
 from gsbench.system import isolate
 from gsbench.system.isolate import CrashError, run_isolated
 from tests.helpers import refusal
@@ -173,15 +172,6 @@ def test_progress_and_output_of_a_function_are_forwarded_to_the_end(functions, t
     assert told[2:] == [("a", 3, 5, "")]
 
 
-def test_a_fresh_interpreter_gets_this_search_path(monkeypatch):
-    monkeypatch.setattr(sys, "path", ["a"])
-    monkeypatch.setattr(isolate, "allowed_modules", lambda: {"mine": "/there"})
-    command = isolate.python_command("m.n", "f", "1", "2")
-    assert command[:3] == [sys.executable, "-P", "-c"]
-    assert command[3].endswith("from m.n import f; f()")
-    assert command[4:] == ['[["a"], {"mine": "/there"}]', "1", "2"]
-
-
 def test_descendants_that_cannot_be_killed_are_given_up(monkeypatch):
     now = iter([100.0, 104.9, 105.0])
     asked = []
@@ -192,12 +182,3 @@ def test_descendants_that_cannot_be_killed_are_given_up(monkeypatch):
     monkeypatch.setattr(psutil, "Process", lambda: here)
     isolate.end_descendants()
     assert asked == [1]
-
-
-def test_an_error_that_cannot_be_pickled_keeps_its_text():
-    class LocalError(Exception):
-        pass
-
-    assert isinstance(isolate._portable(InputError("a")), InputError)
-    portable = isolate._portable(LocalError("b"))
-    assert (type(portable), str(portable)) == (RuntimeError, "LocalError: b")

@@ -274,13 +274,11 @@ def clouds_first(trials: Sequence[Trial]) -> list[Trial]:
     Trials with the same initial cloud wait for each other, so running them at once would leave
     processes idle.
     """
-    known = set[str]()
-
-    def comes_later(trial: Trial) -> bool:
-        cloud = sha256_of([trial.values["scene"], trial.values["init"]])
-        return cloud in known or known.add(cloud) is not None
-
-    return sorted(trials, key=comes_later)
+    first: dict[str, Path] = {}  # folders by cloud
+    for trial in trials:
+        first.setdefault(sha256_of([trial.values["scene"], trial.values["init"]]), trial.folder)
+    leading = set(first.values())
+    return sorted(trials, key=lambda trial: trial.folder not in leading)
 
 
 def collect(job: Job[Outcome], trial: Trial) -> Outcome:

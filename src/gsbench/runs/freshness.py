@@ -161,8 +161,11 @@ def changes(
     present = config_hash(values)  # with the user's modules as this process has imported them
     if record.hashes.get("config") != present or made.config != present:
         yield Change("settings", layout.CONFIG, made.config, present)
-    code = Code(packages=record.code.packages, stages={one.name: 0 for one in STAGES} | made.stages)
-    yield from code_changes(code_of(code), present_version)
+    stages = {stage.name: "none" for stage in STAGES} | made.stages
+    code = code_of(Code(packages=record.code.packages)) | {
+        Part("stage", name): str(version) for name, version in stages.items()
+    }
+    yield from code_changes(code, present_version)
     if made.pycolmap != (installed := version_of("pycolmap")):
         yield Change("code", "pycolmap", str(made.pycolmap), str(installed))
     for source, stamp in made.sources.items():

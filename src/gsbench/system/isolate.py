@@ -160,11 +160,11 @@ def run_isolated(
     """
     what = what or function.__name__
     call = pickle.dumps((function, args, progress is not None))
-    with log.open("ab") if log else tempfile.NamedTemporaryFile() as output:
+    with log.open("ab+") if log else tempfile.TemporaryFile() as output:
         start = output.seek(0, os.SEEK_END)
         code, result = _run_child(call, output, progress or no_progress)
         if code != 0 or result is None:
-            reason = error_tail(Path(output.name), start)
+            reason = error_tail(os.dup(output.fileno()), start)
             raise CrashError(f"{what} {describe_exit(code)}; its last lines: {reason}")
     succeeded, value, trace = result
     if succeeded:
@@ -310,9 +310,9 @@ def describe_exit(code: int) -> str:
     return f"ended early (exit code {code})"
 
 
-def error_tail(output: Path, start: int = 0) -> str:
-    """`error_lines` of the end of an output file, from byte ``start`` on."""
-    with output.open("rb") as stream:
+def error_tail(output: Path | int, start: int = 0) -> str:
+    """`error_lines` of the end of an output (file or descriptor), from byte ``start`` on."""
+    with open(output, "rb") as stream:
         stream.seek(max(start, stream.seek(0, os.SEEK_END) - _TAIL_BYTES))
         return error_lines(stream.read(_TAIL_BYTES))
 

@@ -123,10 +123,11 @@ def _means(trials: Sequence[TrialResult]) -> dict[str, float]:
     scenes = sorted({trial.scene for trial in trials})
     numbers: dict[str, float] = {"trials": len(trials)}
     for name in dict.fromkeys(chain(*measured.values())):
-        quantity = Quantity(
-            name, name, 0, 0, lambda trial, name=name: measured[trial.path].get(name)
-        )  # type: ignore[misc]
-        cell = make_cell(trials, quantity, scenes, len(trials))
+
+        def read(trial: TrialResult, name: str = name) -> float | None:
+            return measured[trial.path].get(name)
+
+        cell = make_cell(trials, Quantity(name, name, 0, 0, read), scenes, len(trials))
         if cell.mean is not None:
             numbers[name] = cell.mean
         if cell.std is not None:

@@ -2,9 +2,9 @@
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,13 +106,20 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Summary:
-    """The parts of a finished trial that a tracker shows; the tag ``note`` is in Markdown."""
+class Update:
+    """The part of a trial that a tracker is to show from now on, beside what it shows.
 
-    scalars: Sequence[Scalar]
-    tags: dict[str, str]
-    files: dict[str, Path]  # by their paths in the tracker
-    pictures: Sequence[Picture]
+    Settings and tags are texts by their names; the tag `NOTE` describes the trial in Markdown.
+    ``status`` says that the trial has ended, ``reason`` why it failed.
+    """
+
+    params: Mapping[str, str] = field(default_factory=dict)
+    tags: Mapping[str, str] = field(default_factory=dict)
+    scalars: Sequence[Scalar] = ()
+    files: Mapping[str, Path] = field(default_factory=dict)  # by their paths in the tracker
+    pictures: Sequence[Picture] = ()
+    status: Literal["FINISHED", "FAILED", "KILLED"] | None = None
+    reason: str | None = None
 
 
 @dataclass(frozen=True)
@@ -189,7 +196,7 @@ class TrackedTrial:
                     ],
                 )
 
-    def summary(self, results: TrialRecord, images: int, with_model: bool) -> Summary:
+    def summary(self, results: TrialRecord, images: int, with_model: bool) -> Update:
         """The finished trial with at most ``images`` test views, and its model ``with_model``."""
         step, seconds = results.iterations, results.seconds.get("train", results.iterations / 1000)
         scalars = []
@@ -213,7 +220,7 @@ class TrackedTrial:
         pictures = [
             Picture(key, pixels, step, seconds) for key, pixels in self._pictures(images).items()
         ]
-        return Summary(scalars, tags, files, pictures)
+        return Update(tags=tags, scalars=scalars, files=files, pictures=pictures, status="FINISHED")
 
     def files(self, names: Sequence[str]) -> dict[str, Path]:
         """The files among ``names`` that the trial's folder has."""
