@@ -37,7 +37,11 @@ def told():
 @pytest.fixture(scope="module")
 def shared(courtyard, told, tmp_path_factory):
     output = tmp_path_factory.mktemp("shared")
-    return Sfm().run(courtyard, output, lambda *state: told.append(state[:3])), output
+
+    def tell(phase, done, total, note=""):
+        told.append((phase, done, total))
+
+    return Sfm().run(courtyard, output, tell), output
 
 
 def test_own_poses_agree_with_the_exact_ones(own):
