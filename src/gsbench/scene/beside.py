@@ -16,6 +16,7 @@ from gsbench.errors import InputError
 from gsbench.files import DAMAGE, file_sha256
 from gsbench.scene.images import open_image
 from gsbench.scene.types import Camera, CameraModel, Capture
+from gsbench.scene.undistortion import as_colmap
 from gsbench.words import listed
 
 DEPTH = "depth"
@@ -102,14 +103,10 @@ def pixels_of_view(picture: Pixels, lens: CameraModel, view: Camera, source: Pat
         )
     if not lens.distorted:
         return resized(picture, view.width, view.height)
-    import pycolmap  # slow to load, and not needed for pinhole images
-
-    size = {"width": lens.width, "height": lens.height}
-    camera = pycolmap.Camera(model=lens.name, params=list(lens.params), **size)
     columns, rows = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
     x, y = (columns - view.cx) / view.fx, (rows - view.cy) / view.fy  # [H, W]
     rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
-    places = camera.img_from_cam(rays) / (lens.width, lens.height)  # [H W, 2], in 0..1
+    places = as_colmap(lens).img_from_cam(rays) / (lens.width, lens.height)  # [H W, 2], in 0..1
     inside = ((places >= 0) & (places < 1)).all(axis=1)  # False for a ray without a place
     pixels = np.where(inside[:, None], places, 0) * picture.shape[1::-1]
     across, down = pixels.astype(int).T
