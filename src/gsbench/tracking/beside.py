@@ -38,8 +38,8 @@ class Mirror:
     """Sends the trials that begin within a ``with`` block to their trackers; ``idle``: sends none.
 
     While the block runs, a process sends every ``tracking.flush_seconds``, and soon after a trial
-    has ended; at the end it gets ``tracking.patience_seconds``. Errors of a tracker are never raised:
-    one line in the log says what is missing.
+    has ended; at the end it gets ``tracking.patience_seconds``. Errors of a tracker are never
+    raised: one line in the log says what is missing.
     """
 
     def __init__(self, idle: bool = False) -> None:
