@@ -225,8 +225,8 @@ def test_the_viewer_shows_one_or_two_trials_until_ctrl_c(runs, monkeypatch, caps
     class Viewer:
         url = "http://127.0.0.1:8080"
 
-        def __init__(self, painters, port):
-            made.append((painters, port))
+        def __init__(self, trials, port):
+            made.append((trials, port))
 
         def stop(self):
             made.append("stopped")
@@ -243,15 +243,14 @@ def test_the_viewer_shows_one_or_two_trials_until_ctrl_c(runs, monkeypatch, caps
         sys.modules, "gsbench.view.server", SimpleNamespace(Viewer=Viewer, check_port=check_port)
     )
     monkeypatch.setattr("gsbench.view.trials.find_trial", lambda address, runs: address)
-    monkeypatch.setattr("gsbench.view.trials.load_viewed", lambda trial, device: (trial, device))
-    monkeypatch.setattr("gsbench.view.trials.TrialPainter", lambda *given: given)
+    monkeypatch.setattr("gsbench.view.trials.load_viewed", lambda *given: given)
     proven = SimpleNamespace(rasterizer="rasterizer")
     monkeypatch.setattr("gsbench.train.proof.create_proven", lambda name, device: proven)
     monkeypatch.setattr(servers.threading, "Event", Event)
     assert servers.view(split("a b --device cpu --port 0"), runs) == 0
     cpu = torch.device("cpu")
-    painters = [(("a", cpu), "rasterizer"), (("b", cpu), "rasterizer")]
-    assert made == [0, (painters, 0), "stopped"]
+    trials = [(name, "rasterizer", cpu) for name in "ab"]
+    assert made == [0, (trials, 0), "stopped"]
     assert capsys.readouterr().out.splitlines() == [
         "http://127.0.0.1:8080  (Ctrl+C ends it)",
         "stopped",

@@ -54,15 +54,13 @@ def view(argv: Sequence[str], runs: Path) -> int:
     from gsbench.system.device import select_device
     from gsbench.train.proof import create_proven
     from gsbench.view.server import Viewer, check_port
-    from gsbench.view.trials import TrialPainter, find_trial, load_viewed
+    from gsbench.view.trials import find_trial, load_viewed
 
     check_port(options.port)
     device = select_device(options.device)
     trials = [find_trial(address, runs) for address in options.trial]
     rasterizer = create_proven("auto", device).rasterizer
-    viewer = Viewer(
-        [TrialPainter(load_viewed(trial, device), rasterizer) for trial in trials], options.port
-    )
+    viewer = Viewer([load_viewed(trial, rasterizer, device) for trial in trials], options.port)
     with stop_on_signals():
         try:
             print(f"{viewer.url}  (Ctrl+C ends it)", flush=True)
