@@ -304,9 +304,9 @@ def _bench_parser() -> ArgumentParser:
     parser.add_argument(
         "--scene",
         default="trained",
-        choices=("trained", "random", "skewed", "crowded"),
-        help="like a trained model (default), like one at the start, like one with its detail at "
-        "few places, or with a twentieth of it over one tile",
+        choices=("trained", "skewed", "crowded"),
+        help="like a trained model (default), like one with its detail at few places, or with a "
+        "twentieth of it over one tile",
     )
     parser.add_argument("--ply", type=path, help="time this model instead of a synthetic scene")
     parser.add_argument("--repeats", type=count, default=5, help="turns that count (default 5)")
@@ -332,19 +332,15 @@ def bench(argv: Sequence[str], _runs: Path | None = None) -> int:
     # the user typed them, which allows them
     allow_modules([raster for raster in rasters if "." in raster])
 
-    from gsbench.bench.measure import run_bench
+    from gsbench.bench.measure import Setting, run_bench
 
-    rows = run_bench(
-        rasters,
-        options.size,
-        options.count,
-        ply=options.ply,
-        repeats=options.repeats,
-        threads=options.threads,
-        memory=not options.no_memory,
-        scene=options.scene,
-        kernels=options.kernels,
-    )
+    ply = options.ply and options.ply.absolute()
+    settings = [
+        Setting(options.scene, *size, count, ply, options.threads)
+        for size in options.size
+        for count in (options.count if ply is None else [0])
+    ]
+    rows = run_bench(rasters, settings, options.repeats, not options.no_memory, options.kernels)
     print(json.dumps(rows, indent=2) if options.json else table(rows))
     return 0
 
