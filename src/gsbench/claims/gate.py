@@ -7,7 +7,7 @@ to matter, or if it is shown not to be worse by the least difference that matter
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 from gsbench.analysis.notes import Note
 from gsbench.analysis.quantities import COSTS, NO_DIRECTION
@@ -63,7 +63,7 @@ def declare_gate(
     names = list(scenes)
     return Question(
         metric=metric,
-        sign=1 if sign > 0 else -1,
+        sign=sign,
         least=size.size,
         relative=size.relative,
         baseline=Arm("", BASELINE),
@@ -79,7 +79,7 @@ def declare_gate(
 
 def asked_difference(
     metric: str, least: str | None, values: Mapping[str, Any]
-) -> tuple[int, LeastEffect]:
+) -> tuple[Literal[-1, 1], LeastEffect]:
     """The direction of ``metric`` (1: more is better) and the least difference that matters.
 
     ``least`` is text such as ``0.1`` or ``10%``; None takes the metric's usual least difference.
@@ -105,7 +105,7 @@ def asked_difference(
     size = read_least(str(usual) if least is None else least, "--least")
     if metric in COSTS and not size.relative:
         raise InputError(f"--least of {metric} must be a part, such as 10%, got {size}")
-    return sign, size
+    return (1 if sign > 0 else -1), size
 
 
 def result_of(verdict: Verdict) -> str:
