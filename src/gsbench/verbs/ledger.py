@@ -3,7 +3,7 @@
 import argparse
 import json
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -65,23 +65,22 @@ Trials = Mapping[Needed, Trial]
 
 def ledger(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 0 kept (or nothing was tried), 1 dropped or failed, 3 undecided."""
-    parser = ArgumentParser(
+    action = next(filter(ACTIONS.__contains__, argv), "")  # without one, all words are shown
+    rows: dict[str, Any] = {
+        "action ACTION": (", ".join(ACTIONS), list(ACTIONS)),
+        "name": "the ledger, which is an experiment in the runs folder",
+    }
+    for words, (actions, meaning, *how) in OPTIONS.items():
+        if action in actions:
+            rows[words] = (f"{actions}: {meaning}", *how)
+    options = ArgumentParser(
         "ledger",
         "`new` declares metric, baseline, captures, seeds and error rate. `try` trains one idea, "
         "seed by seed until it is decided; what looks better is tested on new seeds. Exit code 0: "
         "kept, 1: dropped, or its trials fail, 3: undecided, 2: bad input. `confirm` trains what "
         "was kept on other captures. `show` lists all (docs/night.md).",
-    )
-    parser.add_argument("action", choices=list(ACTIONS))
-    parser.add_argument("name", help="the ledger, which is an experiment in the runs folder")
-    action = next(filter(ACTIONS.__contains__, argv), "")
-    if action != "show":
-        parser.add_argument("settings", nargs="*", metavar="KEY=VALUE", help="as of a sweep")
-    for flag, (actions, read, meaning) in OPTIONS.items():
-        if action in actions:  # the word for help is in all
-            how: dict[str, Any] = {"type": read} if read else {"action": "store_true"}
-            parser.add_argument(flag, help=f"{actions}: {meaning}", **how)
-    options = parser.parse_args(argv)
+        rows,
+    ).parse_args(argv)
     if not is_folder_name(options.name) or options.name in IN_RUNS:
         raise InputError(f"ledger: {options.name!r} cannot be the name of an experiment")
     return ACTIONS[action](options, runs / options.name)
@@ -90,7 +89,7 @@ def ledger(argv: Sequence[str], runs: Path) -> int:
 def new(options: argparse.Namespace, home: Path) -> int:
     """Declare a ledger; the same command again changes nothing."""
     baseline, trials = _compose(home, options.settings, options.settings, BASELINE)
-    values, metric = next(iter(trials.values())).values, options.metric or "psnr"
+    values, metric = next(iter(trials.values())).values, options.metric
     sign, least = asked_difference(metric, options.least, values)
     EvalConfig(**values["eval"] | {"primary": metric})  # raises if it is not computed
     opened = Ledger(
@@ -98,8 +97,8 @@ def new(options: argparse.Namespace, home: Path) -> int:
         sign=sign,
         least=least.size,
         relative=least.relative,
-        ideas=options.ideas or IDEAS,
-        rate=options.fdr or RATE,
+        ideas=options.ideas,
+        rate=options.fdr,
         seeds=_seeds(trials),
     )
 
@@ -120,7 +119,7 @@ def new(options: argparse.Namespace, home: Path) -> int:
 
 def try_idea(options: argparse.Namespace, home: Path) -> int:
     """Run one idea until it is decided; an idea that was decided before is only shown."""
-    book, typed, against = read_ledger(home), options.settings, options.against or BASELINE
+    book, typed, against = read_ledger(home), options.settings, options.against
     if against not in (allowed := [BASELINE, *book.kept]):
         raise InputError(f"--against {against}: it must be one of {listed(allowed)}")
     for key in map(key_of, typed):
@@ -134,7 +133,7 @@ def try_idea(options: argparse.Namespace, home: Path) -> int:
             f"the settings or the code of {against} have changed since its trials ran: bring them "
             "back"
         )
-    asked = _compose(home, words[1], typed, getattr(options, "as"), against)[0]
+    asked = _compose(home, words[1], typed, options.idea, against)[0]
     idea, fails = _begin(home, asked), ""
     for rule in (SCREENING, LOND):
         book = read_ledger(home)
@@ -202,14 +201,15 @@ def show(options: argparse.Namespace, home: Path) -> int:
 
 
 ACTIONS = {"new": new, "try": try_idea, "confirm": confirm, "show": show}
-OPTIONS: dict[str, tuple[str, Callable[[str], Any] | None, str]] = {  # actions, reader, meaning
-    "--metric": ("new", str, "decides, such as lpips_squeeze (psnr)"),
-    "--least": ("new", str, "the least difference that matters, as 0.1 or 10%% (the metric's)"),
-    "--ideas": ("new", whole_number(MOST_IDEAS), f"the most that will be tried ({IDEAS})"),
-    "--fdr": ("new", number(OpenFraction), f"false discovery rate, from 0 to 1 ({RATE})"),
-    "--against": ("try", str, "a kept idea to start from (default: the baseline)"),
-    "--as": ("try", str, "the idea's name (default: densify.name)"),
-    "--json": ("try, show", None, "print JSON"),
+OPTIONS: dict[str, tuple[Any, ...]] = {  # their actions, and rows of `ArgumentParser`
+    "settings* KEY=VALUE": ("new, try, confirm", "as of a sweep"),
+    "--metric NAME": ("new", "decides, such as lpips_squeeze (psnr)", str, "psnr"),
+    "--least SIZE": ("new", "the least difference that matters, as 0.1 or 10%% (the metric's)"),
+    "--ideas N": ("new", f"the most that are tried ({IDEAS})", whole_number(MOST_IDEAS), IDEAS),
+    "--fdr RATE": ("new", f"false discovery rate, 0 to 1 ({RATE})", number(OpenFraction), RATE),
+    "--against IDEA": ("try", "a kept idea to start from (the baseline)", str, BASELINE),
+    "--as=idea NAME": ("try", "the idea's name (default: densify.name)", str, ""),
+    "--json": ("try, show", "print JSON"),
 }
 
 

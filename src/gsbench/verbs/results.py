@@ -41,7 +41,7 @@ from gsbench.errors import InputError
 from gsbench.files import own_output, writable_output, write_text
 from gsbench.runs.experiments import list_experiments
 from gsbench.runs.package_code import edited
-from gsbench.verbs.arguments import ArgumentParser, add_where, names, path
+from gsbench.verbs.arguments import WHERE, ArgumentParser, names, path
 from gsbench.words import some_of, split_outside_brackets
 
 if TYPE_CHECKING:
@@ -55,7 +55,30 @@ REPORT_NAME = "report.html"
 
 def tables(argv: Sequence[str], runs: Path) -> int:
     """Run the verb; raises InputError for bad input."""
-    options = _tables_parser().parse_args(argv)
+    options = ArgumentParser(
+        "tables",
+        "`gsbench tables paper` lists where the paper contradicts itself.",
+        {
+            "experiment?": "its name (without one: lists them); table1, table2 and their _own look "
+            "as in the paper, with its values",
+            "other?": "another one, beside it on the same scenes",
+            "--format NAME": (
+                f"default: md; {TRIALS}: CSV with one row a trial; {JSON}: the verdicts",
+                [*FORMATS, TRIALS, JSON],
+            ),
+            "--out PATH": ("a folder, or a file whose ending says the format", path),
+            "--rows A,B": (f"fields or settings (default {','.join(DEFAULT_ROWS)})", names),
+            "--columns A,B": ("fields or settings, crossed with all metrics", names),
+            "--metrics A,B": ("such as psnr,lpips_squeeze,gaussians,train_time", names),
+            "--paper NAME": f"published numbers, too: {', '.join(published_names())}",
+            "--layout NAME": (
+                f"the paper's layout for any experiment; {FAIRNESS}: for each pair of arms in what "
+                "they differ, what was tuned, and whose defaults those are",
+                [*load_published().tables, "plain", FAIRNESS],
+            ),
+            **WHERE,
+        },
+    ).parse_args(argv)
     options.format = options.format or _format_of(options.out)
     if options.experiment is None:
         print("\n".join(list_experiments(runs)) or f"no experiment in {runs} yet")
@@ -161,53 +184,6 @@ def _as_file(arm: Arm) -> str:
     return re.sub(r"[^\w.=-]+", "_", str(arm))
 
 
-def _tables_parser() -> ArgumentParser:
-    parser = ArgumentParser(
-        "tables", "`gsbench tables paper` lists where the paper contradicts itself."
-    )
-    parser.add_argument(
-        "experiment",
-        nargs="?",
-        help="its name (without one: lists them); table1, table2 and their _own look as in the "
-        "paper, with its values",
-    )
-    parser.add_argument("other", nargs="?", help="another one, beside it on the same scenes")
-    parser.add_argument(
-        "--format",
-        choices=[*FORMATS, TRIALS, JSON],
-        help=f"default: md; {TRIALS}: CSV with one row a trial; {JSON}: the verdicts",
-    )
-    parser.add_argument(
-        "--out", type=path, metavar="PATH", help="a folder, or a file whose ending says the format"
-    )
-    parser.add_argument(
-        "--rows",
-        type=names,
-        metavar="A,B",
-        help=f"fields or settings (default {','.join(DEFAULT_ROWS)})",
-    )
-    parser.add_argument(
-        "--columns", type=names, metavar="A,B", help="fields or settings, crossed with all metrics"
-    )
-    parser.add_argument(
-        "--metrics",
-        type=names,
-        metavar="A,B",
-        help="such as psnr,lpips_squeeze,gaussians,train_time",
-    )
-    add_where(parser)
-    parser.add_argument(
-        "--paper", metavar="NAME", help=f"published numbers, too: {', '.join(published_names())}"
-    )
-    parser.add_argument(
-        "--layout",
-        choices=[*load_published().tables, "plain", FAIRNESS],
-        help=f"the paper's layout for any experiment; {FAIRNESS}: for each pair of arms in what "
-        "they differ, what was tuned, and whose defaults those are",
-    )
-    return parser
-
-
 def _write(texts: Mapping[str, str], out: Path | None, name: str) -> None:
     """Print the texts, or write them to ``out``: a file if its ending is the format's, or a folder.
 
@@ -234,17 +210,12 @@ def report(argv: Sequence[str], runs: Path) -> int:
     """Run the verb; raises InputError for bad input."""
     from gsbench.analysis.report.build import build_report  # here, for a quick answer to --help
 
-    parser = ArgumentParser("report")
-    parser.add_argument("experiment")
-    parser.add_argument(
-        "--out",
-        type=path,
-        metavar="PATH",
-        help=f"folder or .html file; default: the experiment's {REPORT_NAME}",
-    )
-    parser.add_argument("--baseline", help=f"the densifier to compare with ({BASELINE})")
-    add_where(parser)
-    options = parser.parse_args(argv)
+    rows = {
+        "experiment": "its name",
+        "--out PATH": (f"folder or .html file; default: the experiment's {REPORT_NAME}", path),
+        "--baseline NAME": f"the densifier to compare with ({BASELINE})",
+    }
+    options = ArgumentParser("report", rows=rows | WHERE).parse_args(argv)
     experiment = load_experiment(runs, options.experiment)
     densifiers = sorted({trial.densify for trial in experiment.trials})
     if options.baseline is not None and options.baseline not in densifiers:
@@ -261,8 +232,7 @@ def report(argv: Sequence[str], runs: Path) -> int:
 
 def explain(argv: Sequence[str], runs: Path) -> int:
     """Run the verb; raises InputError for bad input."""
-    parser = ArgumentParser("explain")
-    parser.add_argument("cell", metavar="CELL", help=f"a number of a table: {CELL}")
+    parser = ArgumentParser("explain", rows={"cell CELL": f"a number of a table: {CELL}"})
     print(explain_cell(parser.parse_args(argv).cell, runs))
     return 0
 

@@ -40,13 +40,12 @@ LEAN = {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}
 
 def view(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: serves the viewer until Ctrl-C."""
-    parser = ArgumentParser("view")
-    parser.add_argument("trial", nargs="+", metavar="TRIAL", help=TRIAL)
-    parser.add_argument(
-        "--port", type=port, default=VIEWER_PORT, help=f"on this machine; 0: any ({VIEWER_PORT})"
-    )
-    parser.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:1")
-    options = parser.parse_args(argv)
+    rows = {
+        "trial+ TRIAL": TRIAL,
+        "--port N": (f"on this machine; 0: any ({VIEWER_PORT})", port, VIEWER_PORT),
+        "--device NAME": ("auto, cpu, cuda or cuda:1", str, "auto"),
+    }
+    options = ArgumentParser("view", rows=rows).parse_args(argv)
     if len(options.trial) > 2:
         raise InputError(f"one or two trials can be viewed, not {len(options.trial)}")
     require_package("viser", "view", "the viewer")
@@ -74,18 +73,13 @@ def view(argv: Sequence[str], runs: Path) -> int:
 
 def ui(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: serves the dashboard until Ctrl-C, if no server does already."""
-    parser = ArgumentParser("ui")
-    parser.add_argument(
-        "experiment",
-        nargs="?",
-        help="open the comparison of its arms; default: the only experiment",
-    )
-    parser.add_argument(
-        "--uri", help="the tracker's address; default: $MLFLOW_TRACKING_URI, or the runs folder's"
-    )
-    parser.add_argument("--port", type=port, default=DASHBOARD_PORT)
-    parser.flag("--no-browser", "only print the addresses")
-    options = parser.parse_args(argv)
+    rows = {
+        "experiment?": "open the comparison of its arms; default: the only experiment",
+        "--uri ADDRESS": "the tracker's; default: $MLFLOW_TRACKING_URI, or the runs folder's",
+        "--port N": (f"of the server ({DASHBOARD_PORT})", port, DASHBOARD_PORT),
+        "--no-browser": "only print the addresses",
+    }
+    options = ArgumentParser("ui", rows=rows).parse_args(argv)
     if options.uri is not None and "://" not in options.uri:
         raise InputError(f"--uri {options.uri} is not an address such as sqlite:///FILE")
     uri = tracker_uri(options.uri, runs)

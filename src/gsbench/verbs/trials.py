@@ -56,25 +56,18 @@ log = logging.getLogger(__name__)
 
 def status(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 0 if all trials are done, running or queued, 1 if any failed or is missing."""
-    parser = ArgumentParser("status")
-    parser.add_argument(
-        "experiment", nargs="?", help="its name; without one, a line for each experiment"
-    )
-    parser.flag("--all", "list the finished trials too")
-    parser.flag("--watch", "a row for each arm, renewed until all trials have ended")
-    parser.flag(
-        "--verify",
-        "also compare by content what a look leaves to size and time: large files, and the results "
-        "of stages in the store",
-    )
-    parser.flag("--json", "print a JSON list instead of lines")
-    parser.flag("--forget", "remove trials from the plan that never started")
-    parser.flag(
-        "--forget-superseded",
-        "delete the folders of trials that older code made; what their stages computed stays in "
-        "the store, and verdicts still count them as versions of the code",
-    )
-    options = parser.parse_args(argv)
+    rows = {
+        "experiment?": "its name; without one, a line for each experiment",
+        "--all": "list the finished trials too",
+        "--watch": "a row for each arm, renewed until all trials have ended",
+        "--verify": "also compare by content what a look leaves to size and time: large files, and "
+        "the results of stages in the store",
+        "--json": "print a JSON list instead of lines",
+        "--forget": "remove trials from the plan that never started",
+        "--forget-superseded": "delete the folders of trials that older code made; what their "
+        "stages computed stays in the store, and verdicts still count them as versions of the code",
+    }
+    options = ArgumentParser("status", rows=rows).parse_args(argv)
     if options.experiment is None:
         if options.watch:
             raise InputError("--watch needs the name of an experiment")
@@ -182,18 +175,13 @@ def retry(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: the exit code says whether a trial failed, as that of a sweep does."""
     from gsbench.app.command import run_trials
 
-    parser = ArgumentParser("retry")
-    parser.add_argument("experiment")
-    parser.add_argument(
-        "changes",
-        nargs="*",
-        default=[],
-        metavar="KEY=VALUE",
-        help="settings that do not make a different trial: launch=slurm …; allow_targets=[mine] "
-        "for your own code",
-    )
-    parser.flag("--dry-run", "only list them")
-    options = parser.parse_args(argv)
+    rows = {
+        "experiment": "its name",
+        "changes* KEY=VALUE": "settings that do not make a different trial: launch=slurm …; "
+        "allow_targets=[mine] for your own code",
+        "--dry-run": "only list them",
+    }
+    options = ArgumentParser("retry", rows=rows).parse_args(argv)
     home = experiment_home(runs, options.experiment)
     if refused := [change for change in options.changes if makes_other_trials(key_of(change))]:
         raise InputError(
@@ -272,28 +260,15 @@ def recompose(
 
 def sync(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 1 if the tracker cannot be reached."""
-    parser = ArgumentParser("sync")
-    parser.add_argument("experiment", nargs="?", help="its name; without one, all")
-    parser.add_argument(
-        "permissions",
-        nargs="*",
-        metavar="allow_targets=[mine]",
-        help="for trials that a tracker of your own shows",
-    )
-    parser.add_argument(
-        "--uri",
-        help="such as http://127.0.0.1:5000; default: $MLFLOW_TRACKING_URI, or the runs folder's",
-    )
-    parser.add_argument(
-        "--trial",
-        action="append",
-        metavar="SCENE/ARM/FOLDER",
-        help="only this trial of the experiment (repeatable)",
-    )
-    parser.add_argument(
-        "--beside", type=int, metavar="PID", help="end soon after this process has ended"
-    )
-    options = parser.parse_args(argv)
+    rows = {
+        "experiment?": "its name; without one, all",
+        "permissions* allow_targets=[mine]": "for trials that a tracker of your own shows",
+        "--uri ADDRESS": "such as http://127.0.0.1:5000; default: $MLFLOW_TRACKING_URI, or the "
+        "runs folder's",
+        "--trial* SCENE/ARM/FOLDER": "only this trial of the experiment (repeatable)",
+        "--beside PID": ("end soon after this process has ended", int),
+    }
+    options = ArgumentParser("sync", rows=rows).parse_args(argv)
     words = [options.experiment or "", *options.permissions]
     experiment = "" if "=" in words[0] else words.pop(0)
     if unread := [word for word in words if key_of(word) != PERMISSIONS]:
@@ -307,7 +282,7 @@ def sync(argv: Sequence[str], runs: Path) -> int:
         folders: list[TrialFolder] = []
         for home in homes:
             places = [TrialFolder(Path(place)) for place in sorted(trial_folders(home))]
-            wanted = {str(home / trial) for trial in options.trial or ()}
+            wanted = {str(home / trial) for trial in options.trial}
             folders += [one for one in places if not wanted or str(one.path) in wanted]
         for line in send_missing(folders, options.uri, allowed):
             print(line, flush=True)
