@@ -12,7 +12,7 @@ from typing import Any
 
 from gsbench.errors import InputError
 from gsbench.settings import Switch, check_values
-from gsbench.words import did_you_mean, listed
+from gsbench.words import did_you_mean
 
 MAX_SWITCHES = 8
 
@@ -110,9 +110,3 @@ def off_settings(run: Run, switches: Mapping[str, Switch]) -> dict[str, Any]:
         if name not in run:
             settings |= switch.off
     return settings
-
-
-def run_name(run: Run, switches: Sequence[str]) -> str:
-    """``without shrink``; ``with all of them`` if all switches are on."""
-    off = [name for name in switches if name not in run]
-    return f"without {listed(off)}" if off else "with all of them"

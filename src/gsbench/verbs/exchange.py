@@ -19,7 +19,6 @@ from gsbench.words import readable_bytes
 
 DONE, LEFT_OUT = 0, 1
 PAGE = ".html"
-BETTER = {1: ", more is better", -1: ", less is better", 0: ""}
 
 log = logging.getLogger(__name__)
 

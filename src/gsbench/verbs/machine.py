@@ -239,7 +239,7 @@ def check_weights() -> Iterator[Finding]:
     """Findings about the weights of networks that are here; nothing is downloaded."""
     from gsbench.eval.lpips import BACKBONES, find_first_weights
     from gsbench.init.dim import EXTRACTOR_WEIGHTS, LIGHTGLUE_WEIGHTS
-    from gsbench.weights import WEIGHTS_VARIABLE, MissingWeightsError, hub_cache
+    from gsbench.weights import MissingWeightsError
 
     wanted = {f"LPIPS {name}": backbone.features for name, backbone in BACKBONES.items()}
     wanted |= {f"LPIPS {name} heads": (backbone.heads,) for name, backbone in BACKBONES.items()}
@@ -251,13 +251,6 @@ def check_weights() -> Iterator[Finding]:
             verdict: Verdict = "ok"
         except MissingWeightsError as error:
             verdict, text = "note", str(error)
-            if "not found" in text:
-                others = "".join(f" or {spec.names[0]} (from {spec.source})" for spec in specs[1:])
-                text = (
-                    f"{specs[0].names[0]} is not here; gsbench downloads it when needed from "
-                    f"{specs[0].url or specs[0].source}; or put it{others} into "
-                    f"${WEIGHTS_VARIABLE} or {hub_cache()}"
-                )
         yield Finding(verdict, "weights", f"{purpose}: {text}")
 
 

@@ -94,12 +94,15 @@ def tables(argv: Sequence[str], runs: Path) -> int:
         print(f"left out: {warning}", file=sys.stderr)
     where = dict(options.where)
     trials = select_trials([*experiment.trials, *(other.trials if other else ())], where)
+    if options.format in (TRIALS, JSON):
+        for name in ("rows", "columns", "metrics", "layout", "paper"):
+            if getattr(options, name) is not None:
+                raise InputError(f"--format {options.format} shows all, and takes no --{name}")
     if options.format == TRIALS:
-        texts = _trials(trials, options)
+        texts = {"-trials.csv": csv_of(to_frame(trials))}
     else:
         comparison = _comparison([experiment, *([other] if other else [])], trials, where)
         if options.format == JSON:
-            _refuse_options_of_tables(options, f"--format {JSON} shows the verdicts")
             texts = {f".{JSON}": json.dumps(comparison.to_json(), indent=1) + "\n"}
         else:
             texts = _tables(comparison, trials, options)
@@ -125,18 +128,6 @@ def _comparison(
 
     comparison = joined([compare(experiment) for experiment in experiments])
     return chosen(comparison, trials, where_words(where)) if where else comparison
-
-
-def _refuse_options_of_tables(options: argparse.Namespace, what: str) -> None:
-    for name in ("rows", "columns", "metrics", "layout", "paper"):
-        if getattr(options, name) is not None:
-            raise InputError(f"{what}, and takes no --{name}")
-
-
-def _trials(trials: Sequence[TrialResult], options: argparse.Namespace) -> dict[str, str]:
-    """A CSV with one row per trial. Raises InputError for options that only a table has."""
-    _refuse_options_of_tables(options, f"--format {TRIALS} shows every column of every trial")
-    return {"-trials.csv": csv_of(to_frame(trials))}
 
 
 def _tables(

@@ -9,14 +9,11 @@ import sys
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from rich.console import Group
 from rich.live import Live
-from rich.markup import escape
-from rich.table import Table
+from rich.text import Text
 
 from gsbench.config.command_words import makes_other_trials, typed_permissions
 from gsbench.config.compose import Trial, compose_one
@@ -46,10 +43,8 @@ from gsbench.tracking.sync import sync as send_missing
 from gsbench.verbs.arguments import ArgumentParser
 from gsbench.words import counted, readable_time
 
-if TYPE_CHECKING:
-    import pandas as pd
-
 SECONDS_BETWEEN_LOOKS = 3.0
+SHOWN = ("folder", "state", "since", "note")  # facts of a trial in JSON
 
 log = logging.getLogger(__name__)
 
@@ -92,10 +87,9 @@ def status(argv: Sequence[str], runs: Path) -> int:
         print(f"{counted(len(missing), 'trial')} removed from the plan")
         return 0
     if options.json:
-        shown = [asdict(replace(trial, planned=None)) for trial in trials]
-        for entry in shown:
-            del entry["planned"]  # the plan's own entry, for `retry`
-        print(json.dumps(shown, indent=1, default=str))  # `default` is for the folder, a Path
+        # without the plan's own entry; `default` is for the folder, a Path
+        shown = [{key: vars(one)[key] for key in SHOWN} for one in trials]
+        print(json.dumps(shown, indent=1, default=str))
     else:
         print("\n".join(lines_of(trials, options.all)))
     return int(any(STATES[trial.state].retried for trial in trials))
@@ -117,28 +111,16 @@ def _verified(trial: TrialState) -> TrialState:
 
 def _watch(runs: Path, experiment: str) -> None:
     """Show the progress of an experiment until its trials have ended, or Ctrl-C."""
-    frame = progress_frame(runs, experiment)
-    with (
-        suppress(KeyboardInterrupt),
-        Live(_progress_view(experiment, frame), auto_refresh=False) as live,
-    ):
-        while frame[["running", "waiting"]].to_numpy().any():
-            time.sleep(SECONDS_BETWEEN_LOOKS)
+    with suppress(KeyboardInterrupt), Live(auto_refresh=False) as live:
+        while True:
             frame = progress_frame(runs, experiment)
-            live.update(_progress_view(experiment, frame), refresh=True)
-
-
-def _progress_view(name: str, frame: pd.DataFrame) -> Group:
-    """A table of arms with the numbers of trials by state, and the time left."""
-    table = Table(title=escape(name))
-    # In a narrow terminal other columns are cut: arms often differ in their last letters only.
-    table.add_column("arm", no_wrap=True, min_width=max(map(len, frame.index), default=0))
-    for column in frame.columns:
-        table.add_column("it/s" if column == SPEED else column, justify="right")
-    for arm, row in frame.iterrows():
-        table.add_row(escape(str(arm)), *(f"{round(value, 2):g}" for value in row))
-    left = frame.attrs["seconds_left"]
-    return Group(table, f"about {readable_time(left)} left" if left else "")
+            shown = frame.rename(columns={SPEED: "it/s"}).to_string(float_format="{:.3g}".format)
+            left = frame.attrs["seconds_left"]
+            after = f"\nabout {readable_time(left)} left" if left else ""
+            live.update(Text(f"{experiment}\n{shown}{after}", no_wrap=True), refresh=True)
+            if not frame[["running", "waiting"]].to_numpy().any():
+                break
+            time.sleep(SECONDS_BETWEEN_LOOKS)
 
 
 def lines_of(trials: list[TrialState], with_done: bool) -> list[str]:
