@@ -386,7 +386,12 @@ def _of_old_plan(home: Path) -> list[Command]:
     except FileNotFoundError:
         return []
     return [
-        Command(one.overrides, one.cwd, one.time, {name: PlannedTrial(one.overrides)})
+        Command(
+            words=one.overrides,
+            cwd=one.cwd,
+            time=one.time,
+            trials={name: PlannedTrial(words=one.overrides)},
+        )
         for name, one in planned.items()
     ]
 

@@ -294,35 +294,28 @@ def _trials_lines(trials: Sequence[TrialResult], shown: Quantity) -> list[str]:
 
 def _origin(trial: TrialResult) -> dict[str, str]:
     """The folder of a trial, its counts, hashes, and the programs that made it, by label."""
-    record = trial.record
+    record, code = trial.record, trial.record.code
     if not trial.from_renders:
         counts = f"{record.num_gaussians or 0:,} from {record.num_init_points or 0:,} points"
-    elif trial.program:
-        counts = "its own renders"
     else:
-        counts = _listed(record.renders)
-    views = "?" if record.test_views is None else record.test_views
+        counts = "its own renders" if trial.program else _listed(record.renders)
+    views, by = record.test_views, record.trained_by
+    differing = list(edited(code.packages))
+    if len(differing) == len(code.packages):  # before the first release all count as edited
+        differing = []
     origin = {
         "folder": str(trial.path),
         "Gaussians": counts,
-        "views": f"{views} for testing",
+        "views": f"{'?' if views is None else views} for testing",
         **{name: sha for name, sha in record.hashes.items() if name not in trial.conditions},
+        "program": by and f"{by.version}: {' '.join(by.command)}",
+        "machine": trial.machine,
+        "code": ", ".join(trial.code_texts),
+        "commit": code.commit and f"{code.commit}{', edited' if code.edited else ''}",
+        "edited": differing and f"since the last release: {some_of(differing)}",
+        "versions": _listed(record.versions),
     }
-    if record.trained_by is not None:
-        origin["program"] = f"{record.trained_by.version}: {' '.join(record.trained_by.command)}"
-    if machine := trial.machine:
-        origin["machine"] = machine
-    if code := trial.code_texts:
-        origin["code"] = ", ".join(code)
-    if record.code.commit:
-        origin["commit"] = f"{record.code.commit}{', edited' if record.code.edited else ''}"
-    packages = record.code.packages
-    differing = list(edited(packages))
-    # before the first release all packages count as edited
-    if differing and len(differing) < len(packages):
-        origin["edited"] = f"since the last release: {some_of(differing)}"
-    origin["versions"] = _listed(record.versions)
-    return origin
+    return {label: str(text) for label, text in origin.items() if text}
 
 
 def _listed(facts: Mapping[str, str]) -> str:

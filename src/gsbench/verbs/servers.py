@@ -2,12 +2,10 @@
 
 import importlib.util
 import itertools
-import os
 import shlex
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -20,7 +18,7 @@ from gsbench.runs.experiments import experiment_home, list_experiments
 from gsbench.runs.layout import DATABASE
 from gsbench.system.install import require_package
 from gsbench.system.isolate import end_descendants
-from gsbench.system.programs import NEUTRAL, own_folder, safe_environment
+from gsbench.system.programs import own_folder, safe_environment
 from gsbench.system.stopping import stop_on_signals
 from gsbench.tracking.ideas import addresses, show_ideas
 from gsbench.tracking.mlflow_sink import (
@@ -33,7 +31,7 @@ from gsbench.tracking.mlflow_sink import (
 from gsbench.verbs.arguments import ArgumentParser, port
 
 VIEWER_PORT, DASHBOARD_PORT = 8080, 5000
-SECONDS_TO_ANSWER, SECONDS_TO_START = 5.0, 60
+SECONDS_TO_ANSWER = 5.0
 # MLflow's defaults take eight processes and 2 GB
 LEAN = {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}
 
@@ -77,7 +75,6 @@ def ui(argv: Sequence[str], runs: Path) -> int:
         "experiment?": "open the comparison of its arms; default: the only experiment",
         "--uri ADDRESS": "the tracker's; default: $MLFLOW_TRACKING_URI, or the runs folder's",
         "--port N": (f"of the server ({DASHBOARD_PORT})", port, DASHBOARD_PORT),
-        "--no-browser": "only print the addresses",
     }
     options = ArgumentParser("ui", rows=rows).parse_args(argv)
     if options.uri is not None and "://" not in options.uri:
@@ -101,14 +98,12 @@ def ui(argv: Sequence[str], runs: Path) -> int:
             raise InputError(
                 f"{home.name} could not be sent to {uri} ({type(error).__name__}: {error})"
             ) from error
-    lines = "\n".join(f"{name:<10} {address}" for name, address in pages.items())
-    first = next(iter(pages.values()))
-    is_served = is_served or (home is not None and _serves(server, home.name, first))
-    opens = not options.no_browser and sys.stdout.isatty() and _has_screen()
-    threading.Thread(
-        target=_announce, args=(server, lines, first if opens else ""), daemon=not is_served
-    ).start()
-    return 0 if is_served else serve(uri, options.port)
+    for name, address in pages.items():
+        print(f"{name:<10} {address}", flush=True)
+    if is_served or (home is not None and _serves(server, home.name, next(iter(pages.values())))):
+        return 0
+    print("served in some seconds, until Ctrl+C", flush=True)
+    return serve(uri, options.port)
 
 
 def _serves(server: str, experiment: str, page: str) -> bool:
@@ -122,32 +117,6 @@ def _serves(server: str, experiment: str, page: str) -> bool:
     except (requests.RequestException, ValueError, KeyError, TypeError):
         return False
     return f"/experiments/{found}/" in f"{page}/"  # 1 is not the experiment 12
-
-
-def _has_screen() -> bool:
-    """Return whether a browser would open in a window, not within this terminal."""
-    return (
-        os.name == "nt"
-        or sys.platform == "darwin"
-        or bool({"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys())
-    )
-
-
-def _announce(server: str, lines: str, page: str) -> None:
-    """Print the addresses once the server answers, and open the page unless it is empty."""
-    for _ in range(SECONDS_TO_START):
-        try:
-            requests.get(server, timeout=SECONDS_TO_ANSWER)
-        except requests.RequestException:
-            time.sleep(1)
-            continue
-        print(lines, flush=True)
-        if not page:
-            return
-        # Its programs start in a folder that is not a stranger's.
-        command = [sys.executable, "-P", "-m", "webbrowser", page]
-        subprocess.run(command, cwd=NEUTRAL, env=safe_environment(), check=False)
-        return
 
 
 def serve(uri: str, port: int) -> int:
