@@ -104,8 +104,8 @@ def test_the_dashboard_shows_the_only_experiment_or_the_one_named(runs, served, 
     assert served == [(uri, 5000)]
     for name in ("ab", "cde"):
         make_home(runs / name)
-        first, *_ = said("ui --port 81").splitlines()
-        assert first.split() == ["dashboard", "http://127.0.0.1:81"]  # one of two was not chosen
+    first, *_ = said("ui --port 81").splitlines()
+    assert first.split() == ["dashboard", "http://127.0.0.1:81"]  # one of two was not chosen
     served.clear()
     pages = said("ui cde").split()
     assert pages[:3] == ["ideas", f"{LOCAL}/#/experiments/3/runs", "bars"]

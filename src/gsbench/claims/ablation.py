@@ -6,8 +6,9 @@ switch may have no effect while another is off (the scales of children if nothin
 that differ only in such switches are trained once.
 """
 
-import itertools
 from collections.abc import Mapping, Sequence
+from graphlib import CycleError, TopologicalSorter
+from itertools import chain, combinations
 from typing import Any
 
 from gsbench.errors import InputError
@@ -88,18 +89,15 @@ def runs_to_train(switches: Mapping[str, Switch]) -> list[Run]:
 
     Raises InputError if switches depend on each other.
     """
-    for name in switches:
-        chain, outer = [name], switches[name].within
-        while outer in switches:
-            if outer in chain:
-                raise InputError(
-                    f"the switches {', '.join(chain)} form a circle: each is within the next"
-                )
-            chain, outer = [*chain, outer], switches[outer].within
-    runs: set[Run] = set()
-    for size in range(len(switches) + 1):
-        combinations = map(Run, itertools.combinations(switches, size))
-        runs |= {effective_run(run, switches) for run in combinations}
+    try:
+        TopologicalSorter({name: [one.within] for name, one in switches.items()}).prepare()
+    except CycleError as error:
+        raise InputError(
+            f"the switches {', '.join(error.args[1][1:])} form a circle: each is within the next"
+        ) from None
+    sizes = range(len(switches) + 1)
+    on = chain.from_iterable(combinations(switches, size) for size in sizes)
+    runs = {effective_run(Run(one), switches) for one in on}
     return sorted(runs, key=lambda run: (-len(run), sorted(run)))
 
 

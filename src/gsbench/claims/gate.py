@@ -127,15 +127,17 @@ def describe(verdict: Verdict) -> str:
 
 def deviations(baseline: Sequence[TrialResult], new: Sequence[TrialResult]) -> list[Note]:
     """A note for each difference of machine or libraries between the two versions' trials."""
-    machine = ""  # beside the names of libraries, and sorted before them
-    sides = [
-        [{machine: trial.machine or "not recorded"} | trial.record.versions for trial in trials]
-        for trials in (baseline, new)
+
+    def made(trials: Sequence[TrialResult], name: str) -> list[str]:
+        values = (
+            one.record.versions.get(name, "none") if name else one.machine or "not recorded"
+            for one in trials
+        )
+        return sorted(set(values))
+
+    names = {name for one in (*baseline, *new) for name in one.record.versions} - {"gsbench"}
+    return [
+        Note.of(f"other {'library' if name else 'machine'}", library=name, baseline=old, new=now)
+        for name in ("", *sorted(names))  # the machine, and each library
+        if (old := made(baseline, name)) != (now := made(new, name))
     ]
-    notes = []
-    for name in sorted(set().union(*sides[0], *sides[1]) - {"gsbench"}):
-        old, now = (sorted({made.get(name, "none") for made in side}) for side in sides)
-        if old != now:
-            kind = "other machine" if name == machine else "other library"
-            notes.append(Note.of(kind, library=name, baseline=old, new=now))
-    return notes

@@ -116,8 +116,8 @@ def _watch(runs: Path, experiment: str) -> None:
             frame = progress_frame(runs, experiment)
             shown = frame.rename(columns={SPEED: "it/s"}).to_string(float_format="{:.3g}".format)
             left = frame.attrs["seconds_left"]
-            after = f"\nabout {readable_time(left)} left" if left else ""
-            live.update(Text(f"{experiment}\n{shown}{after}", no_wrap=True), refresh=True)
+            after = f"about {readable_time(left)} left\n" if left else ""
+            live.update(Text(f"{experiment}\n{shown}\n{after}", no_wrap=True), refresh=True)
             if not frame[["running", "waiting"]].to_numpy().any():
                 break
             time.sleep(SECONDS_BETWEEN_LOOKS)
