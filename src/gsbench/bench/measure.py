@@ -77,14 +77,14 @@ class Stepper:
             setting.scene, setting.width, setting.height, setting.count, setting.ply
         )
         self.count = len(gaussians)
+        own = None
+        if "." in raster:  # the user has typed the path of a class, and so trusts it
+            own = build_own_rasterizer({"_target_": raster}, [raster.partition(".")[0]])
         self.trainer = Trainer(
             scene,
             gaussians.map(lambda tensor: tensor.detach().to(self.device)),
             ADC(start=NEVER - 1, stop=NEVER, opacity_reset_interval=NEVER, max_gaussians=None),
-            # the user has typed the path of a class of theirs, and so trusts it
-            build_own_rasterizer({"_target_": raster}, [raster.partition(".")[0]])
-            if "." in raster
-            else create_rasterizer(raster, self.device, self.threads),
+            own or create_rasterizer(raster, self.device, self.threads),
             constant_scene_options(),
             SEED,
         )

@@ -137,7 +137,9 @@ def _check_configuration(config: Mapping[str, Any], results: Mapping[str, Any]) 
 def _read(file: Path) -> tuple[str, dict[str, bytes]]:
     """The experiment's name, and its files by their places in a runs folder."""
     if not file.is_file():  # reading a pipe or a device may never end
-        raise InputError("it is no file: give an archive" if file.exists() else "no such file")
+        raise InputError(
+            "it is not a regular file: give an archive" if file.exists() else "no such file"
+        )
     try:
         with zipfile.ZipFile(file) as archive:
             manifest = json.loads(_member(archive, MANIFEST))

@@ -400,7 +400,7 @@ def _lines(home: Path) -> list[tuple[bytes, Line | DamagedError]]:
     """The lines of the file, each as text and read, or with what is wrong with it."""
     found = list[tuple[bytes, Line | DamagedError]]()
     for text in _content(home / COMMANDS).splitlines():
-        kind = Finished if text.startswith(b'{"finished"') else Command
+        kind: type[Line] = Finished if text.startswith(b'{"finished"') else Command
         try:
             found.append((text, parse_typed(text, kind, home / COMMANDS)))
         except DamagedError as error:

@@ -11,7 +11,7 @@ from gsbench.runs.cleaning import Stored, free, stored
 from gsbench.runs.experiments import experiment_home, list_experiments, trial_folders
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import is_held
-from gsbench.verbs.arguments import ArgumentParser
+from gsbench.verbs.arguments import ArgumentParser, Rows
 from gsbench.words import counted, readable_bytes
 
 UNITS = {"h": 3600.0, "d": 86_400.0, "w": 7 * 86_400.0}
@@ -19,7 +19,7 @@ UNITS = {"h": 3600.0, "d": 86_400.0, "w": 7 * 86_400.0}
 
 def clean(argv: Sequence[str], runs: Path) -> int:
     """Run the verb; what a finished trial needs always stays."""
-    rows = {
+    rows: Rows = {
         "experiment?": (
             "also free what only its failed, stopped and superseded trials have in the store"
         ),

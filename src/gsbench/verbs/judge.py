@@ -18,14 +18,14 @@ from gsbench.analysis.frames import (
 )
 from gsbench.errors import InputError
 from gsbench.files import require_regular, writable_output, write_text
-from gsbench.verbs.arguments import ArgumentParser, comma_separated, names, path, whole_number
+from gsbench.verbs.arguments import ArgumentParser, Rows, comma_separated, names, path, whole_number
 from gsbench.words import counted, listed, printable
 
 if TYPE_CHECKING:
     import pandas as pd
 
 MOST_SEED = 10**9
-ROWS = {
+ROWS: Rows = {
     "results? RESULTS": ("a table or a folder", path),
     "settings* KEY=VALUE": "eval.… for a folder of renders",
     "--baseline NAME": "the method to compare with",

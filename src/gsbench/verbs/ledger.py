@@ -66,7 +66,7 @@ Trials = Mapping[Needed, Trial]
 def ledger(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 0 kept (or nothing was tried), 1 dropped or failed, 3 undecided."""
     action = next(filter(ACTIONS.__contains__, argv), "")  # without one, all words are shown
-    rows: dict[str, Any] = {
+    rows: dict[str, tuple[Any, ...] | str] = {
         "action ACTION": (", ".join(ACTIONS), list(ACTIONS)),
         "name": "the ledger, which is an experiment in the runs folder",
     }

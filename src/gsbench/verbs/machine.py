@@ -18,7 +18,7 @@ from gsbench.scene.rules import MIN_SIZE
 from gsbench.system.install import install_command, version_of
 from gsbench.system.programs import allow_modules
 from gsbench.system.resources import available_threads, installed_gpus
-from gsbench.verbs.arguments import ArgumentParser, comma_separated, path, whole_number
+from gsbench.verbs.arguments import ArgumentParser, Rows, comma_separated, path, whole_number
 from gsbench.words import counted, readable_bytes
 
 LITTLE_SPACE = 5_000_000_000  # bytes
@@ -53,7 +53,7 @@ class Finding(NamedTuple):
 
 def doctor(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 1 if something is bad, or if a proof fails."""
-    rows = {
+    rows: Rows = {
         "words* SETTING": "of a scene, such as scene=photos scene.path=/my/photos: what is odd "
         "about it",
         "--prove": "compare a rasterizer with the float64 reference on this machine",
@@ -271,7 +271,7 @@ def bench(argv: Sequence[str], _runs: Path | None = None) -> int:
     """Print the table, or with ``--json`` the list of results."""
     own = ", ".join(executor.name for executor in EXECUTORS)
     count = whole_number(MAX_COUNT)
-    rows = {
+    rows: Rows = {
         "--raster A,B": (f"names: {own} or your own, mine.MyRaster", str, "cpu"),
         "--size WIDTHxHEIGHT,…": ("image sizes", comma_separated(_size), "500x375"),
         "--count N,…": ("numbers of Gaussians", comma_separated(count), "100000"),
@@ -304,8 +304,8 @@ def bench(argv: Sequence[str], _runs: Path | None = None) -> int:
 
     ply = options.ply and options.ply.absolute()
     settings = [
-        Setting(options.scene, *size, count, ply, options.threads)
-        for size in options.size
+        Setting(options.scene, width, height, count, ply, options.threads)
+        for width, height in options.size
         for count in (options.count if ply is None else [0])
     ]
     found = run_bench(rasters, settings, options.repeats, not options.no_memory, options.kernels)

@@ -41,7 +41,7 @@ from gsbench.errors import InputError
 from gsbench.files import own_output, writable_output, write_text
 from gsbench.runs.experiments import list_experiments
 from gsbench.runs.package_code import edited
-from gsbench.verbs.arguments import WHERE, ArgumentParser, names, path
+from gsbench.verbs.arguments import WHERE, ArgumentParser, Rows, names, path
 from gsbench.words import some_of, split_outside_brackets
 
 if TYPE_CHECKING:
@@ -201,12 +201,12 @@ def report(argv: Sequence[str], runs: Path) -> int:
     """Run the verb; raises InputError for bad input."""
     from gsbench.analysis.report.build import build_report  # here, for a quick answer to --help
 
-    rows = {
+    rows: Rows = {
         "experiment": "its name",
         "--out PATH": (f"folder or .html file; default: the experiment's {REPORT_NAME}", path),
         "--baseline NAME": f"the densifier to compare with ({BASELINE})",
     }
-    options = ArgumentParser("report", rows=rows | WHERE).parse_args(argv)
+    options = ArgumentParser("report", rows={**rows, **WHERE}).parse_args(argv)
     experiment = load_experiment(runs, options.experiment)
     densifiers = sorted({trial.densify for trial in experiment.trials})
     if options.baseline is not None and options.baseline not in densifiers:

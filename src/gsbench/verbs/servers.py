@@ -28,7 +28,7 @@ from gsbench.tracking.mlflow_sink import (
     require_own_journal,
     tracker_uri,
 )
-from gsbench.verbs.arguments import ArgumentParser, port
+from gsbench.verbs.arguments import ArgumentParser, Rows, port
 
 VIEWER_PORT, DASHBOARD_PORT = 8080, 5000
 SECONDS_TO_ANSWER = 5.0
@@ -38,7 +38,7 @@ LEAN = {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}
 
 def view(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: serves the viewer until Ctrl-C."""
-    rows = {
+    rows: Rows = {
         "trial+ TRIAL": TRIAL,
         "--port N": (f"on this machine; 0: any ({VIEWER_PORT})", port, VIEWER_PORT),
         "--device NAME": ("auto, cpu, cuda or cuda:1", str, "auto"),
@@ -71,7 +71,7 @@ def view(argv: Sequence[str], runs: Path) -> int:
 
 def ui(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: serves the dashboard until Ctrl-C, if no server does already."""
-    rows = {
+    rows: Rows = {
         "experiment?": "open the comparison of its arms; default: the only experiment",
         "--uri ADDRESS": "the tracker's; default: $MLFLOW_TRACKING_URI, or the runs folder's",
         "--port N": (f"of the server ({DASHBOARD_PORT})", port, DASHBOARD_PORT),

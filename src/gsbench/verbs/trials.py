@@ -40,7 +40,7 @@ from gsbench.system.programs import allow_modules
 from gsbench.tracking.beside import end_with
 from gsbench.tracking.sync import MirrorError
 from gsbench.tracking.sync import sync as send_missing
-from gsbench.verbs.arguments import ArgumentParser
+from gsbench.verbs.arguments import ArgumentParser, Rows
 from gsbench.words import counted, readable_time
 
 SECONDS_BETWEEN_LOOKS = 3.0
@@ -51,7 +51,7 @@ log = logging.getLogger(__name__)
 
 def status(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 0 if all trials are done, running or queued, 1 if any failed or is missing."""
-    rows = {
+    rows: Rows = {
         "experiment?": "its name; without one, a line for each experiment",
         "--all": "list the finished trials too",
         "--watch": "a row for each arm, renewed until all trials have ended",
@@ -157,7 +157,7 @@ def retry(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: the exit code says whether a trial failed, as that of a sweep does."""
     from gsbench.app.command import run_trials
 
-    rows = {
+    rows: Rows = {
         "experiment": "its name",
         "changes* KEY=VALUE": "settings that do not make a different trial: launch=slurm …; "
         "allow_targets=[mine] for your own code",
@@ -242,7 +242,7 @@ def recompose(
 
 def sync(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 1 if the tracker cannot be reached."""
-    rows = {
+    rows: Rows = {
         "experiment?": "its name; without one, all",
         "permissions* allow_targets=[mine]": "for trials that a tracker of your own shows",
         "--uri ADDRESS": "such as http://127.0.0.1:5000; default: $MLFLOW_TRACKING_URI, or the "
