@@ -1,5 +1,6 @@
 """Text for people: readable numbers, lists of names, suggestions for wrong words, safe output."""
 
+import ast
 import difflib
 import re
 import shlex
@@ -39,6 +40,34 @@ def split_outside_brackets(text: str, mark: str) -> list[str]:
         else:
             parts[-1] += letter
     return parts
+
+
+def value_words(text: str) -> str:
+    """A setting's value, as ``str`` gives it, in a few words: objects by their classes and options.
+
+    A user's class keeps the name of its module, since several modules may have a class ``Term``.
+
+    Examples:
+        >>> value_words("[{'_target_': 'my.a.B'}, {'_target_': 'gsbench.eval.C', 'weight': 0.1}]")
+        'a.B + C(weight=0.1)'
+    """
+    if "_target_" not in text:
+        return text
+    try:
+        return _object_words(ast.literal_eval(text))
+    except (ValueError, SyntaxError):
+        return text
+
+
+def _object_words(value: Any) -> str:
+    if isinstance(value, list):
+        return " + ".join(map(_object_words, value))
+    if not isinstance(value, dict) or "_target_" not in value:
+        return str(value)
+    path = str(value["_target_"]).split(".")
+    options = [f"{key}={_object_words(own)}" for key, own in value.items() if key != "_target_"]
+    name = ".".join(path[-1:] if path[0] == "gsbench" else path[-2:])
+    return f"{name}({', '.join(options)})" if options else name
 
 
 def readable_time(seconds: float) -> str:

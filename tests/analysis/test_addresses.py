@@ -7,12 +7,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsbench.analysis.addresses import ArmName, trials_of_arm
+from gsbench.analysis.cells import select_trials, with_variants
+from gsbench.analysis.table_formats import to_markdown
 from gsbench.renders.imported import find_destination
 from gsbench.renders.truth import ReferenceImages
 from gsbench.runs.experiments import Arm
 from gsbench.verbs.results import explain_cell
 from gsbench.view.trials import find_trial
-from tests.analysis.helpers import trials_of
+from tests.analysis.helpers import table_of, trials_of
 from tests.helpers import refusal
 from tests.trials import write_arms
 
@@ -36,12 +38,13 @@ def test_a_printed_arm_is_read_back(init, densify, values, short):
     assert dict(read.settings) == {key: str(one) for key, one in values.items()}
 
 
-MADE = [(0.9, "a:b"), (0.99, "a:b"), (0.9, [1, 2])]
+OBJECTS = [{"_target_": "mine.Depth", "weight": 0.1}, {"_target_": "mine.Edge"}]
+MADE = [(0.9, "a:b"), (0.99, "a:b"), (0.9, [1, 2]), (0.9, OBJECTS)]
 
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
-    """An experiment with three momentum arms, which differ in a number, a list and a text."""
+    """An experiment with four momentum arms, which differ in a number, a text and two lists."""
     folder = tmp_path_factory.mktemp("runs")
     arms = [("adc", {}), *(("momentum", {"decay": decay, "kind": kind}) for decay, kind in MADE)]
     for name, options in arms:
@@ -56,8 +59,9 @@ ARMS = {
     "momentum[decay=9.9e-1]": 1,
     "momentum[densify.decay=0.99]": 1,
     "sfm-momentum[kind=[1, 2]]": 1,
-    "momentum[decay=0.9]": 2,
-    "momentum": 3,
+    "momentum[kind=mine.Depth(weight=0.1) + mine.Edge]": 1,
+    "momentum[decay=0.9]": 3,
+    "momentum": 4,
     "momentum[decay=0.5]": 0,
     "momentum[cay=0.9]": 0,
 }
@@ -75,6 +79,14 @@ def test_all_verbs_read_an_arm_alike(runs, word, count):
         else:
             with refusal(r"momentum\[decay=0.9, kind=\[1, 2\]\]"):
                 reader()
+
+
+def test_objects_have_one_short_name_in_arms_tables_and_choices(runs):
+    short = "mine.Depth(weight=0.1) + mine.Edge"
+    shown = {trial.arm.short for trial in with_variants(trials_of(runs))}
+    assert f"momentum[decay=0.9, kind={short}]" in shown
+    assert f"| garden | sfm | momentum | 0.9 | {short} |" in to_markdown(table_of(runs))
+    assert len(select_trials(trials_of(runs), {"densify.kind": short})) == 2
 
 
 @pytest.mark.parametrize("word", ["momentum[decay=0.9", "[decay=1]", "momentum[0.9]", "a[b=1]c"])

@@ -6,13 +6,15 @@ import shutil
 
 import pytest
 
-from gsbench.analysis.comparison import compare
+from gsbench.analysis.comparison import compare, joined
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import load_experiment
+from gsbench.analysis.tables import build_table
 from gsbench.runs.commands import read_history
 from tests.helpers import change_json, write_lines
 from tests.trials import ask_about, write_arms, write_runs, write_trial
 
+SCHEDULE = ("densify_stop", "mcmc_stop", "opacity_reset_interval")
 CLEAR = {"effect": {"psnr": 3.0, "ssim": 0.5}}
 
 
@@ -172,6 +174,24 @@ def test_the_page_of_an_idea_waits_for_the_trials_of_its_baseline(tmp_path):
     assert "no command has planned the others yet, such as sfm-adc" in page
     assert "nan" not in re.findall(r"\w+", page)
     assert "nothing to compare" not in page
+
+
+def test_two_experiments_are_told_apart_and_one_setting_stands_for_a_schedule(tmp_path):
+    """Their baselines have the same bits, which is no effect of a setting."""
+    for name, length in (("long", 30_000), ("short", 7000)):
+        steps = {f"train.{key}": length // part for part, key in enumerate(SCHEDULE, 2)}
+        for densify, seed in itertools.product(("adc", "mine"), (0, 1)):
+            own = {"experiment": name, "densify": densify, "_iterations": length}
+            write_trial(tmp_path, seed, f"{length:08x}", steps, **own, psnr=20.0 + seed)
+        ask_about(tmp_path, experiment=name)
+    both = joined([compare(load_experiment(tmp_path, name)) for name in ("long", "short")])
+    table = build_table(both.experiment, comparison=both)
+    assert table.row_headings == ("scene", "init", "densify", "experiment", "train.iterations")
+    assert "train.iterations stands for train.densify_stop, train.mcmc_stop, " in table.notes[1]
+    starts = [line.partition(" against ")[0] for line in table.verdicts]
+    names = "sfm-mine[experiment=long]", "sfm-mine[experiment=short]"
+    assert starts[:2] == [f"UNDECIDED: {name}" for name in names]
+    assert not any(note.kind == "same bits" and "short" in str(note) for note in both.remarks)
 
 
 def test_a_trial_of_no_question_is_named(tmp_path):

@@ -3,6 +3,7 @@
 import base64
 import html
 import io
+import itertools
 import math
 import re
 import xml.etree.ElementTree as ElementTree
@@ -509,7 +510,19 @@ def test_arms_that_never_differ_are_called_equal_and_not_undecided(tmp_path):
         for seed in range(3):
             write_trial(tmp_path, seed, densify=densify, psnr=20.0 + seed)
     ask_about(tmp_path)
-    assert "had no effect" in page_of(tmp_path)
+    page = page_of(tmp_path)
+    assert "had no effect" in page
+    assert '<span class="number">PSNR (dB) +0.000 in each of 3 pairs of trainings</span>' in page
+    assert "PSNR (dB): right of zero is better" in page  # it has its scenes, too
+
+
+def test_a_metric_of_a_region_that_a_question_names_has_its_scenes(tmp_path):
+    for densify, seed in itertools.product(("adc", "mine"), range(2)):
+        values = {"psnr": 20.0 + seed, "ssim@far": 0.5 + seed / 7}
+        write_trial(tmp_path, seed, densify=densify, _num_gaussians=seed, **values)
+    ask_about(tmp_path, metric="ssim@far")
+    ask_about(tmp_path)
+    assert "SSIM far: right of zero is better" in page_of(tmp_path)
 
 
 def test_points_of_a_search_are_not_compared(tmp_path):

@@ -309,8 +309,8 @@ def test_the_filter_of_mip_splatting_is_applied(tmp_path, caplog):
         ("f_offset_0", True, "Scaffold-GS computes its Gaussians by networks"),
         ("f_asg_12", True, "Spec-Gaussian computes its colours by networks"),
         ("FILTER_3d", False, "Mip-Splatting's filter_3D is applied"),
-        ("segment", False, "the column segment is not known and not used"),
-        ("scale_3", False, "the column scale_3 is not known and not used"),
+        ("segment", False, "not known and not used: column segment"),
+        ("scale_3", False, "not known and not used: column scale_3"),
         ("red", False, ""),
     ],
 )

@@ -126,7 +126,7 @@ def test_tables_of_scanners_and_other_programs_are_read(tmp_path, name, text, co
 @pytest.mark.parametrize(
     "name, text, message",
     [
-        ("a.csv", "lat,lon,alt\n47.1,8.5,400\n", "none of its columns are called x, y and z"),
+        ("a.csv", "lat,lon,alt\n47.1,8.5,400\n", "it has no column x, y, z"),
         ("a.csv", "X;Y;Z;R\n1,5;2,5;3,5;7\n", "with decimal points"),
         ("a.txt", "1,5\t2,5\t3\n", "with decimal points"),
         ("a.xyz", "1 2 3 #ff8000\n4 5 6 #00ff00\n", "save it so, or as PLY"),
@@ -238,7 +238,7 @@ def header(path, text):
 
 FLOATS = "".join(f"property float {axis}\n" for axis in "xyz")
 PLYS = [
-    ("element vertex 3\nproperty float x\nend_header\n1\n2\n3\n", "no property y, z"),
+    ("element vertex 3\nproperty float x\nend_header\n1\n2\n3\n", "no column y, z"),
     (f"element vertex 0\n{FLOATS}end_header\n", "holds no point"),
     ("element point 1\nproperty int x\nend_header\n1\n", "it has no element vertex, only point"),
 ]

@@ -249,7 +249,7 @@ def test_lists_choose_the_training_and_test_views(make_scene, train, test, train
 def test_a_split_without_views_is_refused():
     names = [str(k) for k in range(5)]
     for options, said in (
-        ({"test_every": 1}, "no training view"),
+        ({"test": names}, "no training view"),
         ({"test": []}, "no test view"),
     ):
         with refusal(said):

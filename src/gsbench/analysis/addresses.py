@@ -11,7 +11,7 @@ from typing import Any, Self
 from gsbench.analysis.results import Arm, TrialResult, group_by
 from gsbench.analysis.trial_result import Trained
 from gsbench.errors import InputError
-from gsbench.words import split_outside_brackets
+from gsbench.words import split_outside_brackets, value_words
 
 TRIAL = (
     "a trial's folder, or EXPERIMENT:SCENE:ARM[:SEED] such as demo:courtyard:volumetric:0 or "
@@ -63,7 +63,7 @@ def _same(typed: str, value: Any) -> bool:
     """Return whether a typed value is that of a setting; numbers may be written in other ways."""
     text = str(value)
     try:
-        return typed == text or float(typed) == float(text)
+        return typed in (text, value_words(text)) or float(typed) == float(text)
     except ValueError:
         return typed.lower() == text.lower() or (typed, text) == ("null", "None")
 

@@ -22,6 +22,7 @@ from gsbench.analysis.trial_result import Planned, Trained
 from gsbench.errors import InputError
 from gsbench.runs.config_hash import is_hashed
 from gsbench.runs.nested import SHOWN
+from gsbench.words import value_words
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -75,7 +76,7 @@ def field_value(trial: TrialResult, name: str) -> str:
     """A field of a trial, or a dotted key of its configuration, as text; null if missing."""
     if name in TRIAL_FIELDS:
         return str(getattr(trial.record, name))
-    return str(_settings_with(trial, name).get(name))
+    return value_words(str(_settings_with(trial, name).get(name)))
 
 
 def _settings_with(trial: TrialResult, name: str) -> Mapping[str, Any]:

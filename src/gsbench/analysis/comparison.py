@@ -267,22 +267,26 @@ def _with_metrics(
     others: tuple[Verdict, ...] = (),
 ) -> Answer:
     own = [trial for trial in trials if trial.arm in (baseline, arm)]
+    known = [*(choose_quantities(own) if own else ()), *(one.quantity for one in others)]
     metrics = tuple(
         interval_of(own, baseline, arm, quantity.key)
-        for quantity in (choose_quantities(own) if own else ())
+        for quantity in dict.fromkeys(known)
         if quantity.direction and not quantity.cost and quantity.key != verdict.quantity.key
     )
     return Answer(baseline, arm, verdict, others, tuple(m for m in metrics if m.pairs.rows))
 
 
 def joined(comparisons: Sequence[Comparison]) -> Comparison:
-    """The answers of several experiments as those of one, called ``A and B``."""
-    first, *others = comparisons
-    if not others:
-        return first
+    """The answers of several experiments as those of one, called ``A and B``.
+
+    The experiment becomes a part of an arm's name: ``sfm-adc[experiment=A]``.
+    """
+    if len(comparisons) == 1:
+        return comparisons[0]
+    comparisons = [_with_place(one) for one in comparisons]
     experiments = [one.experiment for one in comparisons]
     both = replace(
-        first.experiment,
+        experiments[0],
         name=" and ".join(one.name for one in experiments),
         trials=tuple(itertools.chain(*(one.trials for one in experiments))),
         faults=tuple(itertools.chain(*(one.faults for one in experiments))),
@@ -292,6 +296,29 @@ def joined(comparisons: Sequence[Comparison]) -> Comparison:
     trials = itertools.chain(*(one.trials for one in comparisons))
     answers = itertools.chain(*(one.answers for one in comparisons))
     return Comparison(both, tuple(trials), tuple(answers))
+
+
+def _with_place(comparison: Comparison) -> Comparison:
+    def arm(own: Arm) -> Arm:
+        return replace(own, variant=(("experiment", comparison.experiment.name), *own.variant))
+
+    def verdict(own: Verdict) -> Verdict:
+        idea, baseline = arm(own.question.idea), arm(own.question.baseline)
+        return replace(own, question=replace(own.question, idea=idea, baseline=baseline))
+
+    answers = (
+        Answer(
+            arm(one.baseline),
+            arm(one.arm),
+            verdict(one.verdict),
+            tuple(map(verdict, one.others)),
+            tuple(map(verdict, one.metrics)),
+            one.earlier,
+        )
+        for one in comparison.answers
+    )
+    trials = (replace(trial, variant=arm(trial.arm).variant) for trial in comparison.trials)
+    return replace(comparison, trials=tuple(trials), answers=tuple(answers))
 
 
 def chosen(comparison: Comparison, trials: Sequence[TrialResult], where: str) -> Comparison:
@@ -340,7 +367,8 @@ def same_bits_notes(trials: Sequence[TrialResult]) -> list[Note]:
     """A note on settings of one densifier that had no effect: all their results are equal."""
     results: dict[Arm, set[Hashable]] = {}
     for trial in trials:
+        place = trial.experiment, trial.scene, trial.seed
         values = trial.record.num_gaussians, *sorted(trial.metrics.items())
-        results.setdefault(trial.arm, set()).add((trial.scene, trial.seed, *values))
+        results.setdefault(trial.arm, set()).add((*place, *values))
     same = group_by(results, lambda arm: (arm.name, frozenset(results[arm])))
     return [Note.of("same bits", arms=arms) for arms in same.values() if len(arms) > 1]

@@ -107,6 +107,7 @@ SENTENCES: dict[str, str] = {
         "Mean over {trials:n trial}; ± is the deviation (n − 1) over {spread}. Protocol "
         "{protocols:list}.{bold}"
     ),
+    "folded": "{shown} stands for {others:few}, which change together with it.",
     "few values": "(k/{trials}): k of {trials:n trial} with a value; —: none.",
     "not available": "n/a, {reason}.",
     "no mean": "No mean over the scenes is shown, since they differ in conditions or code.",

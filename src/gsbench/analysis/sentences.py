@@ -88,9 +88,13 @@ def numbers(verdict: Verdict) -> str:
     """``+0.50 (95 % interval +0.30 to +0.70)``; "" without a mean."""
     if verdict.mean is None:
         return ""
-    shown = verdict.shown(verdict.mean)
-    if verdict.interval is None:
+    shown, pairs = verdict.shown(verdict.mean), len(verdict.pairs.counting)
+    if pairs == 1:
         return f"{shown} (one pair of trainings has no interval)"
+    if verdict.equal:
+        return f"{shown} in each of {pairs} pairs of trainings"
+    if verdict.interval is None:
+        return shown
     return f"{shown} ({interval_words(verdict.level)} {verdict.shown_interval(verdict.interval)})"
 
 

@@ -33,6 +33,7 @@ ORIGINS = {
 HEAVIEST = (
     "one trial",
     "mean",
+    "folded",
     "worthless",
     "unusable",
     "unused",

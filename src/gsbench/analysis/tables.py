@@ -15,7 +15,6 @@ from gsbench.analysis.cells import (
     field_value,
     make_cell,
     swept_settings,
-    with_variants,
 )
 from gsbench.analysis.differences import (
     between_scenes_notes,
@@ -27,6 +26,7 @@ from gsbench.analysis.quantities import Quantity, choose_quantities
 from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.analysis.table_notes import LEARNT_NOTHING, by_weight, trials_notes
+from gsbench.analysis.trial_settings import canonical
 from gsbench.eval.facts import find_metric
 from gsbench.words import counted
 
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
 DEFAULT_ROWS = ("scene", "init", "densify")
 SIDE_BY_SIDE = ("scene.split", "scene.sector")
+FIRST_NAMED = ("train.iterations", *SIDE_BY_SIDE)  # settings that stand for others
 
 Labels = tuple[str, ...]
 # of a cell: the labels of its row, those of its column, and the quantity's key
@@ -67,12 +68,15 @@ def build_table(
 
     trials = list(experiment.trials if trials is None else trials)
     comparison = compare(experiment) if comparison is None else comparison
+    folded: dict[str, list[str]] = {}
     if rows is None:
-        swept = swept_settings(trials)
+        folded = _changing_together(trials, swept_settings(trials))
         # another split is another question about the same arms, so it gets a column
         if not columns:
-            columns = tuple(key for key in SIDE_BY_SIDE if key in swept)
-        rows = (*DEFAULT_ROWS, *(key for key in swept if key not in columns))
+            columns = tuple(key for key in SIDE_BY_SIDE if key in folded)
+        several = len({trial.experiment for trial in trials}) > 1
+        swept = [key for key in folded if key not in columns]
+        rows = (*DEFAULT_ROWS, *["experiment"][:several], *swept)
     quantities = choose_quantities(trials, metrics)
     fields = (*rows, *columns)
     check_fields(trials, fields)
@@ -93,7 +97,8 @@ def build_table(
         cells[row, column, quantity.key] = make_cell(
             groups.get((*row, *column), []), quantity, own_scenes, expected
         )
-    varied = with_variants(trials)
+    paths = {trial.path for trial in trials}
+    varied = [trial for trial in comparison.trials if trial.path in paths]
     shown_best = winners(comparison)
     bold = _best(cells, quantities, shown_best, varied)
     shown, notes = _rows(cells, bold, quantities), list[Note]()
@@ -112,6 +117,7 @@ def build_table(
             above, text = text, " + ".join(names.get(value, value) for value in column)
         headings.append(Column(above, text, (quantity.key, "+".join(column))))
     notes += _reading_notes(cells, quantities, expected, scene_index is not None, bool(bold))
+    notes += [Note.of("folded", shown=key, others=own) for key, own in folded.items() if own]
     notes += between_scenes_notes(varied)
     notes += trials_notes(comparison, trials)
     # the line on versions stands for many trials, so it comes before the folders that are cut off
@@ -126,6 +132,21 @@ def build_table(
         tuple(map(str, by_weight(notes))),
         verdicts=tuple(filter(None, [*(one.line for one in comparison.answers), comparison.risk])),
     )
+
+
+def _changing_together(trials: Sequence[TrialResult], keys: Iterable[str]) -> dict[str, list[str]]:
+    """For each setting that stands for those which change together with it, the others.
+
+    A schedule has many steps, and its iterations name it best.
+    """
+    configs = {trial.key: trial.config for trial in trials}.values()
+
+    def changes(key: str) -> tuple[int, ...]:
+        first: dict[str, int] = {}
+        return tuple(first.setdefault(canonical(own.get(key)), len(first)) for own in configs)
+
+    ordered = sorted(keys, key=lambda key: (key not in FIRST_NAMED, key))
+    return {own[0]: own[1:] for own in group_by(ordered, changes).values()}
 
 
 def format_cell(cell: Cell, quantity: Quantity) -> str:

@@ -203,7 +203,7 @@ def judge(
     )
     if why := _untestable(verdict):
         others = tuple(note for note in verdict.notes if note != why)
-        return replace(verdict, untestable=why, notes=others)
+        return replace(verdict, untestable=why, notes=others, scenes=_scenes(verdict))
     if question.looks and verdict.state not in (NOT_TESTED, NOT_ASKED):
         verdict = _at_looks(verdict)
     elif verdict.state == ANSWERED:
@@ -386,11 +386,11 @@ def interval_of(
         metric=metric,
         sign=quantity.direction,  # type: ignore[arg-type]
         least=quantity.worthwhile,
-        digests=dict.fromkeys(scenes, (str(baseline), str(idea))),
+        digests=dict.fromkeys(scenes, ("baseline", "idea")),
         seeds={one: tuple(sorted(seeds[baseline][one] & seeds[idea][one])) for one in scenes},
         untested=why or state,
     )
-    pairs = pair(own, question, lambda trial: str(trial.arm))
+    pairs = pair(own, question, lambda trial: "idea" if trial.arm == idea else "baseline")
     notes = (*pairs.left_out, *between_scenes_notes(pairs.of_baseline, pairs.of_arm))
     verdict = Verdict(question, quantity, pairs, state, ALPHA, done=len(own), notes=notes)
     verdict = _measure(verdict)

@@ -14,6 +14,7 @@ from gsbench.files import require_no_links
 from gsbench.parsing import STRICT, Count, Number, Record, Text, Whole
 from gsbench.runs.layout import IN_RUNS
 from gsbench.settings import ARM_BYTES, is_folder_name
+from gsbench.words import value_words
 
 log = logging.getLogger(__name__)
 
@@ -155,7 +156,9 @@ class Arm:
     @property
     def short(self) -> str:
         """The name without the initialiser: ``momentum[decay=0.9]``"""
-        values = ", ".join(f"{key.rpartition('.')[2]}={value}" for key, value in self.variant)
+        values = ", ".join(
+            f"{key.rpartition('.')[2]}={value_words(value)}" for key, value in self.variant
+        )
         return f"{self.densify}[{values}]" if values else self.densify
 
     def has(self, name: str, config: Mapping[str, Any]) -> bool:

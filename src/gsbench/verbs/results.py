@@ -14,7 +14,6 @@ from gsbench.analysis.cells import (
     make_cell,
     select_trials,
     side_by_side,
-    swept_settings,
     to_frame,
     where_words,
     with_variants,
@@ -143,8 +142,6 @@ def _tables(
         rows, columns = options.rows, options.columns or ()
         if both := sorted(set(rows or ()) & set(columns)):
             raise InputError(f"{', '.join(both)} is in --rows and --columns: choose one")
-        if options.other is not None and rows is None:
-            rows = (*DEFAULT_ROWS, "experiment", *swept_settings(trials))
         tables = [build_table(experiment, trials, rows, columns, metrics, comparison=comparison)]
     else:
         tables = paper_tables(experiment, layout, trials, metrics, comparison)
