@@ -296,20 +296,6 @@ def test_an_unknown_device_is_refused(courtyard, untrained_weights, tmp_path):
         superpoint(untrained_weights, device="tpu").run(courtyard, tmp_path)
 
 
-def test_mutual_nearest_matches_equal_those_of_brute_force():
-    rng = np.random.default_rng(2)
-    sides = [features_of(rng.normal(size=(60, 6))) for _ in range(2)]
-    distance = np.linalg.norm(sides[0].descriptors[:, None] - sides[1].descriptors[None], axis=2)
-    expected = []
-    for i in range(60):
-        j = int(distance[i].argmin())
-        row, column = np.sort(distance[i]), np.sort(distance[:, j])
-        if distance[:, j].argmin() == i and row[0] <= 0.9 * row[1] and column[0] <= 0.9 * column[1]:
-            expected.append((i, j))
-    assert sorted(map(tuple, mutual_nearest_matcher(0.9, CPU)(*sides).tolist())) == expected
-    assert len(expected) > 3
-
-
 @pytest.mark.shared
 @pytest.mark.slow
 @pytest.mark.parametrize("extractor", ["aliked", "disk"])
