@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from gsbench.analysis.comparison import Comparison, compare
 from gsbench.analysis.quantities import asked_quantity
-from gsbench.analysis.questions import LeastEffect, read_least
+from gsbench.analysis.questions import read_least
 from gsbench.analysis.results import Experiment, TrialResult, group_by
 from gsbench.analysis.sentences import DECLARED_TABLE, TABLE
 from gsbench.analysis.verdicts import Verdict
@@ -120,7 +120,7 @@ def compare_methods(frame: pd.DataFrame, asked: Declared, name: str = "results")
             f"{metric}: say whether more is better (--better higher, direction 1) or less"
         )
     least = asked.least or quantity.worthwhile
-    size = None if least is None else read_least(least, "--least")
+    size = (None, False) if least is None else read_least(least, "--least")
     questions = [
         _question(trials, asked, idea, quantity.direction, size).with_id(TABLE) for idea in ideas
     ]
@@ -134,7 +134,7 @@ def _question(
     asked: Declared,
     idea: str,
     sign: int,
-    least: LeastEffect | None,
+    least: tuple[float | None, bool],
 ) -> Question:
     """The question about all trials of a method, or about those that were declared."""
     places: dict[tuple[str, str], list[int]] = {}
@@ -154,8 +154,8 @@ def _question(
         baseline=Arm("", baseline),
         metric=asked.metric,
         sign=sign,  # type: ignore[arg-type]
-        least=None if least is None else least.size,
-        relative=least is not None and least.relative,
+        least=least[0],
+        relative=least[1],
         digests={scene: (_digest(baseline), _digest(idea)) for scene in seeds},
         seeds=seeds,
         rule=DECLARED_TABLE if asked.methods else TABLE,

@@ -28,7 +28,7 @@ from gsbench.analysis.report.where import region_maps
 from gsbench.analysis.results import Experiment, TrialResult, group_by, trials_of
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry, fill
 from gsbench.analysis.tables import build_table, with_agreement
-from gsbench.analysis.verdicts import SceneEstimate, Verdict
+from gsbench.analysis.verdicts import Verdict
 from gsbench.eval.facts import find_metric
 from gsbench.parsing import read_if_sound
 from gsbench.runs import layout
@@ -200,7 +200,7 @@ def _forest(verdict: Verdict) -> str:
     rows = [*verdict.scenes]
     if len(rows) > 1:
         mean, seeds = verdict.mean or 0.0, verdict.pairs.seeds
-        rows.append(SceneEstimate("mean of scenes", mean, seeds, verdict.interval))
+        rows.append(("mean of scenes", mean, seeds, verdict.interval))
     better = (
         "right of zero is better" if verdict.quantity.direction == 1 else "left of zero is better"
     )
