@@ -99,12 +99,13 @@ def limit_notes(trials: Sequence[TrialResult], pairs: Iterable[tuple[Arm, Arm]])
     The limit held an arm if a trial on each scene came near it, or was refused growth by a cap
     that may end lower. The paper's own cap is no limit for equal counts: all arms have it.
     """
-    notes, arms = [], set(itertools.chain(*pairs))
-    limited = [trial for trial in trials if trial.arm in arms and _limit(trial)]
+    notes, compared = [], set(itertools.chain(*pairs))
+    limited = [trial for trial in trials if trial.arm in compared and _limit(trial)]
     for limit, sharing in group_by(limited, _limit).items():
         cells = group_by(sharing, lambda trial: (trial.arm, trial.scene))
         free = {cell: own for cell, own in cells.items() if not any(map(_is_held, own))}
-        if not free or len({arm for arm, _ in cells}) < 2:
+        arms = dict.fromkeys(arm for arm, _ in cells)
+        if not free or len(arms) < 2:
             continue
         scenes = sorted({scene for _, scene in free})
         everywhere = len(scenes) == len({scene for _, scene in cells})
@@ -112,7 +113,7 @@ def limit_notes(trials: Sequence[TrialResult], pairs: Iterable[tuple[Arm, Arm]])
         notes.append(
             Note.of(
                 "limit not reached",
-                arms=list(dict.fromkeys(str(arm) for arm, _ in free)),
+                arms=[str(arm) for arm in arms if arm in {free_arm for free_arm, _ in free}],
                 limit=limit,
                 largest=max(counts),
                 scenes="" if everywhere else listed(scenes),
