@@ -111,7 +111,7 @@ class Comparison:
     def remarks(self) -> list[Note]:
         """Notes that belong to the sentences, wherever they stand."""
         compared = {arm for one in self.answers for arm in (one.baseline, one.arm)}
-        by_arm = group_by(self.trials, lambda trial: trial.arm)
+        by_arm = group_by(self.trials, "arm")
         alone = [arm for arm in by_arm if arm not in compared]
         notes = [Note.of("no partner", arm=arm) for arm in alone if self.answers or len(alone) > 1]
         for answer in self.answers:
@@ -194,16 +194,15 @@ def _asked(experiment: Experiment, trials: Sequence[TrialResult]) -> list[Answer
     verdicts = []
     for question in all_questions(experiment):
         # with the names that its arms have among all trials
-        for side, name in enumerate(("baseline", "idea")):
+        sides = []
+        for side, name in enumerate((question.baseline, question.idea)):
             found = (arms.get((scene, both[side])) for scene, both in question.digests.items())
-            arm = next(filter(None, found), getattr(question, name))
-            question = replace(question, **{name: arm})
+            sides.append(next(filter(None, found), name))
+        question = replace(question, baseline=sides[0], idea=sides[1])
         verdicts.append(judge(everything, question, experiment.unfinished))
     folded = {trial.path for trial in experiment.older}
     answers = []
-    for own in group_by(
-        verdicts, lambda one: (one.question.baseline, one.question.idea, one.question.name)
-    ).values():
+    for own in group_by(verdicts, "question.baseline", "question.idea", "question.name").values():
         code = _code_of(own[-1].question)
         current = [one for one in own if _code_of(one.question) == code]
         shown = ([one for one in current if one.state == ANSWERED] or current)[-1]
@@ -262,13 +261,13 @@ def joined(comparisons: Sequence[Comparison]) -> Comparison:
     for one in comparisons:
         place = ("experiment", one.experiment.name)
 
-        def named(verdict: Verdict, place: tuple[str, str] = place) -> Verdict:
-            question = verdict.question
-            for side in ("baseline", "idea"):
-                arm = getattr(question, side)
-                arm = replace(arm, variant=(place, *arm.variant))
-                question = replace(question, **{side: arm})
-            return replace(verdict, question=question)
+        def arm(own: Arm, place: tuple[str, str] = place) -> Arm:
+            return replace(own, variant=(place, *own.variant))
+
+        def named(verdict: Verdict, arm: Callable[[Arm], Arm] = arm) -> Verdict:
+            asked = verdict.question
+            sides = arm(asked.baseline), arm(asked.idea)
+            return replace(verdict, question=replace(asked, baseline=sides[0], idea=sides[1]))
 
         trials += [replace(trial, variant=(place, *trial.variant)) for trial in one.trials]
         answers += [
@@ -282,17 +281,12 @@ def joined(comparisons: Sequence[Comparison]) -> Comparison:
         ]
     experiments = [one.experiment for one in comparisons]
 
-    def chained(part: Callable[[Experiment], Sequence[Any]]) -> tuple[Any, ...]:
-        return tuple(itertools.chain(*map(part, experiments)))
-
-    both = replace(
-        experiments[0],
-        name=" and ".join(one.name for one in experiments),
-        trials=chained(lambda one: one.trials),
-        faults=chained(lambda one: one.faults),
-        older=chained(lambda one: one.older),
-        versions=chained(lambda one: one.versions),
-    )
+    parts: dict[str, Any] = {
+        part: tuple(itertools.chain(*(getattr(one, part) for one in experiments)))
+        for part in ("trials", "faults", "older", "versions")
+    }
+    name = " and ".join(one.name for one in experiments)
+    both = replace(experiments[0], name=name, **parts)
     return Comparison(both, tuple(trials), tuple(answers))
 
 

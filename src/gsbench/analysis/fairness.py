@@ -7,14 +7,13 @@ recorded.
 import itertools
 import math
 import statistics
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from operator import attrgetter
 from typing import Any
 
 from gsbench.analysis.differences import (
     between_scenes_notes,
     compared_trials,
-    differing_code,
     differing_keys,
     ingredients_between,
     ingredients_note,
@@ -26,12 +25,10 @@ from gsbench.analysis.quantities import COSTS, relative_change
 from gsbench.analysis.results import Arm, TrialResult, group_by, trials_of
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.analysis.trial_settings import canonical
-from gsbench.gaussians.paper_values import PAPER_CAP
 from gsbench.parsing import read_if_sound
-from gsbench.runs.config_hash import is_ingredient
 from gsbench.runs.experiments import SearchPoint, TuningRecord
 from gsbench.runs.layout import EVENTS, TUNING
-from gsbench.words import counted, listed, value_words
+from gsbench.words import counted, value_words
 
 CAP, LIMIT = "densify.cap", "densify.max_gaussians"
 DIGITS = 3  # significant digits of a number of Gaussians
@@ -55,7 +52,7 @@ def counts_notes(trials: Sequence[TrialResult], pairs: Iterable[tuple[Arm, Arm]]
 
     It says how to compare all of these at equal counts.
     """
-    by_arm, notes = group_by(trials, lambda trial: trial.arm), []
+    by_arm, notes = group_by(trials, "arm"), []
     for first, own in group_by(pairs, lambda pair: pair[0]).items():
         baseline, unequal = by_arm.get(first, []), dict[Arm, float]()
         for _, second in own:
@@ -93,64 +90,12 @@ def equal_counts_advice(trials: Sequence[TrialResult]) -> str:
     return f"give all arms {words} and another name"
 
 
-def limit_notes(trials: Sequence[TrialResult], pairs: Iterable[tuple[Arm, Arm]]) -> list[Note]:
-    """A note for each limit on the count that compared arms share and that some did not reach.
-
-    The limit held an arm if a trial on each scene came near it, or was refused growth by a cap
-    that may end lower. The paper's own cap is no limit for equal counts: all arms have it.
-    """
-    notes, compared = [], set(itertools.chain(*pairs))
-    limited = [trial for trial in trials if trial.arm in compared and _limit(trial)]
-    for limit, sharing in group_by(limited, _limit).items():
-        cells = group_by(sharing, lambda trial: (trial.arm, trial.scene))
-        free = {cell: own for cell, own in cells.items() if not any(map(_is_held, own))}
-        arms = dict.fromkeys(arm for arm, _ in cells)
-        if not free or len(arms) < 2:
-            continue
-        scenes = sorted({scene for _, scene in free})
-        everywhere = len(scenes) == len({scene for _, scene in cells})
-        counts = [trial.record.num_gaussians or 0 for own in free.values() for trial in own]
-        notes.append(
-            Note.of(
-                "limit not reached",
-                arms=[str(arm) for arm in arms if arm in {free_arm for free_arm, _ in free}],
-                limit=limit,
-                largest=max(counts),
-                scenes="" if everywhere else listed(scenes),
-            )
-        )
-    return notes
-
-
-def _limit(trial: TrialResult) -> int:
-    """The limit on the count that the trial's experiment asked for; 0 without one."""
-    budget = trial.record.budget
-    if budget is None or trial.record.num_gaussians is None or trial.made_elsewhere:
-        return 0
-    limit = budget.max_gaussians or 0
-    return 0 if (limit, budget.cap) == (PAPER_CAP, "soft") else limit
-
-
-def _is_held(trial: TrialResult) -> bool:
-    """Return whether the trial's limit held its count."""
-    budget, count = trial.record.budget, trial.record.num_gaussians or 0
-    # a governor and a curve hold growth back early, also if the limit is never reached
-    refuses = budget is not None and budget.cap not in ("governor", "curve")
-    refused = refuses and bool(trial.record.events.get("blocked_by_cap"))
-    return refused or count >= (1 - EQUAL_COUNTS) * _limit(trial)
-
-
-def fairness_table(
-    trials: Sequence[TrialResult],
-    first: Arm,
-    second: Arm,
-    older: Sequence[TrialResult] = (),
-) -> Table:
+def fairness_table(trials: Sequence[TrialResult], first: Arm, second: Arm) -> Table:
     """The fairness sheet of two arms as a table with notes.
 
-    ``trials`` are all trials of the experiment that count, each with its variant, ``older`` those
-    of earlier code. Measured rows cover the paired trials: one value, or the smallest, the largest
-    and the mean. Raises KeyError for an arm without trials.
+    ``trials`` are all trials of the experiment that count, each with its variant. Measured rows
+    cover the paired trials: one value, or the smallest, the largest and the mean. Raises KeyError
+    for an arm without trials.
     """
     pairs = pair_trials(trials, first, second)
     compared = list(itertools.chain(*pairs)) or trials
@@ -174,7 +119,7 @@ def fairness_table(
     notes = [ingredients_note(ingredients_between(trials, first, second), first, second)]
     notes += between_scenes_notes(*groups)
     notes += [Note.of("compared", pairs=len(pairs))]
-    tuning = [f"Tuning. {note}" for note in tuning_notes(trials, (first, second), older)]
+    tuning = [f"Tuning. {note}" for note in tuning_notes(trials, (first, second))]
     columns = tuple(Column("", name, ("", name)) for name in (str(first), str(second), "differs"))
     title = f"Fairness sheet: {second} against {first}"
     return Table(title, ("what",), columns, tuple(rows), (*map(str, notes), *tuning), wrapped=True)
@@ -249,20 +194,13 @@ MEASURED: dict[str, Callable[[TrialResult], Any]] = {
 }
 
 
-def tuning_notes(
-    trials: Sequence[TrialResult], pair: Sequence[Arm], older: Sequence[TrialResult] = ()
-) -> list[Note]:
-    """List, for each arm of a pair, its searches, and the settings that these trials vary.
-
-    These trials are measured on the test views, so varying settings among them is tuning on the
-    verdict's own views.
-    """
+def tuning_notes(trials: Sequence[TrialResult], pair: Sequence[Arm]) -> list[Note]:
+    """List, for each arm of a pair, its searches, and whether the arms were tuned alike."""
     unlike = tuning_note(trials, pair)
     notes = [unlike] if unlike else []
     for arm in pair:
         own = trials_of(trials, arm)
         notes += [_search_note(own, name, record) for name, record in searches_of(own[0]).items()]
-        notes += _varied_settings([*trials, *older], own[0])
     return notes or [Note.of("no tuning")]
 
 
@@ -331,33 +269,6 @@ def _search_note(own: Sequence[TrialResult], experiment: str, search: TuningReco
         more=max(0, len(search.points) - MAX_VALUES),
         others="" if _has_settings(own[0], best) else " These trials have other values.",
     )
-
-
-def _varied_settings(trials: Sequence[TrialResult], own: TrialResult) -> list[Note]:
-    """Name the settings and code that vary among arms with one initialiser and densifier class."""
-    target = own.config.get("densify._target_")
-    same_class = [
-        t
-        for t in trials
-        if t.init == own.init and t.config and t.config.get("densify._target_") == target
-    ]
-    # each scene may have settings of its own, which are no choices
-    by_scene = group_by(same_class, lambda trial: trial.scene).values()
-    most = max((group_by(of_scene, _choice) for of_scene in by_scene), key=len, default={})
-    if len(most) < 2:
-        return []
-    firsts = [same[0] for same in most.values()]
-    configs = [trial.config for trial in firsts]
-    keys = {key for config in configs for key in differing_keys(configs[0], config)}
-    code = [str(part) for part in differing_code(firsts) if part.kind != "stage"]
-    return [Note.of("varied", arm=own.arm, choices=len(most), settings=[*sorted(keys), *code])]
-
-
-def _choice(trial: TrialResult) -> Hashable:
-    """The user's choices for a trial: settings, modules, and edits of gsbench's packages."""
-    config = [(k, canonical(v)) for k, v in trial.config.items() if is_ingredient(k)]
-    code = [(part, made) for part, made in trial.code.items() if part.kind != "stage"]
-    return frozenset(config), frozenset(code)
 
 
 def _has_settings(trial: TrialResult, point: SearchPoint | None) -> bool:

@@ -137,16 +137,18 @@ def _question(
     least: tuple[float | None, bool],
 ) -> Question:
     """The question about all trials of a method, or about those that were declared."""
-    places: dict[tuple[str, str], list[int]] = {}
-    for trial in trials:
-        places.setdefault((trial.densify, trial.scene), []).append(trial.seed)
-    seeds = {scene: tuple(sorted(own)) for (method, scene), own in places.items() if method == idea}
+    places = group_by(trials, "densify", "scene")
+    seeds = {
+        scene: tuple(sorted(one.seed for one in own))
+        for (method, scene), own in places.items()
+        if method == idea
+    }
     untested, baseline = "", asked.baseline
     if asked.methods:
         seeds = dict.fromkeys(asked.scenes, asked.seeds)
     else:
         for scene, own in seeds.items():
-            first = sorted(places.get((baseline, scene), []))[: len(own)]
+            first = sorted(one.seed for one in places.get((baseline, scene), []))[: len(own)]
             if not set(own) >= set(first):
                 untested = f"it leaves out seeds of {baseline} on {scene}"
     return Question(
@@ -193,7 +195,7 @@ def _trials(frame: pd.DataFrame, metric: str, direction: int, name: str) -> list
         method, scene, seed = str(row[0]), str(row[1]), _seed(row[2])
         own = {key: column[number] for key, column in metrics.items()}
         trials.append(_trial(name, method, scene, seed, own, facts))
-    for place, same in group_by(trials, lambda one: (one.densify, one.scene, one.seed)).items():
+    for place, same in group_by(trials, "densify", "scene", "seed").items():
         if len(same) > 1:
             raise InputError(f"{place[0]}, {place[1]}, seed {place[2]} is twice in it")
     return trials

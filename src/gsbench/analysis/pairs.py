@@ -153,8 +153,8 @@ def pair(
 def pair_trials(trials: Sequence[TrialResult], baseline: Arm, arm: Arm) -> list[TrialPair]:
     """The pairs of trials of two arms, sorted by scene and seed, without regard to metrics."""
     pairs: list[TrialPair] = []
-    for scene, own in sorted(group_by(trials, lambda trial: trial.scene).items()):
-        sides = [trials_of(own, side) for side in (baseline, arm)]
+    for scene, own in sorted(group_by(trials, "scene").items()):
+        sides = trials_of(own, baseline), trials_of(own, arm)
         seeds = sorted({trial.seed for side in sides for trial in side})
         with suppress(InputError):  # the verdict on these arms reports it
             pairs += _match_seeds(scene, *sides, seeds).values()

@@ -11,7 +11,7 @@ of noise (findings/simulations.md, "Thresholds"); it is tabulated in ``threshold
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 
 import numpy as np
@@ -68,31 +68,26 @@ class Region:
     seeds: int
     even: Array
 
-    def limits(self, level: float) -> Array:
-        """The thresholds [D] at a level."""
-        if self.scenes == 1 or level < LEAST_LEVEL:
-            return np.full(self.even.shape, self._student(level))
-        low, part = _place(level)
-        curves = _curves(self.scenes, self.seeds)
-        curve = curves[low] + part * (curves[low + 1] - curves[low])
-        f = np.interp(self.even, table()["knots"], curve)
+    @cached_property
+    def _f(self) -> Array:
+        """f at the levels of the table [L, D]."""
+        curves = _curves(self.scenes, self.seeds) * (self.scenes > 1)
+        return np.stack([np.interp(self.even, table()["knots"], curve) for curve in curves])
+
+    def limits(self, level: Array | float) -> Array:
+        """The thresholds [D] at a level, or at one for each mean."""
+        row, part = _place(level)
+        which = np.arange(len(self.even))
+        f = self._f[row, which] + part * (self._f[row + 1, which] - self._f[row, which])
+        f = np.where(np.less(level, LEAST_LEVEL), 0.0, f)
         return np.asarray(self._student(level) * np.exp(f * self._ratio(level)))
 
     def p_values(self, sizes: Array) -> Array:
         """The two-sided p [D] of means with these ``sizes`` [D] in standard errors."""
-        if self.scenes == 1:
-            return np.asarray(2 * special.stdtr(self.seeds - 1, -sizes))
-        curves = _curves(self.scenes, self.seeds)
-        f = np.stack([np.interp(self.even, table()["knots"], curve) for curve in curves])
-        which = np.arange(len(sizes))
         low, high = np.full(sizes.shape, np.log(LEAST_P)), np.zeros(sizes.shape)
         for _ in range(STEPS):
             middle = (low + high) / 2
-            level = np.exp(middle)
-            row, part = _place(level)
-            between = f[row, which] + part * (f[row + 1, which] - f[row, which])
-            between = np.where(level < LEAST_LEVEL, 0.0, between)
-            significant = sizes > self._student(level) * np.exp(between * self._ratio(level))
+            significant = sizes > self.limits(np.exp(middle))
             low, high = np.where(significant, low, middle), np.where(significant, middle, high)
         return np.exp(high)
 

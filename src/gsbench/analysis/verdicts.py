@@ -291,32 +291,30 @@ def _without_lacking(
 ) -> Verdict:
     """The verdict, undecided if it favours an arm that lacks results which the other arm has."""
     question, read = verdict.question, verdict.quantity.read
-    sides = {second for _, second in question.digests.values()}
+    ideas = {second for _, second in question.digests.values()}
     done: tuple[set[tuple[str, int]], set[tuple[str, int]]] = (set(), set())
+    missing = [(one, int(one.is_of(question, 1))) for one in unfinished]
     for trial in trials:
-        if read(trial) is not None:
-            done[trial.digest in sides].add((trial.scene, trial.seed))
-    valueless = [Unfinished.of(trial) for trial in trials if read(trial) is None]
+        side = int(trial.digest in ideas)
+        if read(trial) is None:
+            missing.append((Unfinished(trial.path, trial.digest, failed=True), side))
+        else:
+            done[side].add((trial.scene, trial.seed))
     lacking: tuple[list[Unfinished], list[Unfinished]] = ([], [])
-    for one in (*unfinished, *valueless):
-        side = int(one.is_of(question, 1))
+    for one, side in missing:
         if (one.scene, one.seed) in done[1 - side] - done[side]:
             lacking[side].append(one)
 
     def favours_lacking(outcome: Outcome) -> bool:
-        favoured_sides = favoured(outcome, question.sign, verdict.quantity.direction)
-        return any(lacking[side] for side in favoured_sides)
+        sides = favoured(outcome, question.sign, verdict.quantity.direction)
+        return any(lacking[side] for side in sides)
 
     like, favours = verdict.like_these, favours_lacking(verdict.outcome)
     if like is not None and favours_lacking(like.outcome):
         like = replace(like, outcome=UNDECIDED)
-    return replace(
-        verdict,
-        outcome=UNDECIDED if favours else verdict.outcome,
-        like_these=like,
-        lacking=(*lacking[0], *lacking[1]),
-        favours_lacking=favours,
-    )
+    outcome = UNDECIDED if favours else verdict.outcome
+    own = (*lacking[0], *lacking[1])
+    return replace(verdict, outcome=outcome, like_these=like, lacking=own, favours_lacking=favours)
 
 
 def find_outlying(pairs: Pairs) -> list[TrialResult]:

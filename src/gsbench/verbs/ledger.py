@@ -102,8 +102,8 @@ def new(options: argparse.Namespace, home: Path) -> int:
     opened = Ledger(
         metric=metric,
         sign=1 if sign > 0 else -1,
-        least=least.size,
-        relative=least.relative,
+        least=least[0],
+        relative=least[1],
         ideas=options.ideas or IDEAS,
         rate=options.fdr or RATE,
         seeds=seeds_of(trials),

@@ -31,12 +31,12 @@ Points = Sequence[tuple[float, float]]  # Gaussians and value of trainings of on
 def quality_charts(trials: Trials, quantities: Iterable[Quantity]) -> list[str]:
     """A chart for each scene, quantity and arm that was trained at three or more limits."""
     charts = []
-    of_scene = group_by(trials, lambda trial: (trial.scene, trial.init))
+    of_scene = group_by(trials, "scene", "init")
     for quantity in quantities:
         if not quantity.direction or quantity.cost:
             continue
         for (scene, _), own in of_scene.items():
-            arms = group_by(own, lambda trial: trial.densify)
+            arms = group_by(own, "densify")
             baseline = arms.pop(BASELINE, [])
             charts += [_chart(scene, quantity, name, baseline, arms[name]) for name in arms]
     return list(filter(None, charts))
