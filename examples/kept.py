@@ -20,21 +20,14 @@ class Kept:
             self.file.with_stem(run.replaces).unlink(missing_ok=True)
         return self.shown["id"]  # if it is new, everything is sent (again)
 
-    def params(self, values):
-        self.keep("params", values)
-
-    def tags(self, values):
-        self.keep("tags", values)
-
-    def metrics(self, scalars):
-        self.keep("metrics", {f"{one.key} {one.step}": one.value for one in scalars})
-
-    def artifacts(self, files, pictures):
-        self.keep("files", {name: str(path) for name, path in files.items()})
-        self.keep("pictures", {one.key: list(one.pixels.shape) for one in pictures})
-
-    def close(self, status, reason):
-        self.keep("end", {"status": status, "reason": reason})
+    def send(self, update):
+        self.keep("params", update.params)
+        self.keep("tags", update.tags)
+        self.keep("metrics", {f"{one.key} {one.step}": one.value for one in update.scalars})
+        self.keep("files", {name: str(path) for name, path in update.files.items()})
+        self.keep("pictures", {one.key: list(one.pixels.shape) for one in update.pictures})
+        if update.status:
+            self.keep("end", {"status": update.status, "reason": update.reason})
 
     def keep(self, part, values):
         self.shown[part] = self.shown.get(part, {}) | dict(values)

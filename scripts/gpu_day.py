@@ -265,7 +265,9 @@ def wheels() -> str:
     for unused in ("wheels", "site/gsplat/cuda/csrc/third_party/glm/doc"):  # 20 MB
         shutil.rmtree(new / unused, ignore_errors=True)
     # Keypoints and tracks, 20 MB of bonsai's model, only tell which points the chosen images see.
-    capture = read_capture(SceneConfig("bonsai", "colmap", path=os.environ["GPU_DAY_SCENE"]))
+    capture = read_capture(
+        SceneConfig(name="bonsai", kind="colmap", path=os.environ["GPU_DAY_SCENE"])
+    )
     model = read_reference(capture)
     cloud = model_points(model)
     model.delete_all_points2D_and_points3D()

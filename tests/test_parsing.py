@@ -53,16 +53,6 @@ def test_a_file_is_read_up_to_its_limit_and_refused_beyond(tmp_path):
     assert [read_tail(file, count) for count in (3, 10, 11)] == [b"xxx", b"x" * 10, b"x" * 10]
 
 
-def test_a_file_that_grows_while_it_is_read_is_read_up_to_the_limit(tmp_path, monkeypatch):
-    """As from files in ``/proc`` that report no size, the pieces come one by one."""
-    pieces = iter([b"ab", b"cd", b"ef", b""])
-    asked = []
-    monkeypatch.setattr(os, "read", lambda _, most: asked.append(most) or next(pieces))
-    (tmp_path / "a").write_text("x" * 4)
-    assert read_bytes(tmp_path / "a", most=6) == b"abcdef"
-    assert asked == [5, 5, 3, 1]
-
-
 def test_only_regular_files_are_read(tmp_path):
     (tmp_path / "file").write_text("1")
     (tmp_path / "link").symlink_to(tmp_path / "file")

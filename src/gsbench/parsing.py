@@ -37,7 +37,6 @@ from gsbench.words import as_line
 
 # enough for the plan of 80,000 trials, or a training that logs each of 300,000 iterations
 MAX_BYTES = 64 << 20
-SPARE = 1 << 16  # bytes that are read at once beyond a file's size
 MAX_YAML_BYTES = 1 << 20  # a configuration has 2 to 10 kB; the parser needs a second for this much
 # levels of nesting: gsbench's files have up to six, and arguments of a user's class add a few
 MAX_DEPTH = 40
@@ -72,9 +71,10 @@ def read_bytes(path: Path, most: int = MAX_BYTES) -> bytes:
 
     Raises DamagedError for any other file, FileNotFoundError for a missing one.
     """
-    with _opened(path) as descriptor:
-        content = _read_up_to(descriptor, most + 1)
-    if len(content) > most:
+    with _opened(path) as descriptor, open(descriptor, "rb", 0, closefd=False) as file:
+        size = os.fstat(descriptor).st_size
+        content = file.read() if size <= most else b""
+    if max(size, len(content)) > most:
         raise DamagedError(path, f"cannot be read: it has more than {most:,} bytes")
     return content
 
@@ -137,20 +137,6 @@ def _opened(path: Path) -> Iterator[int]:
         raise DamagedError(
             path, f"cannot be read ({getattr(error, 'strerror', None) or error})"
         ) from None
-
-
-def _read_up_to(descriptor: int, most: int) -> bytes:
-    """Read at most ``most`` bytes.
-
-    One call is enough, except for files such as in ``/proc`` that report no size.
-    """
-    content = os.read(descriptor, min(most, os.fstat(descriptor).st_size + 1))
-    parts = [content]
-    while (left := most - sum(map(len, parts))) > 0 and (
-        part := os.read(descriptor, min(left, SPARE))
-    ):
-        parts.append(part)
-    return b"".join(parts)
 
 
 def read_json(path: Path) -> Any:

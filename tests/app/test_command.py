@@ -5,7 +5,7 @@ import logging
 import pytest
 from omegaconf import OmegaConf
 
-from gsbench.app import command
+from gsbench.app import command, sweep
 from gsbench.app.command import one_trial_per_scene, summarize
 from gsbench.app.sweep import check_sweep_settings
 from gsbench.config.compose import Trial
@@ -141,7 +141,7 @@ def test_a_dry_run_explains_a_reference_to_nothing(runs):
 
 def test_a_dry_run_shows_as_many_log_lines_as_the_run_would(runs, monkeypatch):
     asked = []
-    monkeypatch.setattr(command, "set_up_logging", asked.append)
+    monkeypatch.setattr(sweep, "set_up_logging", asked.append)
     command.compose_trials(["hydra.verbose=true"])
     command.compose_trials(["hydra.verbose=[gsbench.scene]", "seed=0,1"], multirun=True)
     assert asked == [True, ["gsbench.scene"]]

@@ -52,7 +52,7 @@ def ran(runs, monkeypatch):
         return outcomes[::-1]
 
     monkeypatch.setattr(command, "run_batch", run)
-    monkeypatch.setattr(hydra_app, "begin_for_another_launcher", lambda trials, asks: None)
+    monkeypatch.setattr(hydra_app, "begin", lambda trials, asks: None)
     return ran
 
 

@@ -16,7 +16,7 @@ from gsbench.config.build import build
 from gsbench.config.command_words import check_words
 from gsbench.config.compose import compose_one
 from gsbench.config.overrides import key_of, parse_word
-from gsbench.config.schema import checked_values, plain, register_schemas
+from gsbench.config.schema import check, plain, register_schemas
 from gsbench.pipeline.parts import build_metrics
 from gsbench.runs.config_hash import config_hash
 from gsbench.system.install import conf_dir
@@ -36,7 +36,7 @@ def composed(*overrides):
     register_schemas()
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
         config = compose("config", overrides=list(overrides))
-    return checked_values(config)
+    return check(plain(config))
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +52,7 @@ def changed(base, changes):
     OmegaConf.set_struct(config, False)
     for key, value in changes.items():
         OmegaConf.update(config, key, value, merge=False)
-    return checked_values(config)
+    return check(plain(config))
 
 
 def checked(base, *words):

@@ -13,7 +13,7 @@ from gsbench.config import compose
 from gsbench.config.compose import compose_one
 from gsbench.config.explain import explained
 from gsbench.config.overrides import parse_word
-from gsbench.launch.jobs import job_of
+from gsbench.launch.jobs import TrialJob
 from tests.helpers import refusal
 
 ARMS = "densify=adc,volumetric"
@@ -127,4 +127,4 @@ def test_a_value_is_set_added_or_removed_as_by_hydra(word, found):
 
 def test_a_pickled_job_is_small():
     trials = compose_trials(["densify=adc,volumetric", "seed=0,1"], multirun=True)
-    assert all(len(pickle.dumps(job_of(trial))) < 20_000 for trial in trials)
+    assert all(len(pickle.dumps(TrialJob(trial))) < 20_000 for trial in trials)

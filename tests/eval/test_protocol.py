@@ -83,7 +83,7 @@ def test_raw_lpips_variants_get_values_from_0_to_1_and_others_from_minus_1_to_1(
     squeeze = find_metric("lpips_squeeze")
     raw = replace(squeeze, key="lpips_squeeze_raw")
     assert evaluator_module.MEASURES["lpips_vgg_raw"].keywords == {"net": "vgg", "raw": True}
-    like_vgg_raw = partial(evaluator_module.LpipsMetric, net="squeeze", raw=True)
+    like_vgg_raw = partial(evaluator_module._lpips, net="squeeze", raw=True)
     monkeypatch.setitem(evaluator_module.MEASURES, raw.key, like_vgg_raw)
     monkeypatch.setattr(facts, "METRICS", (squeeze, raw))
     monkeypatch.setattr(evaluator_module, "METRICS", (squeeze, raw))
@@ -115,9 +115,16 @@ def test_a_render_with_nan_is_refused():
         Evaluator(PAPER, lpips=[]).evaluate_view(render, np.zeros((16, 16, 3), dtype=np.uint8))
 
 
-def test_an_unknown_lpips_variant_is_refused():
-    with refusal("vgg_raw, vgg, alex, squeeze"):
-        Evaluator(PAPER, lpips=["vgg16"])
+@pytest.mark.parametrize(
+    "choice, known",
+    [
+        ({"lpips": ["vgg16"]}, "vgg_raw, vgg, alex, squeeze"),
+        ({"more": ["psnr"]}, "ms_ssim, iw_ssim"),
+    ],
+)
+def test_unknown_metrics_are_refused(choice, known):
+    with refusal(f"choose among {known}"):
+        Evaluator(PAPER, **choice)
 
 
 def test_means_leave_out_metrics_that_a_view_lacks():

@@ -46,7 +46,7 @@ def superpoint(weights, **options):
 
 
 def matcher_of(weights):
-    return build_matcher(superpoint(None).feature_settings(), weights, CPU)
+    return build_matcher(superpoint(None), [weights], CPU)
 
 
 def features_of(descriptors, keypoints=0.0, size=(9, 9), file_size=None):
@@ -97,7 +97,8 @@ def test_lightglue_matches_enough_points(few, untrained_weights, tmp_path, caplo
 
 def test_other_settings_or_images_have_other_file_names(courtyard, tmp_path):
     def paths(extraction, matching, images):
-        store = FeatureStore(tmp_path / "work", images, extraction, matching)
+        capture = replace(courtyard, images=images)
+        store = FeatureStore(tmp_path / "work", capture, extraction, matching)
         return store.features_path("0000.png"), store.matches_path("0000.png", "0001.png")
 
     same, changed = courtyard.images, tmp_path / "changed"
@@ -119,9 +120,9 @@ def test_other_settings_or_images_have_other_file_names(courtyard, tmp_path):
 
 @pytest.mark.parametrize("width, height", [(128, 96), (1237, 40), (131, 101)])
 def test_superpoint_keypoints_are_the_maxima_of_its_score_map(untrained_weights, width, height):
-    settings = superpoint(untrained_weights, max_keypoints=10**6).feature_settings()
+    settings = superpoint(untrained_weights, max_keypoints=10**6).extraction
     weights = untrained_weights / "superpoint.safetensors"
-    extract = EXTRACTORS[settings.extractor](settings, weights, CPU)
+    extract = EXTRACTORS["superpoint"](settings, weights, CPU)
     transformers = pytest.importorskip("transformers")
     config = transformers.SuperPointConfig(nms_radius=3)
     network = transformers.SuperPointForKeypointDetection(config).eval()
@@ -187,8 +188,9 @@ def test_no_network_is_downloaded_by_the_libraries(untrained_weights, monkeypatc
     monkeypatch.setattr(torch.hub, "load_state_dict_from_url", refuse)
     monkeypatch.setattr("kornia.feature.lightglue.load_state_dict_from_url", refuse)
     matcher_of(untrained_weights / LIGHTGLUE)
-    settings = superpoint(None).feature_settings()
-    EXTRACTORS["superpoint"](settings, untrained_weights / "superpoint.safetensors", CPU)
+    EXTRACTORS["superpoint"](
+        superpoint(None).extraction, untrained_weights / "superpoint.safetensors", CPU
+    )
 
 
 def test_disk_is_loaded_from_its_published_layout(tmp_path):
@@ -197,8 +199,8 @@ def test_disk_is_loaded_from_its_published_layout(tmp_path):
     torch.manual_seed(0)
     content = {"extractor": DISK().state_dict(), "optimizer": {"lr": 1.0}}
     torch.save(content, tmp_path / "depth-save.pth")
-    settings = Dim(extractor="disk", matcher="mutual_nearest", max_keypoints=50).feature_settings()
-    extract = EXTRACTORS[settings.extractor](settings, tmp_path / "depth-save.pth", CPU)
+    settings = Dim(extractor="disk", matcher="mutual_nearest", max_keypoints=50).extraction
+    extract = EXTRACTORS["disk"](settings, tmp_path / "depth-save.pth", CPU)
     with torch.inference_mode():
         keypoints, descriptors, scores = extract(torch.rand(1, 3, 75, 101))
     assert len(keypoints) == len(scores) <= 50
@@ -220,25 +222,21 @@ def test_detection_settings_are_the_extractors_own_unless_given(
 ):
     """The defaults are those of deep-image-matching and the authors."""
     own = Dim(extractor=extractor, matcher="mutual_nearest", weights=tmp_path, download=False)
-    found = own.feature_settings()
-    assert (found.keypoint_threshold, found.nms_radius) == (threshold, radius)
-    given = replace(own, keypoint_threshold=0.0, nms_radius=7).feature_settings()
-    assert (given.keypoint_threshold, given.nms_radius) == (0.0, 7)
     monkeypatch.setattr(
-        "gsbench.init.dim.find_all_weights",
+        "gsbench.init.networks.options.find_all_weights",
         lambda files, folder, download: [f.names[0] for f in files],
     )
-    assert own.find_weights() == (file, None)
+    assert own.find_weights() == [file]
     light = replace(own, matcher="lightglue")
-    assert light.find_weights() == (file, f"{extractor}_lightglue_v0-1_arxiv-pth")
-    for one in (found, given):  # features depend on exactly these settings
-        expected = {"extractor": extractor, "max_image_size": 1600, "max_keypoints": 2048}
-        expected |= {"keypoint_threshold": one.keypoint_threshold, "nms_radius": one.nms_radius}
-        expected |= {"aliked_model": "n16"} if extractor == "aliked" else {}
-        assert one.extraction() == expected
-    assert found.matching() == {"matcher": "mutual_nearest", "max_ratio": 0.95}
-    matching = light.feature_settings().matching()
-    assert matching == {"matcher": "lightglue", "filter_threshold": 0.1}
+    assert light.find_weights() == [file, f"{extractor}_lightglue_v0-1_arxiv-pth"]
+    # features depend on exactly these settings
+    expected = {"extractor": extractor, "max_image_size": 1600, "max_keypoints": 2048}
+    expected |= {"aliked_model": "n16"} if extractor == "aliked" else {}
+    assert own.extraction == {**expected, "keypoint_threshold": threshold, "nms_radius": radius}
+    given = replace(own, keypoint_threshold=0.0, nms_radius=7).extraction
+    assert given == {**expected, "keypoint_threshold": 0.0, "nms_radius": 7}
+    assert own.matching == {"matcher": "mutual_nearest", "max_ratio": 0.95}
+    assert light.matching == {"matcher": "lightglue", "filter_threshold": 0.1}
 
 
 @pytest.mark.parametrize(
@@ -261,7 +259,7 @@ def test_weights_of_another_network_or_shape_are_refused(untrained_weights, tmp_
     state["log_assignment.0.final_proj.weight"] = torch.zeros(3, 3)
     torch.save(state, tmp_path / "bad.pth")
     torch.save({"conv.weight": torch.zeros(3)}, foreign := tmp_path / "foreign.pth")
-    aliked = partial(EXTRACTORS["aliked"], Dim(extractor="aliked").feature_settings(), device=CPU)
+    aliked = partial(EXTRACTORS["aliked"], Dim(extractor="aliked").extraction, device=CPU)
     for build, file, said in (
         (matcher_of, foreign, "is for another network"),
         (aliked, foreign, "is for another network"),
@@ -278,7 +276,7 @@ def test_too_little_gpu_memory_for_matching_is_reported():
 
 
 def test_too_little_gpu_memory_for_extraction_is_reported(courtyard):
-    settings = Dim().feature_settings()
+    settings = Dim().extraction
     with refusal(r"0000.png: cpu ran out of memory at 320x240 px"):
         extract_features(courtyard.images / "0000.png", no_gpu, settings, CPU)
 
@@ -296,20 +294,6 @@ def test_lightglue_has_no_weights_for_the_small_aliked():
 def test_an_unknown_device_is_refused(courtyard, untrained_weights, tmp_path):
     with refusal(r"init\.device=tpu is not known to torch"):
         superpoint(untrained_weights, device="tpu").run(courtyard, tmp_path)
-
-
-def test_mutual_nearest_matches_equal_those_of_brute_force():
-    rng = np.random.default_rng(2)
-    sides = [features_of(rng.normal(size=(60, 6))) for _ in range(2)]
-    distance = np.linalg.norm(sides[0].descriptors[:, None] - sides[1].descriptors[None], axis=2)
-    expected = []
-    for i in range(60):
-        j = int(distance[i].argmin())
-        row, column = np.sort(distance[i]), np.sort(distance[:, j])
-        if distance[:, j].argmin() == i and row[0] <= 0.9 * row[1] and column[0] <= 0.9 * column[1]:
-            expected.append((i, j))
-    assert sorted(map(tuple, mutual_nearest_matcher(0.9, CPU)(*sides).tolist())) == expected
-    assert len(expected) > 3
 
 
 @pytest.mark.shared

@@ -1,7 +1,6 @@
 """Features from outside COLMAP give the same model as its own, in the right coordinates."""
 
 import itertools
-from dataclasses import replace
 
 import numpy as np
 import pycolmap
@@ -12,63 +11,57 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from gsbench.init import Sfm
 from gsbench.init.colmap.database import (
+    DatabaseTask,
     create_database,
     database_counts,
-    image_ids,
     unknown_camera_groups,
-    write_keypoints,
-    write_matches,
+    write_features,
 )
 from gsbench.init.colmap.mapping import map_images
-from gsbench.init.colmap.matches import extract_sift, match_sift, verification_options, verify_pairs
-from gsbench.init.networks.features import Features, FeatureSettings
+from gsbench.init.colmap.matches import extract_sift, match_sift, verify_pairs
+from gsbench.init.networks.features import Features
 from gsbench.init.networks.models import extract_features
 from gsbench.logs import no_progress
 
-SIFT = FeatureSettings(
-    extractor="sift", matcher="mutual_nearest", max_image_size=1600, max_keypoints=2000
-)
+KNOWN = Sfm(camera="single", camera_model="PINHOLE", focal_length=300.0, threads=1)
 
 
 def new_database(path, capture):
-    groups = unknown_camera_groups(capture.images, capture.image_names, "single", "PINHOLE", 300.0)
-    return list(create_database(path, groups))
+    names = sorted(capture.image_names)
+    create_database(path, unknown_camera_groups(capture.images, names, KNOWN))
+    return DatabaseTask(path, capture.images, names, list(itertools.combinations(names, 2)))
 
 
-def rewritten(own, path, capture, options):
-    """Write the features and matches of one database to another, as if they were foreign.
-
-    Returns the matches of all pairs.
-    """
-    names = new_database(path, capture)
+def rewritten(own, path, capture):
+    """Write the features and matches of one database to another, as if they were foreign."""
+    task = new_database(path, capture)
     with pycolmap.Database.open(own) as database:
         ids = {image.name: image.image_id for image in database.read_all_images()}
-        keypoints = {name: database.read_keypoints(ids[name])[:, :2] for name in names}
-        pairs = list(itertools.combinations(names, 2))
-        matches = {(a, b): database.read_matches(ids[a], ids[b]) for a, b in pairs}
-    write_keypoints(path, keypoints)
-    write_matches(path, matches)
-    verify_pairs(path, pairs, verification_options(options), no_progress)
-    return matches
+        keypoints = {name: database.read_keypoints(ids[name])[:, :2] for name in task.names}
+        matches = {(a, b): database.read_matches(ids[a], ids[b]) for a, b in task.pairs}
+    write_features(path, keypoints, matches)
+    verify_pairs(path, Sfm(), no_progress)
 
 
 @pytest.fixture(scope="module")
 def own_path(bare_photos, tmp_path_factory):
     """A database with COLMAP's own features and matches."""
     path = tmp_path_factory.mktemp("own") / "database.db"
-    names = new_database(path, bare_photos)
-    extract_sift(path, bare_photos.images, names, Sfm(), 1, no_progress)
-    match_sift(path, list(itertools.combinations(names, 2)), Sfm(), 1, no_progress)
+    task = new_database(path, bare_photos)
+    extract_sift(task, KNOWN, no_progress)
+    match_sift(path, task.pairs, KNOWN, no_progress)
     return path
 
 
 def test_sift_through_the_external_path_gives_the_same_model(own_path, bare_photos, tmp_path):
     own, external = own_path, tmp_path / "external.db"
-    rewritten(own, external, bare_photos, Sfm())
+    rewritten(own, external, bare_photos)
     assert database_counts(external) == database_counts(own)
 
     first, second = (
-        map_images(path, bare_photos.images, tmp_path / path.stem, Sfm(), no_progress).model
+        map_images(
+            DatabaseTask(path, bare_photos.images, [], []), tmp_path / "map", Sfm(), no_progress
+        ).model
         for path in (own, external)
     )
     assert first.num_points3D() == second.num_points3D() > 100
@@ -88,7 +81,7 @@ def extract(path, max_image_size):
         filled = laf_is_filled(frames)[0]
         return frames[0, filled, :, 2], descriptors[0, filled], responses[0, filled]
 
-    settings = replace(SIFT, max_image_size=max_image_size)
+    settings = {"max_image_size": max_image_size, "max_keypoints": 2000}
     return extract_features(path, found, settings, torch.device("cpu"))
 
 
@@ -116,33 +109,3 @@ def test_keypoints_are_scaled_separately_in_x_and_y():
         file_size=(400, 201),
     )
     assert_allclose(features.colmap_keypoints, [[2.0, 2.01], [398.0, 198.99]], rtol=1e-6)
-
-
-def test_a_pair_must_keep_a_share_of_its_matches(own_path, bare_photos, tmp_path):
-    """Pairs below the ratio are dropped, and others are kept.
-
-    COLMAP applies the ratio to each geometry that it tries (essential, fundamental, homography).
-    So a kept pair may have another geometry than without the ratio, and other inliers. If the
-    geometry is the same, so are the inliers.
-    """
-    geometries = {}
-    for ratio in (0.0, 0.8):
-        path = tmp_path / f"{ratio}.db"
-        matches = rewritten(own_path, path, bare_photos, Sfm(min_inlier_ratio=ratio))
-        ids = image_ids(path)
-        with pycolmap.Database.open(path) as database:
-            geometries[ratio] = {
-                (a, b): database.read_two_view_geometry(ids[a], ids[b]) for a, b in matches
-            }
-    verified, kept = (
-        {pair for pair, geometry in found.items() if len(geometry.inlier_matches)}
-        for found in geometries.values()
-    )
-    assert set() < kept < verified
-    for pair in kept:
-        free, asked = geometries[0.0][pair], geometries[0.8][pair]
-        assert len(asked.inlier_matches) >= 0.8 * len(matches[pair])
-        if asked.config == free.config:
-            assert_array_equal(asked.inlier_matches, free.inlier_matches)
-    for pair in verified - kept:
-        assert len(geometries[0.0][pair].inlier_matches) < 0.8 * len(matches[pair])

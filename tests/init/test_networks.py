@@ -10,8 +10,8 @@ from gsbench.errors import GsbenchError
 from gsbench.files import file_sha256
 from gsbench.init import Dim
 from gsbench.init.networks import extract_and_match
-from gsbench.init.networks.extract_and_match import NetworkJob, open_store
 from gsbench.init.networks.features import Features
+from gsbench.init.reconstruction import Job
 from tests.helpers import refusal, write
 
 NAMES = ("a.png", "b.png", "c.png")
@@ -53,25 +53,27 @@ def networks(monkeypatch):
     monkeypatch.setitem(extract_and_match.EXTRACTORS, "superpoint", made.build("extractor"))
     monkeypatch.setattr(extract_and_match, "build_matcher", made.build("matcher"))
     monkeypatch.setattr(extract_and_match, "extract_features", made.extract)
+    monkeypatch.setattr(Dim, "find_weights", lambda _: made.weights)
     return made
 
 
 @pytest.fixture
-def job(bare_photos, tmp_path):
+def job(networks, bare_photos, tmp_path):
     images = tmp_path / "images"
     images.mkdir()
     for number, name in enumerate(NAMES):
         Image.new("L", (8, 8), number).save(images / name)
     capture = replace(bare_photos, images=images, image_names=NAMES, test_names=())
-    options = Dim(threads=1)
-    work = tmp_path / "work"
-    weights = [write(tmp_path / name, name) for name in ("extractor.pth", "matcher.pth")]
-    settings = options.feature_settings()
-    return NetworkJob(options, settings, "cpu", capture, None, work, *weights)
+    networks.weights = [write(tmp_path / name, name) for name in ("extractor.pth", "matcher.pth")]
+    return Job(Dim(threads=1), capture, tmp_path, tmp_path / "work", None)
 
 
 def run(job, progress=lambda *at: None):
-    return extract_and_match.extract_and_match(job, progress)
+    return extract_and_match.extract_and_match(job.options, job, progress)
+
+
+def open_store(job):
+    return extract_and_match.open_store(job.options, job, job.options.find_weights())
 
 
 def test_each_image_and_pair_is_computed_once(networks, job):
@@ -122,8 +124,8 @@ def test_keypoints_on_ignored_pixels_are_left_out(networks, job):
     masked = replace(job, capture=replace(job.capture, masks=masks))
     run(masked)
     store = open_store(masked)
-    assert store.require_features("c.png").keypoints.tolist() == [[0, 0], [2, 2], [3, 3]]
-    assert len(store.require_features("b.png").keypoints) == 3
+    assert store.features("c.png").keypoints.tolist() == [[0, 0], [2, 2], [3, 3]]
+    assert len(store.features("b.png").keypoints) == 3
 
 
 def test_pairs_that_the_preview_leaves_out_are_counted(networks, job, monkeypatch):
@@ -147,20 +149,21 @@ def test_the_weights_are_named_by_their_digests_and_tell_stored_files_apart(
     run(job)
     weights = tmp_path / "w.pth"
     weights.write_bytes(b"weights")
-    found = run(replace(job, matcher_weights=weights))
-    assert found.settings["weights_sha256"] == {
-        file.name: file_sha256(file) for file in (job.extractor_weights, weights)
+    networks.weights[1] = weights
+    assert run(job).settings["weights_sha256"] == {
+        file.name: file_sha256(file) for file in networks.weights
     }
     assert (len(networks.extracted), len(networks.matched)) == (3, 6)
-    assert run(replace(job, extractor_weights=weights)).settings["weights_sha256"]
+    networks.weights[0] = weights
+    run(job)
     assert (len(networks.extracted), len(networks.matched)) == (6, 9)
 
 
 def test_stored_files_that_are_gone_are_named(networks, job):
     store = open_store(job)
     for read, names, said in (
-        (store.require_features, ("a.png",), r"features of a\.png are gone from .*work"),
-        (store.require_matches, ("a.png", "b.png"), r"matches of a\.png and b\.png are gone"),
+        (store.features, ("a.png",), r"features of a\.png are gone from .*work"),
+        (store.matches, ("a.png", "b.png"), r"matches of a\.png and b\.png are gone"),
     ):
         with pytest.raises(GsbenchError, match=f"the stored {said}"):
             read(*names)

@@ -9,18 +9,17 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from gsbench.init import MODEL_FOLDER, Sfm
-from gsbench.init.base import OWN_GAUGE_FOLDER, PoseErrors, Preparation, Timer
+from gsbench.init import MODEL_FOLDER
+from gsbench.init.base import OWN_GAUGE_FOLDER, PoseErrors
 from gsbench.init.colmap.alignment import (
+    align,
+    align_poses,
     compare_poses,
     measure_gauge,
-    similarity_to,
     training_extent,
 )
-from gsbench.init.colmap.mapping import MappingResult
-from gsbench.init.colmap.reconstruct import poses_by_name
-from gsbench.init.reconstruction import Job, Matching, finish
-from gsbench.init.report import make_report
+from gsbench.init.colmap.reconstruct import common_poses, poses_by_name
+from gsbench.init.report import make_report, write_result
 from gsbench.scene.types import Capture
 from tests.init.models import add_point, camera_at, model_with
 
@@ -68,7 +67,7 @@ def test_the_gauge_expresses_the_threshold_of_the_paper():
 
 def reported(capture, model, packages=(), **more):
     """The report on a model whose poses were estimated."""
-    return make_report("x", "own", capture, model, None, packages, settings={}, seconds={}, **more)
+    return make_report("x", "own", capture, model, packages, settings={}, seconds={}, **more)
 
 
 def test_a_report_has_the_numbers_of_its_model(capture):
@@ -113,7 +112,7 @@ def test_a_similarity_leaves_no_pose_errors_and_a_tilt_does():
     reference, model = model_of(CENTERS), model_of(CENTERS)
     rotation = pycolmap.Rotation3d(turn.as_matrix())
     model.transform(pycolmap.Sim3d(3.0, rotation, np.array([1.0, 2.0, 3.0])))
-    similarity = similarity_to(model, reference)
+    similarity = align_poses(*common_poses(model, reference))
     errors = compare_poses(model, reference, similarity, 2.0, exact=True)
     assert similarity.scale == pytest.approx(1 / 3)
     assert errors.num_images == 4
@@ -121,17 +120,19 @@ def test_a_similarity_leaves_no_pose_errors_and_a_tilt_does():
     assert errors.rotation_max_deg < 1e-5
 
     tilted = model_of(CENTERS, Rotation.from_rotvec([0, np.radians(4.0), 0]))
-    errors = compare_poses(tilted, reference, similarity_to(tilted, reference), 2.0, exact=False)
+    similarity = align_poses(*common_poses(tilted, reference))
+    errors = compare_poses(tilted, reference, similarity, 2.0, exact=False)
     assert errors.rotation_mean_deg == pytest.approx(4.0)
     assert errors.center_max < 1e-9
 
 
 def finished(capture, folder, model, reference):
-    """The report on an estimated ``model``, which is written below ``folder``."""
-    job = Job(Sfm(), capture, folder / "out", folder / "work", None)
-    mapped = MappingResult(model, 1, "incremental", ())
-    nothing = Matching(None), Preparation()
-    return finish(job, *nothing, model, reference, mapped, Timer({}), {}, None)
+    """The report on an estimated ``model``, which is written to ``folder``."""
+    report = reported(
+        capture, model, **align(model, reference, capture, False, folder / OWN_GAUGE_FOLDER)
+    )
+    write_result(model, report, folder)
+    return report
 
 
 def test_two_common_cameras_are_not_compared_and_give_a_warning(capture, tmp_path):
@@ -156,7 +157,7 @@ def test_an_estimated_model_is_written_in_both_gauges(capture, tmp_path):
     assert own.scene_extent == pytest.approx(3 * report.gauge.scene_extent)
     assert own.threshold_in_reference == pytest.approx(0.03 / 27)
     for gauge, centers in ((MODEL_FOLDER, CENTERS), (OWN_GAUGE_FOLDER, 3 * CENTERS + shift)):
-        found = poses_by_name(pycolmap.Reconstruction(tmp_path / "out" / gauge))
+        found = poses_by_name(pycolmap.Reconstruction(tmp_path / gauge))
         assert_allclose([found[name][0] for name in NAMES], centers, atol=1e-9)
 
 
@@ -164,7 +165,8 @@ def test_centre_errors_are_in_reference_units_and_relative_to_the_extent():
     moved = CENTERS.copy()
     moved[3, 2] += 0.3
     model, reference = model_of(moved), model_of(CENTERS)
-    found = compare_poses(model, reference, similarity_to(reference, reference), 2.0, exact=True)
+    same = align_poses(*common_poses(reference, reference))
+    found = compare_poses(model, reference, same, 2.0, exact=True)
     assert found.center_max == pytest.approx(0.3)
     assert found.center_mean == pytest.approx(0.3 / 4)
     assert found.center_rmse == pytest.approx(0.3 / 2)

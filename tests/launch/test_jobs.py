@@ -16,6 +16,7 @@ from types import SimpleNamespace
 import pytest
 import submitit
 
+from gsbench.config.compose import Trial
 from gsbench.errors import InputError, TrainingError
 from gsbench.files import DiskFullError
 from gsbench.launch import jobs
@@ -24,7 +25,6 @@ from gsbench.launch.jobs import (
     TrialJob,
     check_job_links,
     collect,
-    job_folder,
     new_job_folder,
     run_one,
 )
@@ -34,7 +34,7 @@ from gsbench.runs.commands import digest_of
 from gsbench.runs.config_hash import config_hash
 from gsbench.system.locks import BusyError
 from gsbench.system.stopping import Stopped
-from tests.helpers import refusal
+from tests.helpers import refusal, write
 from tests.trials import LOCAL, record_of, trial_values, write_results
 from tests.trials import bare_trial as trial
 
@@ -146,7 +146,7 @@ def collected(runs, failure="", results=""):
         if results == "changed":
             (one.folder / "table.csv").unlink()
     ended.paths.result_pickle.write_bytes(b"cos\nmkdir\n(S'exploded'\ntR.")
-    return collect(ended, one.folder, [trial(runs, 1), one])
+    return collect(ended, one)
 
 
 def test_the_files_of_a_trial_tell_how_its_job_ended(tmp_path):
@@ -202,7 +202,7 @@ def machine(monkeypatch):
 def test_a_local_job_takes_a_slot_and_its_share_of_the_machine(tmp_path, machine, capsys):
     machine["outcome"] = Outcome(tmp_path, "failed", "no luck")
     one = trial(tmp_path)
-    job = TrialJob(one.values, ["theirs", "both"], {"mine": "/there"}, "6,7")
+    job = TrialJob(one, ["theirs", "both"], {"mine": "/there"}, "6,7")
     assert job() is machine["outcome"]
     assert sys.path == ["theirs", "both", "own"]
     assert (machine["trial"].values, machine["wait"]) == (one.values, True)
@@ -215,14 +215,14 @@ def test_a_local_job_takes_a_slot_and_its_share_of_the_machine(tmp_path, machine
     assert signal.SIGINT not in machine["signals"]  # it belongs to that process, too
     assert capsys.readouterr().err == "no luck\n"
     del machine["assign_gpu"]
-    TrialJob(one.values | {"device": "cuda:1"}, [], {}, None)()
+    TrialJob(Trial(one.values | {"device": "cuda:1"}, ()), [], {}, None)()
     assert "assign_gpu" not in machine
 
 
 def test_a_job_in_slurm_mirrors_itself_and_is_forgotten_at_its_end(tmp_path, machine, capsys):
     machine["outcome"] = Outcome(tmp_path, "done", "psnr 1")
     record_submission(tmp_path, "7_1", tmp_path / "log")
-    TrialJob(trial(tmp_path, launch=SLURM).values, [], {}, None)()
+    TrialJob(trial(tmp_path, launch=SLURM), [], {}, None)()
     assert read_submission(tmp_path) is None
     assert not {"slots", "assign_gpu"} & set(machine)
     assert machine["assign_threads"] == (3, 2)
@@ -244,7 +244,7 @@ def test_a_stopped_job_ends_and_is_requeued_when_its_time_is_up(
         raise Stopped(number)
 
     monkeypatch.setattr(jobs, "run_one", stop)
-    job = TrialJob(trial(tmp_path, launch=SLURM).values, [], {}, None)
+    job = TrialJob(trial(tmp_path, launch=SLURM), [], {}, None)
     with pytest.raises(SystemExit) as ended:
         job()
     assert ended.value.code == 128 + number
@@ -252,22 +252,12 @@ def test_a_stopped_job_ends_and_is_requeued_when_its_time_is_up(
     assert job.checkpoint().function is job
 
 
-def test_a_job_gets_the_search_path_and_the_gpus_of_its_sweep(tmp_path, monkeypatch):
-    monkeypatch.setattr(sys, "path", ["", "a", "b"])
-    monkeypatch.setattr(jobs, "allowed_modules", lambda: {"mine": "/there"})
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3")
-    one = trial(tmp_path)
-    assert jobs.job_of(one) == TrialJob(
-        one.values, ["a", "b"], {"mine": "/there"}, "3", digest_of(one.values)
-    )
-
-
 def test_a_job_whose_code_changed_since_its_command_fails_and_runs_nothing(
     tmp_path, machine, monkeypatch
 ):
     monkeypatch.setattr(jobs, "run_one", lambda *arguments, **named: pytest.fail("it ran"))
     one = trial(tmp_path, launch=SLURM)
-    outcome = TrialJob(one.values, [], {}, None, f"{digest_of(one.values)}-before")()
+    outcome = TrialJob(one, [], {}, None, f"{digest_of(one.values)}-before")()
     assert (outcome.status, outcome.bad_input) == ("failed", True)
     assert outcome.message == "code changed since the command; give it again"
 
@@ -286,7 +276,7 @@ class Jobs:
 
     def submit(self, job):
         assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
-        seed, left = job.values["seed"], self.steps[len(self.seeds)]
+        seed, left = job.trial.values["seed"], self.steps[len(self.seeds)]
         self.seeds.append(seed)
         self.running += 1
         self.most = max(self.most, self.running)
@@ -333,30 +323,30 @@ def test_local_jobs_run_as_many_at_once_as_asked(tmp_path, monkeypatch, caplog, 
     ] * 4
 
 
-def test_ctrl_c_is_passed_on_to_the_processes_that_still_run(tmp_path):
+def test_ctrl_c_is_passed_on_to_the_processes_that_still_run(tmp_path, monkeypatch):
     executor = Jobs(tmp_path, [0, 9])
+    monkeypatch.setattr(submitit, "LocalExecutor", lambda folder: executor)
     with pytest.raises(KeyboardInterrupt):
-        jobs._run([trial(tmp_path, seed) for seed in (1, 2)], executor, 2, Mirrored())
+        jobs.run_local([trial(tmp_path, seed) for seed in (1, 2)], Mirrored())
     assert executor.sent == {1: signal.SIGTERM}  # the process of seed 2 has ended
 
 
 def test_submitits_link_is_removed_and_any_other_link_is_refused(tmp_path):
     values = trial_values(tmp_path, name="cluster")
-    folder = job_folder(values)
-    assert folder == tmp_path / ".jobs/cluster"
+    folder = tmp_path / ".jobs/cluster"
     script = new_job_folder(values) / "2_submission.sh"
     script.write_text("#!/bin/bash\n")
     left = script.with_name(".submission_file_aaa46bf3.sh")
     left.symlink_to(script)
-    assert job_folder(values) == folder
+    assert new_job_folder(values).parent == folder
     assert not left.is_symlink()
     assert script.exists()
     (folder / "2_0_0_log.out").symlink_to(tmp_path / "elsewhere")
     with refusal(r"2_0_0_log\.out is a link"):
-        job_folder(values)
+        new_job_folder(values)
     (tmp_path / ".jobs/other").symlink_to(tmp_path)
     with refusal(r"other is a link"):
-        job_folder(trial_values(tmp_path, name="other"))
+        new_job_folder(trial_values(tmp_path, name="other"))
 
 
 def test_through_a_link_no_file_of_another_folder_is_removed(tmp_path):
@@ -373,8 +363,7 @@ def test_through_a_link_no_file_of_another_folder_is_removed(tmp_path):
 
 def test_no_job_unpickles_what_a_strangers_runs_folder_has(tmp_path):
     values = trial_values(tmp_path, name="theirs")
-    planted = job_folder(values) / "17_submitted.pkl"
-    planted.write_bytes(b"code")
+    planted = write(tmp_path / ".jobs/theirs/17_submitted.pkl", b"code")
     first, second = new_job_folder(values), new_job_folder(values)
     assert first != second
     assert not list(first.iterdir())
@@ -392,7 +381,7 @@ def slurm(tmp_path, monkeypatch):
     def submit_array(tasks):
         if state.error:
             raise state.error
-        state.submitted += [task.values["seed"] for task in tasks]
+        state.submitted += [task.trial.values["seed"] for task in tasks]
         return [job(tmp_path, f"9_{number}") for number, _ in enumerate(tasks)]
 
     executor = SimpleNamespace(folder=tmp_path, submit_array=submit_array)

@@ -7,7 +7,7 @@ import pytest
 
 from gsbench.launch import batch, dry_run
 from gsbench.launch.batch import (
-    begin_for_another_launcher,
+    begin,
     check_trackers,
     missing_folders,
     missing_weights,
@@ -74,7 +74,7 @@ def test_unfinished_trials_go_to_their_launcher_once_checked_and_planned(
     assert not left.exists()
     called.clear()
     run_batch([one])
-    begin_for_another_launcher([one, two])
+    begin([one, two])
     assert called == [
         ("check_parts", [], 0, launch is not SLURM),
         ("check_parts", [1], 0, launch is not SLURM),
@@ -92,7 +92,7 @@ def test_what_is_missing_here_matters_unless_the_trials_run_elsewhere(tmp_path, 
     ):
         with refusal(said):
             run_batch([trial(runs, **wrong)])
-        begin_for_another_launcher([trial(runs, 0, SLURM, **wrong)])
+        begin([trial(runs, 0, SLURM, **wrong)])
     one = trial(runs, eval={"weights": "nosuch"})
     write_results(one.folder, one.values)
     with refusal("no such folder"):  # wrong even if all trials are done
@@ -174,3 +174,29 @@ def test_weights_are_searched_once_for_equal_options(monkeypatch):
         assert dry_run.unavailable_now({"flip": flip}) == ["lpips_vgg"]
     assert [options.flip for options in asked] == [False, True]
     dry_run._unavailable_now.cache_clear()
+
+
+def test_nothing_stays_of_trials_of_which_all_were_refused(tmp_path, called, monkeypatch):
+    runs, bad = tmp_path / "runs", {1, 2}
+
+    def refuse(trials, mirror):
+        for one in trials:
+            one.folder.mkdir(parents=True, exist_ok=True)
+        seeds = [one.values["seed"] for one in trials]
+        return [
+            Outcome(one.folder, "failed", "no", seed in bad)
+            for one, seed in zip(trials, seeds, strict=True)
+        ]
+
+    monkeypatch.setattr(batch, "run_serial", refuse)
+    monkeypatch.setattr(batch, "_why_not_done", lambda trial: True)
+    one, two, three = (trial(runs, seed) for seed in (1, 2, 3))
+    run_batch([one, two])
+    assert not any(one.folder.exists() for one in (one, two))
+    assert not read_history(runs / "x").planned
+    two.folder.mkdir(parents=True)  # of an earlier command, whose trial began
+    run_batch([one, two])
+    assert two.folder.exists() > one.folder.exists()
+    run_batch([one, three])
+    assert one.folder.exists()
+    assert set(read_history(runs / "x").planned) == {one.folder, two.folder, three.folder}

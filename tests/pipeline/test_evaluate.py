@@ -203,15 +203,14 @@ def test_a_trial_is_measured_on_its_own_device():
     """Torch's device "meta" stands in for a GPU: its tensors have no values, but a place."""
     seen = set()
 
-    class Spy:
-        def measure(self, *images):
-            seen.update(image.device.type for image in images)
-            return 0.0
+    def spy(*images):
+        seen.update(image.device.type for image in images)
+        return 0.0
 
     parts = Parts(compose_one(["scene=courtyard", "eval.lpips=[]", "eval.flip=false"]).values)
     parts.device = torch.device("meta")
     evaluator = parts.evaluator
-    evaluator._metrics = {"spy": Spy()}
+    evaluator._metrics = {"spy": spy}
     image = np.zeros((4, 5, 3), np.uint8)
     assert evaluator.evaluate_view(image, image, np.ones((4, 5), bool)) == {"spy": 0.0}
     assert seen == {"meta"}

@@ -2,7 +2,6 @@
 
 import logging
 from dataclasses import replace
-from shlex import split
 from types import SimpleNamespace
 
 import pytest
@@ -14,10 +13,10 @@ from gsbench.files import DiskFullError
 from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.normalization import IDENTITY, Normalization
 from gsbench.pipeline import trial as trials
-from gsbench.pipeline.trial import TrialSteps, _publish, _recorded_failures, run_trial
+from gsbench.pipeline.trial import _publish, _recorded_failures, run_trial
 from gsbench.runs.config_hash import config_hash
 from gsbench.runs.keys import CAPTURE, EVALUATE, GROUND_TRUTH, INIT, TRAIN, Step
-from gsbench.runs.store import Store, StoredResult
+from gsbench.runs.store import StoredResult
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS
 from gsbench.system.locks import BusyError, hold
@@ -100,117 +99,8 @@ def test_a_failure_is_recorded_and_raised(tmp_path, monkeypatch, error, kind, me
         raise error
 
 
-# ---- the steps
-
-
 def step(stage, **inputs):
     return Step(stage, inputs, lambda folder: (folder / "made").write_text(str(inputs)))
-
-
-@pytest.fixture
-def made(monkeypatch):
-    """What the steps of a trial are made of; the keys of steps are the words that made them."""
-    state = SimpleNamespace(capture_step=None, masking=None, normalizing=None, needs=False)
-    told = []
-    state.told = told
-
-    class Source:
-        def __init__(self, options, reader, user):
-            self.step = state.capture_step
-
-        def read(self, folder):
-            told.append(("read", folder))
-            return "given"
-
-    def note(name, result):
-        def call(*arguments):
-            told.append((name, *arguments))
-            return result() if callable(result) else result
-
-        return call
-
-    def init(store, capture, initializer, *more):
-        told.append(("init", capture, initializer, *more))
-        return step(INIT, of=str(initializer))
-
-    monkeypatch.setattr(trials, "CaptureSource", Source)
-    monkeypatch.setattr(trials, "masking_step", note("masking", lambda: state.masking))
-    monkeypatch.setattr(trials, "masked_capture", lambda capture, folder: f"{capture} masked")
-    monkeypatch.setattr(trials, "normalizing_step", note("normalizing", lambda: state.normalizing))
-    monkeypatch.setattr(
-        trials, "normalized_capture", lambda capture, by, folder: f"{capture} normalized"
-    )
-    monkeypatch.setattr(trials, "init_step", init)
-    monkeypatch.setattr(trials, "Sfm", lambda threads: f"Sfm on {threads}")
-    monkeypatch.setattr(trials, "Views", lambda *given: ("views", *given))
-    monkeypatch.setattr(trials, "check_capture", note("check", None))
-    monkeypatch.setattr(trials, "train_step", note("train", step(TRAIN)))
-    monkeypatch.setattr(trials, "external_step", note("external", step(TRAIN)))
-    monkeypatch.setattr(trials, "ground_truth_step", note("truth", step(GROUND_TRUTH)))
-    monkeypatch.setattr(trials, "evaluate_step", note("evaluate", step(EVALUATE)))
-    initializer = SimpleNamespace(needs_reference=lambda capture: state.needs)
-    state.parts = SimpleNamespace(
-        scene=SimpleNamespace(transparent="white"),
-        initializer=initializer,
-        threads=3,
-        program=None,
-        user_code="code",
-        reader=None,
-    )
-    return state
-
-
-def test_the_steps_of_photographs_follow_each_other(made, tmp_path):
-    store = Store(tmp_path)
-    own = TrialSteps(made.parts, store)
-    assert [one.stage for one in own.steps()] == [INIT, TRAIN, GROUND_TRUTH, EVALUATE]
-    assert own.photographs == own.capture == "given"
-    init = step(INIT, of=str(made.parts.initializer))
-    assert [word for word, *_ in made.told] == split(
-        "read masking normalizing init check train truth evaluate"
-    )
-    by_name = {name: rest for name, *rest in made.told}
-    assert by_name["read"] == [None]
-    assert by_name["masking"] == ["given", "white"]
-    assert by_name["init"] == ["given", made.parts.initializer, None, "code"]
-    assert [given if not isinstance(given, Step) else given.key for given in own.views] == [
-        "views",
-        store,
-        "given",
-        init.key,
-        made.parts.scene,
-    ]
-    assert by_name["train"] == [own.views, made.parts]
-    assert by_name["truth"] == [own.views]
-    assert by_name["evaluate"][0] == own.views
-    assert by_name["evaluate"][1].stage is TRAIN
-    assert by_name["evaluate"][2] is made.parts
-
-
-def test_steps_before_the_initialisation_change_what_it_sees(made, tmp_path):
-    store = Store(tmp_path)
-    made.capture_step, made.needs = step(CAPTURE, courtyard=1), True
-    made.masking, made.normalizing = step(CAPTURE, masks=1), step(CAPTURE, frame=1)
-    made.parts.program = "program"
-    own = TrialSteps(made.parts, store)
-    # its photographs are needed for all other keys
-    assert list(own.steps()) == [made.capture_step]
-    assert made.told == []
-    store.get(made.capture_step)
-    steps = list(own.steps())
-    assert steps[:3] == [made.capture_step, made.masking, made.normalizing]
-    assert [one.stage for one in steps[3:]] == [INIT, INIT, TRAIN, GROUND_TRUTH, EVALUATE]
-    assert made.told[0] == ("read", store.path(made.capture_step))
-    assert own.photographs == "given"
-    assert own.capture == "given masked normalized"
-    by_name = [(name, rest) for name, *rest in made.told]
-    assert ("normalizing", ["given masked"]) in by_name
-    first, second = (rest for name, rest in by_name if name == "init")
-    assert first == [own.capture, "Sfm on 3"]
-    assert second[:2] == [own.capture, made.parts.initializer]
-    assert second[2].key == steps[3].key
-    assert ("external", [own.views, "program", made.parts]) in by_name
-    assert "train" not in dict(by_name)
 
 
 # ---- the files of the trial

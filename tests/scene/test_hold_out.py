@@ -51,18 +51,18 @@ def test_matched_splits_leave_equally_many_views(count, sectors, sector):
 def test_no_split_is_empty_or_trains_on_a_test_view(data):
     names = NAMES[: data.draw(st.integers(3, 8), "number of photographs")]
     sectors = data.draw(st.integers(2, 10), "sectors")
-    rule = SplitRule(
-        split=data.draw(st.sampled_from(["every_nth", "sector", "list"])),
-        test_every=data.draw(st.integers(2, 30), "test_every"),
-        sectors=sectors,
-        sector=data.draw(st.integers(0, sectors - 1), "sector"),
-        match_views=data.draw(st.booleans(), "match_views"),
-        validation=data.draw(st.booleans(), "validation"),
-    )
+    rule = {
+        "split": data.draw(st.sampled_from(["every_nth", "sector", "list"])),
+        "test_every": data.draw(st.integers(2, 30), "test_every"),
+        "sectors": sectors,
+        "sector": data.draw(st.integers(0, sectors - 1), "sector"),
+        "match_views": data.draw(st.booleans(), "match_views"),
+        "validation": data.draw(st.booleans(), "validation"),
+    }
     some = st.none() | st.lists(st.sampled_from(names), unique=True)
-    lists = (data.draw(some), data.draw(some)) if rule.split == "list" else (None, None)
+    lists = (data.draw(some), data.draw(some)) if rule["split"] == "list" else (None, None)
     try:
-        found = hold_out(names, rule, lists, cameras)
+        found = hold_out(names, SplitRule(**rule), lists, cameras)
     except InputError:
         return
     assert found.train

@@ -134,7 +134,7 @@ def test_a_file_that_is_no_mask_is_refused_in_one_line(tmp_path, pixels, said):
 def test_a_damaged_mask_is_refused(tmp_path):
     path = save(tmp_path / "m.png", noise(64, 64) // 128 * 255)
     path.write_bytes(path.read_bytes()[:-60])
-    with refusal(r"m\.png: the mask is damaged"):
+    with refusal(r"m\.png: the image is damaged"):
         read_mask(path)
     path.write_text("white")
     with refusal(r"m\.png: not a readable image"):

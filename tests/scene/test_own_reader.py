@@ -99,7 +99,9 @@ def test_a_fault_of_the_reader_is_named(fault, folder):
 
 
 def source(folder, reader, code="a", **settings):
-    options = SceneConfig("own", "reader", _target_="mine.Reader", path=str(folder), **settings)
+    options = SceneConfig(
+        name="own", kind="reader", _target_="mine.Reader", path=str(folder), **settings
+    )
     return CaptureSource(options, reader, UserCode({"mine": code}, {"scene": "mine.Reader"}))
 
 
@@ -150,7 +152,7 @@ def test_results_are_stored_under_the_readers_code_its_settings_and_what_it_read
 )
 def test_a_reader_goes_with_its_kind_of_scene(settings, said):
     with pytest.raises(InputError, match=said):
-        SceneConfig("own", path="/a", **settings)
+        SceneConfig(name="own", path="/a", **settings)
 
 
 def test_options_of_the_reader_stand_among_the_settings_of_the_scene(monkeypatch, folder):

@@ -39,10 +39,6 @@ def value(number, **facts):
     return [Finding(number, ("a.png",), facts)]
 
 
-def found(rule, number, **facts):
-    return {rule: value(number, **facts)}
-
-
 def panorama(is_panorama):
     return Facts(photographs=[Facts(name="a.jpg", camera=None, is_panorama=is_panorama)])
 
@@ -67,32 +63,32 @@ ROWS = {
     "mask-of-other-size": (value(0), value(1, name="a.png", **SIZE), "8x6 px and its image a.png"),
     "black-mask": (value(0.01), value(0.0), "black all over"),
     "grey-mask": (value(0.05), value(0.051), "5% of its pixels are grey"),
-    "no-pose": (found("no-pose", 0), found("no-pose", 1), "1 photograph without a pose .*: a.png"),
+    "no-pose": (value(0), value(1), "1 photograph without a pose .*: a.png"),
     "no-file": (
-        found("no-file", 0),
-        found("no-file", 1),
+        value(0),
+        value(1),
         "1 image with a camera but without a file: a.png",
     ),
     "found-by-last-part": (
-        found("found-by-last-part", 0),
-        found("found-by-last-part", 1),
+        value(0),
+        value(1),
         "files found by the last part of their path: a.png",
     ),
     "focal-length-and-field": (
-        found("focal-length-and-field", 1.05),
-        found("focal-length-and-field", 1.06, given=50, meant=53),
+        value(1.05),
+        value(1.06, given=50, meant=53),
         "its focal length is 50 px, but its field of view means 53 px",
     ),
     "panorama": (panorama(False), panorama(True), "1 photograph declared as panoramas"),
     "copies": (Facts(left_out={}), Facts(left_out={"a": "b"}), r"left out, .*: a \(b is used\)"),
     "lens-turns-back": (
-        found("lens-turns-back", 0.0),
-        found("lens-turns-back", 0.02, **LENS),
+        value(0.0),
+        value(0.02, **LENS),
         r"camera of a.png \(RADIAL: 1, 2\) turns back .*: 2.0% of",
     ),
     "little-left": (
-        found("little-left", 0.25),
-        found("little-left", 0.24, **LENS),
+        value(0.25),
+        value(0.24, **LENS),
         "leaves 8x6 of 40x30 px undistorted: check its lens",
     ),
     "no-training-view": (Facts(train="a"), Facts(train=""), "no training view has a pose"),
@@ -187,9 +183,10 @@ def test_each_rule_has_its_row_here_and_an_id_of_its_own():
 def test_a_rule_is_silent_up_to_its_limit_and_names_what_is_beyond(name):
     fine, odd, said = ROWS[name]
     rule = BY_ID[name]
-    judge = rule.tell if rule.stage == "file" else rule.judge
-    assert judge(fine) is None
-    judged = judge(odd)
+    if rule.measure == rules.GIVEN:
+        fine, odd = {name: fine}, {name: odd}
+    assert rule.judge(fine) is None
+    judged = rule.judge(odd)
     with refusal(said):
         raise rules.InputError(judged.line)
     assert judged.refused is (rule.usable != rules.ANY)
@@ -247,7 +244,7 @@ def test_panoramas_are_refused_unless_they_are_accepted(tmp_path, size, refused)
     capture = read_photos("toy", tmp_path, accept=["panorama"])
     assert [(odd.rule, odd.refused) for odd in capture.oddities] == [("panorama", True)] * refused
     with refusal("scene.accept=panoramas is no rule: .*did you mean panorama"):
-        SceneConfig("toy", "photos", path="/x", accept=["panoramas"])
+        SceneConfig(name="toy", kind="photos", path="/x", accept=["panoramas"])
 
 
 def test_prepared_views_of_an_accepted_lens_are_judged_again(make_scene, tmp_path):

@@ -46,13 +46,11 @@ def is_cyclic_run(found, order):
 def test_a_ring_is_cut_by_azimuth_in_any_order_and_coordinates(seed, sectors, far):
     degrees = list(np.random.default_rng(seed).permutation(np.arange(24) * 15.0))
     rotation, shift = some_rotation(seed), np.array([5.0, -3.0, 2.0]) * (100 if far else 1)
-    found = arrange_cameras([turned(camera, rotation, shift, 0.3) for camera in ring(degrees)])
-    assert "surround" in found.description
-    assert found.order[0] == 0, "a closed ring begins at the first camera"
+    order, why = arrange_cameras([turned(camera, rotation, shift, 0.3) for camera in ring(degrees)])
+    assert "surround" in why
+    assert order[0] == 0, "a closed ring begins at the first camera"
     around = [int(index) for index in np.argsort(degrees)]
-    parts = [
-        {found.order[place] for place in sector_range(24, part, sectors)} for part in range(sectors)
-    ]
+    parts = [{order[place] for place in sector_range(24, part, sectors)} for part in range(sectors)]
     assert sorted(index for part in parts for index in part) == list(range(24))
     assert all(is_cyclic_run(part, around) for part in parts)
 
@@ -63,36 +61,37 @@ def test_azimuths_do_not_depend_on_heights_and_are_rounded():
         np.array([3 * np.cos(a), 3 * np.sin(a), 1.0 + (k % 2) * (k < 18)])
         for k, a in enumerate(angles)
     ]
-    found = arrange_cameras([looking(eye, np.zeros(3)) for eye in eyes])
-    assert found.order == (0, 18, *range(1, 18))
-    assert "gaps up to 20 degrees" in found.description
+    order, why = arrange_cameras([looking(eye, np.zeros(3)) for eye in eyes])
+    assert order == [0, 18, *range(1, 18)]
+    assert "gaps up to 20 degrees" in why
 
 
 def test_an_open_ring_starts_after_its_gap():
     degrees = [100.0, 60.0, 20.0, 140.0, 180.0, 220.0, 260.0]  # nothing from 260 to 380
-    assert [degrees[k] for k in arrange_cameras(ring(degrees)).order] == sorted(degrees)
+    assert [degrees[k] for k in arrange_cameras(ring(degrees))[0]] == sorted(degrees)
 
 
 def test_cameras_on_one_side_are_cut_by_planes_in_order():
-    found = arrange_cameras(ring([0.0, 20.0, 40.0, 60.0, 80.0, 100.0]))
-    assert "one side" in found.description
-    assert found.order == (0, 1, 2, 3, 4, 5)
+    order, why = arrange_cameras(ring([0.0, 20.0, 40.0, 60.0, 80.0, 100.0]))
+    assert "one side" in why
+    assert order == [0, 1, 2, 3, 4, 5]
 
 
 def test_parallel_and_outward_looking_cameras_are_cut_by_planes():
     places = [np.array([x, 0.0, 0.0]) for x in (0.0, 3.0, 1.0, 2.0)]
     row = [looking(place, place + np.array([0.0, 5.0, 0.0])) for place in places]
-    assert "one direction" in arrange_cameras(row).description
-    assert arrange_cameras(row).order == (0, 2, 3, 1)
+    order, why = arrange_cameras(row)
+    assert "one direction" in why
+    assert order == [0, 2, 3, 1]
     for side in (1, -1):  # the first camera is at the mean, so the second one fixes the sign
         places = [np.array([side * x, 0.0, 0.0]) for x in (0.0, 1.0, -1.0, 2.0, -2.0)]
         row = [looking(place, place + np.array([0.0, 5.0, 0.0])) for place in places]
-        assert arrange_cameras(row).order == (3, 1, 0, 2, 4)
+        assert arrange_cameras(row)[0] == [3, 1, 0, 2, 4]
     outward = [
         looking(camera.center, 2 * camera.center - [0, 0, 1.5])
         for camera in ring([0.0, 90.0, 180.0, 270.0, 45.0])
     ]
-    assert "do not look at one place" in arrange_cameras(outward).description
+    assert "do not look at one place" in arrange_cameras(outward)[1]
 
 
 def test_nine_of_ten_cameras_must_look_towards_the_centre():
@@ -101,7 +100,7 @@ def test_nine_of_ten_cameras_must_look_towards_the_centre():
         around = ring([36.0 * k for k in range(10)])
         for k in range(away):
             around[k] = looking(around[k].center, 2 * around[k].center)
-        assert ("surround" in arrange_cameras(around).description) == surrounds
+        assert ("surround" in arrange_cameras(around)[1]) == surrounds
 
 
 def test_a_first_camera_straight_above_the_centre_is_accepted():
@@ -110,9 +109,9 @@ def test_a_first_camera_straight_above_the_centre_is_accepted():
     level = [looking(place, np.zeros(3)) for place in around]
     above = np.array([[[1.0, 0, 0], [0, -1, 0], [0, 0, -1]], [[-1.0, 0, 0], [0, 1, 0], [0, 0, -1]]])
     top = [Camera(40, 30, 50.0, 50.0, 20.0, 15.0, turn, -turn @ [0, 0, 3.0]) for turn in above]
-    found = arrange_cameras([*top, *level])
-    assert "none in 360 degrees around its centre" in found.description
-    assert sorted(found.order) == list(range(6))
+    order, why = arrange_cameras([*top, *level])
+    assert "none in 360 degrees around its centre" in why
+    assert sorted(order) == list(range(6))
 
 
 def test_rounding_errors_do_not_change_the_order_of_a_ring():
@@ -122,7 +121,7 @@ def test_rounding_errors_do_not_change_the_order_of_a_ring():
         Camera(40, 30, 50, 50, 20, 15, c.rotation, c.translation + d)
         for c, d in zip(cameras, noise, strict=True)
     ]
-    assert arrange_cameras(cameras).order == arrange_cameras(shaken).order == tuple(range(48))
+    assert arrange_cameras(cameras)[0] == arrange_cameras(shaken)[0] == list(range(48))
 
 
 @given(st.integers(3, 60), st.integers(2, 9))

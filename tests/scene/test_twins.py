@@ -26,7 +26,7 @@ from tests.train.conftest import orbit_camera
         (["a.jpg", "a.png", "b.jpg"], (), {"a.png": "a.jpg"}),
         # the format that more photographs have
         (["a.jpg", "a.png", "b.png"], (), {"a.jpg": "a.png"}),
-        (["a.JPEG", "a.png", "b.png", "c.JPG", "c.tif"], (), {"a.png": "a.JPEG", "c.tif": "c.JPG"}),
+        (["a.JPEG", "a.png", "b.png", "c.JPG", "c.tif"], (), {"a.JPEG": "a.png", "c.tif": "c.JPG"}),
         (["a.jpg", "a.png", "b.jpg"], {"a.png"}, {"a.jpg": "a.png"}),
         (["1/a.jpg", "2/a.png"], (), {}),
         (["a.jpg", "a.v2.jpg"], (), {}),

@@ -10,7 +10,6 @@ import psutil
 import pytest
 from numpy.testing import assert_array_equal
 
-from gsbench.errors import InputError
 from gsbench.system import isolate
 from gsbench.system.isolate import CrashError, run_isolated
 from tests.helpers import refusal
@@ -42,6 +41,14 @@ def refuse():
 
 def odd():
     raise Unpicklable("x", 1)
+
+def work(job, progress):
+    print("printed")
+    progress("a", job, 5)
+    if job == 3:
+        raise ValueError("three")
+    progress("b", 1, None, "note")
+    return job + 1
 
 def abort():
     sys.stderr.write("noise\\nterminate called: what():  the model is broken\\n")
@@ -150,61 +157,19 @@ def test_the_end_of_a_process_is_described(code, said):
     assert isolate.describe_exit(code) == said
 
 
-def test_progress_comes_from_a_file_line_by_line(tmp_path):
-    channel, told = isolate.ProgressFile(tmp_path / "progress"), []
-    channel("a", 1, None)
-    channel("b", 2, 3, "note")
-    waits = iter([False, False, True])
+def test_progress_and_output_of_a_function_are_forwarded_to_the_end(functions, tmp_path):
+    told, log = [], tmp_path / "log"
 
-    class Ended:
-        def wait(self, seconds):
-            assert seconds == 0.25
-            if len(told) == 2:
-                with channel.path.open("a") as file:  # the rest of the line comes later
-                    file.write("c\t4")
-                told.append("half")
-            elif "half" in told:
-                with channel.path.open("a") as file:
-                    file.write("5\t\tend\n")
-            return next(waits)
-
-    def progress(*given):
-        told.append(given)
+    def report(*given, **named):
+        told.append((*given, *named.values()))
         raise BrokenPipeError  # a closed terminal stops nothing
 
-    isolate._listen(channel.path, progress, Ended())
-    assert told == [("a", 1, None, ""), ("b", 2, 3, "note"), "half", ("c", 45, None, "end")]
-
-
-def test_the_progress_of_a_function_is_forwarded_to_the_end(monkeypatch):
-    told = []
-
-    def run_isolated(function, *arguments, what, log):
-        assert (what, log) == ("work", None)
-        return function(*arguments)
-
-    def work(job, progress):
-        progress("a", job, 5)
-        if job == 3:
-            raise ValueError("three")
-        return job + 1
-
-    monkeypatch.setattr(isolate, "POLL_SECONDS", 0.01)
-    monkeypatch.setattr(isolate, "run_isolated", run_isolated)
-    report = lambda *given: told.append(given)  # noqa: E731
-    assert isolate.run_with_progress(work, 2, report, "work") == 3
+    assert isolate.run_with_progress(functions.work, 2, report, "work", log) == 3
+    assert told == [("a", 2, 5, ""), ("b", 1, None, "note")]
+    assert log.read_text() == "printed\n"
     with pytest.raises(ValueError, match="three"):
-        isolate.run_with_progress(work, 3, report, "work")
-    assert told == [("a", 2, 5, ""), ("a", 3, 5, "")]
-
-
-def test_a_fresh_interpreter_gets_this_search_path(monkeypatch):
-    monkeypatch.setattr(sys, "path", ["a"])
-    monkeypatch.setattr(isolate, "allowed_modules", lambda: {"mine": "/there"})
-    command = isolate.python_command("m.n", "f", "1", "2")
-    assert command[:3] == [sys.executable, "-P", "-c"]
-    assert command[3].endswith("from m.n import f; f()")
-    assert command[4:] == ['[["a"], {"mine": "/there"}]', "1", "2"]
+        isolate.run_with_progress(functions.work, 3, report, "work")
+    assert told[2:] == [("a", 3, 5, "")]
 
 
 def test_descendants_that_cannot_be_killed_are_given_up(monkeypatch):
@@ -217,12 +182,3 @@ def test_descendants_that_cannot_be_killed_are_given_up(monkeypatch):
     monkeypatch.setattr(psutil, "Process", lambda: here)
     isolate.end_descendants()
     assert asked == [1]
-
-
-def test_an_error_that_cannot_be_pickled_keeps_its_text():
-    class LocalError(Exception):
-        pass
-
-    assert isinstance(isolate._portable(InputError("a")), InputError)
-    portable = isolate._portable(LocalError("b"))
-    assert (type(portable), str(portable)) == (RuntimeError, "LocalError: b")

@@ -46,14 +46,6 @@ def test_systems_without_proc_have_other_sources(tmp_path, monkeypatch):
     assert peak_resident_mb() == 3
 
 
-def test_on_a_gpu_the_peak_is_that_of_torch(monkeypatch):
-    gpu, reset = torch.device("cuda:1"), []
-    monkeypatch.setattr(torch.cuda, "reset_peak_memory_stats", reset.append)
-    monkeypatch.setattr(torch.cuda, "max_memory_allocated", {gpu: 3 * MIB}.get)
-    reset_peak_memory(gpu)
-    assert (reset, peak_memory_mb(gpu)) == ([gpu], 3)
-
-
 def test_the_pipeline_can_be_imported_without_the_resource_module():
     """Windows has no such module; psutil does without it."""
     code = (

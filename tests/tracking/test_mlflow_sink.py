@@ -16,7 +16,7 @@ from gsbench.tracking.mlflow_sink import (
     require_own_artifacts,
 )
 from gsbench.tracking.sinks import Run
-from gsbench.tracking.trial import Picture, Scalar
+from gsbench.tracking.trial import Picture, Scalar, Update
 from tests.helpers import refusal
 
 PICTURE = Picture("view", np.zeros((2, 3, 3), np.uint8), 30, 2.5)
@@ -96,26 +96,25 @@ def sink():
 
 
 def test_long_texts_are_cut_and_times_are_those_of_the_training(sink):
-    sink.tags({"raster": "cpu", "note": "n" * 6000})
-    sink.metrics([Scalar("eval/psnr", 20.5, 30, 2.5)])
-    sink.artifacts({"a.txt": Path("a.txt"), "sub/b.png": Path("b.png")}, [PICTURE])
-    sink.close("FAILED", "x" * 6000)
-    sink.close("KILLED", None)
-    (_, _, tags), (_, _, metrics) = sink._client.calls[:2]
-    lengths = {tag.key: len(tag.value) for tag in tags["tags"]}
-    assert lengths == {"raster": 3, "mlflow.note.content": 5000}
-    (metric,) = metrics["metrics"]
+    update = Update(
+        params={"short": "a", "long": "b" * 600},
+        tags={"raster": "cpu", "note": "n" * 6000},
+        scalars=[Scalar("eval/psnr", 20.5, 30, 2.5)],
+        files={"a.txt": Path("a.txt"), "sub/b.png": Path("b.png")},
+        pictures=[PICTURE],
+        status="FAILED",
+        reason="x" * 6000,
+    )
+    sink.send(update)
+    sink.send(Update(status="KILLED"))
+    (_, _, sent) = sink._client.calls[0]
+    assert [len(param.value) for param in sent["params"]] == [1, 500]
+    lengths = {tag.key: len(tag.value) for tag in sent["tags"]}
+    assert lengths == {"raster": 3, "mlflow.note.content": 5000, "error": 5000}
+    (metric,) = sent["metrics"]
     found = (metric.key, metric.value, metric.step, metric.timestamp)
     assert found == ("eval/psnr", 20.5, 30, 1_002_500)
     assert sink._client.called("log_artifact") == [("r", "a.txt", None), ("r", "b.png", "sub")]
     (image,) = [named for name, _, named in sink._client.calls if name == "log_image"]
     assert image == {"key": "view", "step": 30, "timestamp": 1_002_500, "synchronous": True}
-    assert sink._client.called("set_tag") == [("r", "error", "x" * 5000)]
     assert sink._client.called("set_terminated") == [("r", "FAILED"), ("r", "KILLED")]
-
-
-def test_long_settings_are_shortened(sink):
-    sink._client = client = Client()
-    sink.params({"short": "a", "long": "b" * 600})
-    ((_, _, named),) = client.calls
-    assert [len(param.value) for param in named["params"]] == [1, 500]

@@ -23,23 +23,17 @@ class Tracker:
         self.told.append(("open", run.complete))
         return f"run {run.token}"
 
-    def params(self, values):
-        pass
-
-    def tags(self, values):
-        if "note" in values:
-            self.told.append(("note", values["note"]))
-
-    def metrics(self, scalars):
+    def send(self, update):
         if self.refuses:
             raise self.refuses
-        self.told.append(("log", {one.key.split("/")[1] for one in scalars}, len(scalars)))
-
-    def artifacts(self, files, pictures):
-        self.told.append(("files", list(files)))
-
-    def close(self, status, reason):
-        self.told.append((status, reason))
+        if update.scalars:
+            keys = {one.key.split("/")[1] for one in update.scalars}
+            self.told.append(("log", keys, len(update.scalars)))
+        if "note" in update.tags:
+            self.told.append(("note", update.tags["note"]))
+        if update.status:
+            self.told.append(("files", list(update.files)))
+            self.told.append((update.status, update.reason))
 
 
 @pytest.fixture

@@ -24,7 +24,6 @@ from gsbench.eval.options import EvalConfig
 from gsbench.launch.batch import check_parts, missing_folders, need_no_check, run_batch
 from gsbench.launch.dry_run import describe_plan
 from gsbench.launch.outcomes import Outcome
-from gsbench.logs import set_up_logging
 from gsbench.words import command, counted
 
 log = logging.getLogger(__name__)
@@ -36,11 +35,14 @@ def launch(argv: list[str]) -> int:
     Raises InputError for a wrong configuration, and for a single trial's bad input.
     """
     words, multirun, is_dry_run = parse(argv)
-    sweep = _read(words, multirun)
+    sweep = Sweep.read(words, multirun)
     # Trials run in this block, so only Hydra's errors are about the words.
     with explained(words, HYDRA_ERRORS):
         if is_dry_run:
-            return dry_run(sweep)
+            trials, are_known = trials_of(sweep)
+            if are_known:  # those that a search will choose are only described
+                list_trials(trials)
+            return 0
         if sweep.config.hydra.job.chdir:
             log.info("hydra.job.chdir: paths still start in %s, as the command does", os.getcwd())
         ended = run_by_hydra(sweep, run_batch) or own_path(sweep)
@@ -56,15 +58,9 @@ def compose_trials(
 
     Only the words ``typed`` by the user (default: all ``words``) give permissions.
     """
-    sweep = _read(words, multirun, typed)
+    sweep = Sweep.read(words, multirun, typed)
     with explained(words, HYDRA_ERRORS):
         return trials_of(sweep)[0]
-
-
-def _read(words: Sequence[str], multirun: bool, typed: Sequence[str] | None = None) -> Sweep:
-    sweep = Sweep.read(words, multirun, typed)
-    set_up_logging(sweep.config.hydra.verbose)
-    return sweep
 
 
 def trials_of(sweep: Sweep) -> tuple[list[Trial], bool]:
@@ -79,14 +75,6 @@ def trials_of(sweep: Sweep) -> tuple[list[Trial], bool]:
     if sweep.multirun:
         return planned_trials(sweep, None)
     return [sweep.composer.trial(sweep.words)], True
-
-
-def dry_run(sweep: Sweep) -> int:
-    """List the trials of a command; those that a search will choose are only described."""
-    trials, are_known = trials_of(sweep)
-    if are_known:
-        list_trials(trials)
-    return 0
 
 
 def own_path(sweep: Sweep) -> Ended:

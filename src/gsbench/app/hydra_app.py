@@ -25,8 +25,8 @@ from gsbench.config.compose import Trial, check_permitted, trial_of_job
 from gsbench.config.hydra_setup import installed_nodes
 from gsbench.config.overrides import is_sweep, key_of, task_words
 from gsbench.errors import GsbenchError, InputError
-from gsbench.files import checked_runs_folder
-from gsbench.launch.batch import begin_for_another_launcher
+from gsbench.files import checked_runs_folder, storage_errors
+from gsbench.launch.batch import begin
 from gsbench.launch.jobs import check_job_links
 from gsbench.launch.outcomes import Outcome, outcome_of_error
 from gsbench.logs import set_up_logging
@@ -137,7 +137,8 @@ class HydraApp:
         if self.launcher == OWN:
             outcomes = self.run(trials, asks=asks)
         else:
-            begin_for_another_launcher(trials, asks)
+            with storage_errors(checked_runs_folder(trials[0].values["runs"])):
+                begin(trials, asks)
             outcomes = self._by_launcher(trials, context, config)
         self.ended.add(trials, outcomes)
         return outcomes

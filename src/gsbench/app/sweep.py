@@ -19,6 +19,7 @@ from gsbench.config.hydra_setup import config_loader, hydra_config, hydra_ready
 from gsbench.config.overrides import is_sweep, parse_word, task_words
 from gsbench.errors import InputError
 from gsbench.launch.outcomes import Outcome
+from gsbench.logs import set_up_logging
 from gsbench.pipeline.metric_facts import facts_for
 
 OWN = "gsbench"  # the name of the launcher and of the sweeper in Hydra
@@ -53,6 +54,7 @@ class Sweep:
     def read(cls, words: Sequence[str], multirun: bool, typed: Sequence[str] | None = None) -> Self:
         """Check and compose ``words``; only those ``typed`` (default: all) give permissions.
 
+        Logging is set up as they say.
         Raises InputError with one line for wrong ones.
         """
         check_words(words)
@@ -69,6 +71,7 @@ class Sweep:
             if not multirun:  # a reference to nothing is refused before any work
                 with hydra_config(config):
                     os.path.abspath(config.hydra.run.dir)
+        set_up_logging(config.hydra.verbose)
         return cls(tuple(words), multirun, composer)
 
     @property

@@ -14,8 +14,8 @@ from __future__ import annotations
 
 import itertools
 import logging
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from hydra.core.override_parser.types import Override
@@ -203,18 +203,20 @@ def _plan(
     by_arm = group_by(
         zip(trials, jobs, intervals, strict=True), lambda job: job[0].folder.parent.name
     )
-    return [
-        _arm_search(replace(asked, arm=arm, points=[]), tune.at_once, of_arm)
-        for arm, of_arm in by_arm.items()
-    ]
+    return [_arm_search(asked, tune.at_once, of_arm) for of_arm in by_arm.values()]
 
 
 def _arm_search(
-    record: TuningRecord,
+    record: Callable[..., TuningRecord],
     at_once: int,
     jobs: Sequence[tuple[Trial, Sequence[str], Mapping[str, Override]]],
 ) -> ArmSearch:
-    """The search of an arm with these ``jobs``: each a trial, its words, and its intervals."""
+    """The search of an arm with these ``jobs``: each a trial, its words, and its intervals.
+
+    ``record`` makes its record from what is its own.
+    """
+    first = jobs[0][0]
+    home, arm = first.files.home, first.folder.parent.name
     found: dict[str, Override] = {}
     for _, _, of_job in jobs:
         found |= of_job
@@ -223,16 +225,14 @@ def _arm_search(
     fixed = set(map(key_of, itertools.chain(*kept)))
     if both := next((key for key in intervals if bare_key(key) in fixed), None):
         raise InputError(
-            f"{both} of {record.arm} is searched in one grid and given in another: leave one of "
-            "them out"
+            f"{both} of {arm} is searched in one grid and given in another: leave one of them out"
         )
     ranges = {key: distribution(interval) for key, interval in intervals.items()}
-    first, home = jobs[0][0], jobs[0][0].files.home
     texts = {key: str(one.input_line).partition("=")[2] for key, one in intervals.items()}
     log_scaled = [key for key, values in ranges.items() if getattr(values, "log", False)]
     return ArmSearch(
-        replace(record, ranges=texts, log=log_scaled),
-        home.with_name(f"{home.name}-tune-{record.arm}"),
+        record(arm=arm, ranges=texts, log=log_scaled, points=[]),
+        home.with_name(f"{home.name}-tune-{arm}"),
         at_once,
         ranges,
         list(dict.fromkeys(kept)),
@@ -240,8 +240,8 @@ def _arm_search(
     )
 
 
-def _asked(tune: TuneSettings, trials: Sequence[Trial]) -> TuningRecord:
-    """The record of the searches, without arms.
+def _asked(tune: TuneSettings, trials: Sequence[Trial]) -> Callable[..., TuningRecord]:
+    """The record of the searches, without arms and their ranges.
 
     Raises InputError for an unknown metric, and for one without a better direction.
     """
@@ -269,15 +269,12 @@ def _asked(tune: TuneSettings, trials: Sequence[Trial]) -> TuningRecord:
             f"{TUNE}.seed: {listed(list(map(str, both)))} is a seed of the sweep, too: tune with "
             "others"
         )
-    return TuningRecord(
+    return partial(
+        TuningRecord,
         sweep=trials[0].files.home.name,
-        arm="",
         metric=metric,
         direction=direction,
         wanted=tune.points,
         seeds=seeds,
         scenes=list(dict.fromkeys(trial.values["scene"]["name"] for trial in trials)),
-        ranges={},
-        log=[],
-        points=[],
     )

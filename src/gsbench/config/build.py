@@ -37,7 +37,7 @@ REQUIRED_METHODS = {  # of a user's class, by the group or the setting that name
     "train.terms": ("__call__",),
     "train.schedule": ("__call__",),
     "train.optimizer": ("init", "step"),
-    "tracking": ("open", "params", "tags", "metrics", "artifacts", "close"),
+    "tracking": ("open", "send"),
 }
 
 

@@ -17,8 +17,6 @@ from gsbench.runs.config_hash import READING, WITHOUT_EFFECT, is_hashed, purpose
 from gsbench.runs.user_code import PERMISSIONS
 from gsbench.words import did_you_mean
 
-# not in the configuration's hash, but in the path of the trial's folder
-IN_TRIAL_PATH = ("name", "seed")
 OPTIONS = (
     "-m",
     "--multirun",
@@ -59,27 +57,24 @@ def parse(argv: Sequence[str]) -> tuple[list[str], bool, bool]:
     multirun = dry_run = False
     words = iter(argv)
     for word in words:
+        option, _, value = word.partition("=")
         if word in ("-m", "--multirun"):
             multirun = True
         elif word == "--dry-run":
             dry_run = True
-        elif word.split("=")[0] in ("--config-dir", "-cd"):
-            folders.append(Path(word.partition("=")[2] or next(words, "")))
-        elif word.split("=")[0] in MAIN_CONFIG_OPTIONS:
-            name = word.partition("=")[2] or next(words, "NAME")
-            name = "NAME" if "-cp" in word or "path" in word else name
+        elif option in ("--config-dir", "-cd"):
+            folders.append(Path(value or next(words, "")))
+        elif option in MAIN_CONFIG_OPTIONS:
+            name = value or next(words, "NAME")
+            name = name if option in ("--config-name", "-cn") else "NAME"
             raise InputError(
                 f"{word}: gsbench's main configuration is its own: write yours to "
                 f"FOLDER/experiment/{name}.yaml, and give --config-dir FOLDER +experiment={name}"
             )
         elif word.startswith("-"):
-            group = word.lstrip("-").partition("=")[0]
-            is_setting = group.partition(".")[0] in GROUPS
-            near = (
-                f"; a setting has no dashes: {group}=…"
-                if is_setting
-                else did_you_mean(word, OPTIONS)
-            )
+            near, key = did_you_mean(word, OPTIONS), option.lstrip("-")
+            if key.partition(".")[0] in GROUPS:
+                near = f"; a setting has no dashes: {key}=…"
             raise InputError(
                 f"{word} is not an option{near} (there are -m, --dry-run, --config-dir FOLDER, "
                 "--cfg job, --info, --help)"
@@ -238,7 +233,8 @@ def makes_other_trials(key: str) -> bool:
     """Return whether each value of a setting gives a different trial."""
     first, _, last = key.partition(".")
     without_effect = last in WITHOUT_EFFECT or purpose(key) == READING
-    return not without_effect and (is_hashed(first) or first in IN_TRIAL_PATH)
+    # name and seed are not in the hash, but in the path of the trial's folder
+    return not without_effect and (is_hashed(first) or first in ("name", "seed"))
 
 
 def _check_experiment_word(word: str, override: Override, folders: Sequence[Path]) -> None:

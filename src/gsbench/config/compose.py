@@ -30,7 +30,7 @@ from gsbench.config.hydra_setup import (
 )
 from gsbench.config.overrides import bare_key, is_sweep, key_of, parse_word, task_words
 from gsbench.config.permissions import check_texts
-from gsbench.config.schema import ROOT_SETTINGS, Config, check, checked_values, plain
+from gsbench.config.schema import ROOT_SETTINGS, Config, check, plain
 from gsbench.config.search_path import check_search_path, read_by_gsbench, searched_folders
 from gsbench.config.strange_files import check_choice, check_places, permitted_to_files
 from gsbench.config.trust import MADE_NODES, check_composed, check_permissions
@@ -102,8 +102,7 @@ class Composer:
         single = [word for word in words if not is_sweep(word)]
         own = task_words(single)
         self.hydra_words = tuple(word for word in single if word not in own)
-        self._check_texts(single)  # before any of them is resolved
-        self._check_words(self.hydra_words)
+        self._check_words(single)  # before any of them is resolved
         self._chosen: dict[tuple[str, ...], DictConfig] = {}
         self._times: dict[str, Any] = {}  # what ${now:…} stands for, the same in all trials
         # The settings of a group whose choices are listed, here or in a file, are checked with each
@@ -248,16 +247,12 @@ class Composer:
 
     def _check_words(self, words: Sequence[str]) -> None:
         """Refuse words that would resolve what is not allowed, or leave the folder of a group."""
-        self._check_texts(words)
         for word in words:
-            if not _is_value(word):
-                check_choice(word, str(parse_word(word).value()))
-
-    def _check_texts(self, words: Sequence[str]) -> None:
-        for word in words:
+            override = parse_word(word)
             if "${" in word:
-                override = parse_word(word)
                 check_texts({override.key_or_group: override.value()}, self.allowed)
+            if not _is_value(word):
+                check_choice(word, str(override.value()))
 
 
 def _by_autograd(train: Mapping[str, Any]) -> bool:
@@ -348,7 +343,7 @@ def trial_of_job(config: DictConfig, allowed: Sequence[str], overrides: Sequence
     with open_dict(config):
         config[PERMISSIONS] = list(allowed)
     with explained(overrides):
-        return Trial(checked_values(config), tuple(overrides))
+        return Trial(check(plain(config)), tuple(overrides))
 
 
 def with_seed(trial: Trial, seed: int) -> Trial:

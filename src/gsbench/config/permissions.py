@@ -254,14 +254,17 @@ def check_texts(values: Any, allowed: Sequence[str], file: str = "") -> None:
     """
     for place, key, value in entries_of(values):
         where = f"{file}: " * bool(file) + ".".join((*place, key))
-        for text in (key, value):
-            if isinstance(text, str) and "${" in text:
-                check_interpolation(where, key, text, allowed)
+        check_text(where, key, value, allowed)
 
 
-def check_interpolation(where: str, key: str, value: str, allowed: Sequence[str]) -> None:
-    if value in HYDRAS_VALUES:
-        return
+def check_text(where: str, key: str, value: Any, allowed: Sequence[str]) -> None:
+    """Refuse a ``${…}`` in a key or in its value that may not be resolved."""
+    for text in (key, value):
+        if isinstance(text, str) and "${" in text and text not in HYDRAS_VALUES:
+            _check_interpolation(where, key, text, allowed)
+
+
+def _check_interpolation(where: str, key: str, value: str, allowed: Sequence[str]) -> None:
     if key.startswith("_") and key.endswith("_"):  # the checked name would not be the imported one
         raise InputError(
             f"{where}={value}: write the name itself here, since ${{…}} may become another"

@@ -233,7 +233,7 @@ def register_schemas() -> None:
 
 @cache
 def _names_and_defaults(schema: type) -> type:
-    """A dataclass for Hydra with the fields of ``schema``, untyped: `checked_values` checks."""
+    """A dataclass for Hydra with the fields of ``schema``, untyped: `check` checks."""
     fields: list[tuple[str, Any, Any]] = []
     for entry in dataclasses.fields(schema):
         factory: Any = entry.default_factory
@@ -247,17 +247,12 @@ def _names_and_defaults(schema: type) -> type:
     return dataclasses.make_dataclass(schema.__name__, fields)
 
 
-def checked_values(config: DictConfig) -> dict[str, Any]:
-    """Resolve, convert (``1e3``) and check a configuration; returns its values.
-
-    Hydra's node is left out. Classes that a group names check their options
-    themselves, when they are made. Raises InputError naming the key.
-    """
-    return check(plain(config))
-
-
 def check(values: dict[str, Any]) -> dict[str, Any]:
-    """Apply all `RULES` to the values of a configuration, in place; returns them."""
+    """Convert (``1e3``) and check the values of a configuration by all `RULES`; returns them.
+
+    Classes that a group names check their options themselves, when they are made. Raises InputError
+    naming the key.
+    """
     for rule in RULES:
         rule(values)
     return values

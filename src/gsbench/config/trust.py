@@ -7,7 +7,7 @@ made. `docs/security.md` says what this protects from. Loads no Hydra by itself.
 
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
@@ -18,7 +18,7 @@ from gsbench.config.permissions import (
     check_launch,
     check_program,
     check_target,
-    check_texts,
+    check_text,
     is_allowed,
     is_external,
     load_class,
@@ -30,16 +30,17 @@ from gsbench.runs.nested import TARGET, entries_of, targets_in
 from gsbench.runs.user_code import PERMISSIONS
 
 ADDRESS_VARIABLES = ("MLFLOW_TRACKING_URI", "WANDB_BASE_URL")  # by which users name their trackers
-# Where gsbench and Hydra write, by gsbench's own configuration (None: what the installed packages
-# say). Only the command line chooses another place: Hydra would overwrite a ``config.yaml`` there.
-WRITTEN = {
-    "runs": "${oc.env:GSBENCH_RUNS,runs}",
-    "hydra.run.dir": None,
-    "hydra.sweep.dir": None,
-    "hydra.sweep.subdir": None,
-    "hydra.output_subdir": None,
-    "hydra.job.name": None,
-}
+# Where gsbench and Hydra write. Only the command line chooses another place than gsbench's own
+# configuration and the installed packages: Hydra would overwrite a ``config.yaml`` there.
+WRITTEN = (
+    "runs",
+    "hydra.run.dir",
+    "hydra.sweep.dir",
+    "hydra.sweep.subdir",
+    "hydra.output_subdir",
+    "hydra.job.name",
+)
+OWN_RUNS = "${oc.env:GSBENCH_RUNS,runs}"
 
 # ---- Hydra's own settings
 SPECIAL_KEYS = (  # keys by which Hydra instantiates objects, beside _target_
@@ -57,12 +58,12 @@ HYDRAS_CALLBACKS = tuple(
 # Hydra's nodes of which plug-ins and loggers are made. What an installed package writes there is
 # trusted.
 MADE_NODES = ("launcher", "sweeper", "job_logging", "hydra_logging")
-CLASS_KEYS = (TARGET, "class", "()")  # Hydra's and logging's keys of import paths
+CLASS_KEYS = ("class", "()")  # logging's keys of import paths
 # Keys whose texts start nothing: resources, names and directions, and how a log line looks. In a
 # plug-in any other text may be a line for a shell, a module or a server whose answers are
 # unpickled; in a logger, a file to append to.
 FREE_KEYS = SBATCH_RESOURCES | {
-    *("name", "direction", "study_name", "timeout", "pre_dispatch", "backend"),
+    *("name", "direction", "study_name", "timeout", "pre_dispatch", "backend", "metric", "seed"),
     *("level", "format", "datefmt", "style", "handlers", "formatter"),
 }
 # streams; a Ray cluster of this machine
@@ -121,51 +122,25 @@ def check_composed(
     is refused. Raises InputError.
     """
     raw: Any = OmegaConf.to_container(config, resolve=False)
-    if "hydra" in raw:  # Hydra removes its node when it runs a job
-        foreign = {name: _differing(raw["hydra"][name], installed.get(name)) for name in MADE_NODES}
-        raw["hydra"] = raw["hydra"] | foreign
-        _check_hydra(raw["hydra"], allowed)
-    check_texts(raw, allowed)
-    for place, key, _ in entries_of(raw):
+    usual = {
+        (*place, key): value
+        for place, key, value in entries_of({"runs": OWN_RUNS, "hydra": installed})
+    }
+    hydra = raw.get("hydra")  # Hydra removes its node when it runs a job
+    words = [word for own in hydra["overrides"].values() for word in own] if hydra else []
+    typed = {word.partition("=")[0].lstrip("+~") for word in words}
+    for place, key, value in entries_of(raw):
+        if usual.get((*place, key)) == value:
+            continue
+        check_text(".".join((*place, key)), key, value, allowed)
         if key in SPECIAL_KEYS:  # `_partial_` makes a function of anything, to be called later
             raise InputError(
                 f"{'.'.join((*place, key))}: gsbench makes no objects this way: leave it out"
             )
-    for place, target in targets_in(raw):
-        _check_place(place, target, allowed)
-    if "hydra" in raw:
-        _check_written(raw, {"hydra": installed})
-
-
-def _check_written(raw: Mapping[str, Any], installed: Mapping[str, Any]) -> None:
-    """Refuse a place to write that is neither gsbench's own nor typed."""
-    words = [word for own in raw["hydra"]["overrides"].values() for word in own]
-    typed = {word.partition("=")[0].lstrip("+~") for word in words}
-    for key, own in WRITTEN.items():
-        given, usual = (_value_at(key, values) for values in (raw, installed))
-        if key not in typed and given not in (None, own or usual):
-            raise InputError(
-                f"a file sets {key}={given}, a place to write: type it on the command line"
-            )
-
-
-def _value_at(key: str, values: Any) -> Any:
-    """The value of a dotted ``key``; None without it."""
-    for part in key.split("."):
-        values = values.get(part) if isinstance(values, Mapping) else None
-    return values
-
-
-def _differing(given: Any, installed: Any) -> Any:
-    """The part of ``given`` that differs from ``installed``: entries of a mapping, or all."""
-    if not isinstance(given, dict) or not isinstance(installed, dict):
-        return given
-    differing = {
-        key: value
-        for key, value in given.items()
-        if key not in installed or value != installed[key]
-    }
-    return {key: _differing(value, installed.get(key)) for key, value in differing.items()}
+        if key == TARGET:
+            _check_place(place, value, allowed)
+        if hydra:
+            _check_hydra((*place, key), value, typed, allowed)
 
 
 def _check_place(place: tuple[str, ...], target: Any, allowed: Sequence[str]) -> None:
@@ -185,58 +160,52 @@ def _check_place(place: tuple[str, ...], target: Any, allowed: Sequence[str]) ->
         load_class(target, group, allowed)  # refuses names such as gsbench.densify.adc.torch.load
 
 
-def _check_hydra(hydra: Mapping[str, Any], allowed: Sequence[str]) -> None:
-    """Refuse Hydra's own settings that would start code.
+def _check_hydra(
+    path: tuple[str, ...], value: Any, typed: Collection[str], allowed: Sequence[str]
+) -> None:
+    """Refuse a setting that would start code by Hydra, or write elsewhere.
 
-    In ``hydra``, `MADE_NODES` hold only what no installed package wrote.
+    No installed package has written it; ``typed`` are the keys of the words of the command line.
     """
-    # A variable can name a file that Python, a library or a program loads, and no list of harmless
-    # ones is complete.
-    if hydra["job"].get("env_set"):
+    where, node = ".".join(path), path[1] if path[0] == "hydra" and len(path) > 1 else ""
+    key = path[-2] if path[-1].isdigit() else path[-1]
+    if where == "hydra.job.env_set" and value:
+        # A variable can name a file that Python, a library or a program loads, and no list of
+        # harmless ones is complete.
         raise InputError(
             "hydra.job.env_set can change what runs: set variables in the shell, before the command"
         )
-    for place, key, value in entries_of(
-        {name: hydra[name] for name in ("callbacks", *MADE_NODES)}, ("hydra",)
-    ):
-        where = ".".join((*place, key))
-        name = key if len(place) == 1 else place[1]
-        if (*place, key)[1:3] in [("sweeper", part) for part in SWEPT_TEXTS]:
-            # A job is composed after this check, and its words could name packages to import
-            # configurations from.
-            for text in (key, value):
-                if isinstance(text, str) and NOT_SWEPT.match(text):
-                    raise InputError(
-                        f"{'.'.join(place)}: {text} cannot differ from job to job, and no file can "
-                        "allow it: type it on the command line"
-                    )
-        elif isinstance(value, str) and "${" in value:
-            # may become a class
-            raise InputError(f"{where}: write the settings themselves here, without ${{…}}")
-        elif name in MADE_NODES and isinstance(value, str):
-            _check_text(where, name, key if not key.isdigit() else place[-1], value, allowed)
-
-
-def _check_text(where: str, node: str, key: str, text: str, allowed: Sequence[str]) -> None:
-    """Refuse a ``text`` that a plug-in or logger could take for code or a file.
-
-    Call it only for a text that no installed package wrote.
-    """
-    if key in CLASS_KEYS:
-        if not is_allowed(text, allowed):
-            advice = permission_advice([text.split(".")[0]], allowed)
+    if path[:2] == ("hydra", "sweeper") and path[2:3] and path[2] in SWEPT_TEXTS:
+        # A job is composed after this check, and its words could name packages to import
+        # configurations from.
+        for text in (path[-1], value):
+            if isinstance(text, str) and NOT_SWEPT.match(text):
+                raise InputError(
+                    f"{'.'.join(path[:-1])}: {text} cannot differ from job to job, and no file can "
+                    "allow it: type it on the command line"
+                )
+        return
+    is_made = node in MADE_NODES and isinstance(value, str)
+    if (is_made or node == "callbacks") and "${" in (value if isinstance(value, str) else ""):
+        # may become a class
+        raise InputError(f"{where}: write the settings themselves here, without ${{…}}")
+    if is_made and key in CLASS_KEYS:
+        if not is_allowed(value, allowed):
+            advice = permission_advice([value.split(".")[0]], allowed)
             raise InputError(
-                f"{where}={text} is not what a package set; if you trust that code, {advice}"
+                f"{where}={value} is not what a package set; if you trust that code, {advice}"
             )
-        return
-    is_tuning = where.startswith("hydra.sweeper.tune.")
-    if is_allowed(f"hydra.{node}", allowed) or is_tuning or text in FREE_TEXTS:
-        return
-    # In any text, logging imports the name after ext://.
-    if "://" in text or not text.isprintable() or key not in FREE_KEYS:
-        advice = permission_advice([f"hydra.{node}"], allowed)
+    elif is_made and key != TARGET and not is_allowed(f"hydra.{node}", allowed):
+        # In any text, logging imports the name after ext://.
+        is_plain = key in FREE_KEYS and "://" not in value and value.isprintable()
+        if not is_plain and value not in FREE_TEXTS:
+            advice = permission_advice([f"hydra.{node}"], allowed)
+            raise InputError(
+                f"{where}={value!r} could start code or write a file; if you trust it, {advice}"
+            )
+    elif where in WRITTEN and value is not None and where not in typed:
         raise InputError(
-            f"{where}={text!r} could start code or write a file; if you trust it, {advice}"
+            f"a file sets {where}={value}, a place to write: type it on the command line"
         )
 
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gsbench.eval.images import in_double_precision
-from gsbench.eval.metric import MaskedMetric, Metric
+from gsbench.eval.metric import Measure
 
 ROUNDS = 5  # as in Mip-NeRF 360's evaluation; each leaves out the pixels that the last one clipped
 NO_CONTRAST = 1e-10  # smaller singular values, relative to the largest, are rounding errors
@@ -50,19 +50,11 @@ def _unclipped(values: Tensor) -> Tensor:
     return (values > CLIPPED) & (values < 1 - CLIPPED)
 
 
-class Corrected:
-    """The metric ``inner`` after `color_corrected`, or with ``gain`` its increase by that."""
+def after_correction(measure: Measure, gain: bool = False) -> Measure:
+    """``measure`` after `color_corrected`, or with ``gain`` its increase by that."""
 
-    def __init__(self, inner: Metric, gain: bool = False) -> None:
-        self._inner, self._gain = inner, gain
+    def measured(image: Tensor, truth: Tensor, mask: Tensor | None) -> float:
+        value = measure(color_corrected(image, truth, mask).to(image), truth, mask)
+        return value - measure(image, truth, mask) if gain else value
 
-    def measure(self, image: Tensor, truth: Tensor) -> float:
-        value = self._inner.measure(color_corrected(image, truth).to(image), truth)
-        return value - self._inner.measure(image, truth) if self._gain else value
-
-    def measure_masked(self, image: Tensor, truth: Tensor, mask: Tensor) -> float:
-        assert isinstance(self._inner, MaskedMetric)
-        value = self._inner.measure_masked(
-            color_corrected(image, truth, mask).to(image), truth, mask
-        )
-        return value - self._inner.measure_masked(image, truth, mask) if self._gain else value
+    return measured

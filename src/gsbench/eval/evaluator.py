@@ -1,8 +1,9 @@
 """The evaluator: it applies a protocol's metrics and the user's own to pairs of images."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from functools import partial
 from numbers import Real
 from pathlib import Path
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsbench.errors import InputError, TrainingError
-from gsbench.eval.color_correction import Corrected
+from gsbench.eval.color_correction import after_correction
 from gsbench.eval.facts import (
     CORRECTED,
     LPIPS,
@@ -27,8 +28,8 @@ from gsbench.eval.facts import (
 )
 from gsbench.eval.flip import flip, flip_map
 from gsbench.eval.images import as_batch, as_unit_range, in_double_precision, replace_ignored
-from gsbench.eval.lpips import Lpips, load_lpips
-from gsbench.eval.metric import MaskedMetric, Metric, UnavailableError
+from gsbench.eval.lpips import BACKBONES, Lpips, load_lpips
+from gsbench.eval.metric import MaskedMetric, Measure, Metric, UnavailableError
 from gsbench.eval.metrics import psnr
 from gsbench.eval.protocol import Protocol
 from gsbench.eval.regions import LEAST_SHARE, Regions
@@ -39,98 +40,69 @@ from gsbench.weights import MissingWeightsError
 from gsbench.words import raised
 
 
-@dataclass(frozen=True)
-class MetricContext:
-    """Conditions that gsbench's metrics share; ``weights`` is the folder that is searched first."""
-
-    protocol: Protocol
-    device: torch.device
-    weights: Path | None = None
-    download: bool = True
-    # LPIPS networks, each loaded once, or the error for missing weights
-    networks: dict[str, Lpips | MissingWeightsError] = field(default_factory=dict, repr=False)
-
-    def network(self, net: str) -> Lpips:
-        """The LPIPS network ``net``; raises UnavailableError if its weights are missing."""
-        if net not in self.networks:
-            try:
-                self.networks[net] = load_lpips(net, self.weights, self.download, self.device)
-            except MissingWeightsError as error:
-                self.networks[net] = error
-        network = self.networks[net]
-        if isinstance(network, MissingWeightsError):
-            raise UnavailableError(str(network), awaited=True)
-        return network
-
-
-class Psnr:
+def measure_psnr(protocol: Protocol) -> Measure:
     """Peak signal-to-noise ratio in dB, at most the protocol's cap.
 
     The cap also replaces the infinite PSNR of identical images.
     """
 
-    def __init__(self, context: MetricContext) -> None:
-        self._cap = context.protocol.psnr_cap
+    def measure(image: Tensor, truth: Tensor, mask: Tensor | None) -> float:
+        if mask is not None:
+            image, truth = image[mask][None], truth[mask][None]
+        value = float(psnr(in_double_precision(image), in_double_precision(truth)))
+        return min(value, protocol.psnr_cap)
 
-    def measure(self, image: Tensor, truth: Tensor) -> float:
-        return min(float(psnr(in_double_precision(image), in_double_precision(truth))), self._cap)
-
-    def measure_masked(self, image: Tensor, truth: Tensor, mask: Tensor) -> float:
-        return self.measure(image[mask][None], truth[mask][None])
+    return measure
 
 
-class Ssim:
+def _ssim(evaluator: Evaluator) -> Measure:
     """Structural similarity with the protocol's padding."""
-
-    def __init__(self, context: MetricContext) -> None:
-        self._padding = context.protocol.ssim_padding
-
-    def measure(self, image: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
-        return float(
-            ssim(in_double_precision(image), in_double_precision(truth), self._padding, mask)
-        )
-
-    measure_masked = measure
+    padding = evaluator.protocol.ssim_padding
+    return lambda image, truth, mask: float(
+        ssim(in_double_precision(image), in_double_precision(truth), padding, mask)
+    )
 
 
-class LpipsMetric:
+def _lpips(evaluator: Evaluator, net: str, raw: bool = False) -> Measure:
     """LPIPS by one network, fed [-1, 1] as it is defined, or [0, 1] if ``raw``."""
+    network = evaluator.network(net)
 
-    def __init__(self, context: MetricContext, net: str, raw: bool = False) -> None:
-        self._network, self._raw = context.network(net), raw
-
-    def measure(self, image: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
-        _require_size(image, self._network.backbone.min_size)
+    def measure(image: Tensor, truth: Tensor, mask: Tensor | None) -> float:
+        _require_size(image, network.backbone.min_size)
         first, second = as_batch(image), as_batch(truth)  # [1, 3, H, W] each
-        if not self._raw:
+        if not raw:
             first, second = 2 * first - 1, 2 * second - 1
-        return float(self._network(first, second, mask))
+        return float(network(first, second, mask))
 
-    measure_masked = measure
+    return measure
 
 
-class Flip:
+def _flip(evaluator: Evaluator) -> Measure:
     """FLIP for the protocol's viewer."""
+    ppd = evaluator.protocol.flip_ppd
 
-    def __init__(self, context: MetricContext) -> None:
-        self._ppd = context.protocol.flip_ppd
+    def measure(image: Tensor, truth: Tensor, mask: Tensor | None) -> float:
+        if mask is None:
+            return float(flip(image, truth, ppd))
+        return float(in_double_precision(flip_map(image, truth, ppd))[mask].mean())
 
-    def measure(self, image: Tensor, truth: Tensor) -> float:
-        return float(flip(image, truth, self._ppd))
-
-    def measure_masked(self, image: Tensor, truth: Tensor, mask: Tensor) -> float:
-        return float(in_double_precision(flip_map(image, truth, self._ppd))[mask].mean())
+    return measure
 
 
-class StructuralMetric:
+def _structural(evaluator: Evaluator, key: str) -> Measure:
     """A structural metric by its authors' definition, which is the same in all protocols."""
+    function, min_side = load_structural(key), STRUCTURAL[key].min_side  # px
 
-    def __init__(self, context: MetricContext, key: str) -> None:
-        self._measure, self._min_side = load_structural(key), STRUCTURAL[key].min_side  # px
+    def measure(image: Tensor, truth: Tensor, mask: Tensor | None) -> float:
+        _require_size(image, min_side)
+        return function(in_double_precision(image), in_double_precision(truth))
 
-    def measure(self, image: Tensor, truth: Tensor) -> float:
-        _require_size(image, self._min_side)
-        return self._measure(in_double_precision(image), in_double_precision(truth))
+    return measure
+
+
+def _corrected(evaluator: Evaluator, key: str, gain: bool = False) -> Measure:
+    """The metric ``key`` after a correction of the colours, or what that adds."""
+    return after_correction(MEASURES[key](evaluator), gain)
 
 
 def _require_size(image: Tensor, min_side: int) -> None:
@@ -140,29 +112,34 @@ def _require_size(image: Tensor, min_side: int) -> None:
         raise UnavailableError(f"a view is {width}x{height} px, below {min_side} px a side")
 
 
-def _corrected(key: str) -> Callable[[MetricContext], Metric]:
-    """The metric ``key`` after a correction of the colours."""
-    return lambda context: Corrected(MEASURES[key](context))
-
-
-# Makes each metric of `gsbench.eval.facts.METRICS` for a context, or raises UnavailableError if
-# weights are missing.
-MEASURES: dict[str, Callable[[MetricContext], Metric]] = {
-    "psnr": Psnr,
-    "ssim": Ssim,
-    "lpips_vgg_raw": partial(LpipsMetric, net="vgg", raw=True),
-    "lpips_vgg": partial(LpipsMetric, net="vgg"),
-    "lpips_alex": partial(LpipsMetric, net="alex"),
-    "lpips_squeeze": partial(LpipsMetric, net="squeeze"),
-    "flip": Flip,
+# Makes each metric of `gsbench.eval.facts.METRICS`, or raises UnavailableError if weights are
+# missing.
+MEASURES: dict[str, Callable[[Evaluator], Measure]] = {
+    "psnr": lambda evaluator: measure_psnr(evaluator.protocol),
+    "ssim": _ssim,
+    "lpips_vgg_raw": partial(_lpips, net="vgg", raw=True),
+    "flip": _flip,
+    **{f"{LPIPS}{net}": partial(_lpips, net=net) for net in BACKBONES},
 }
-MEASURES |= {key: partial(StructuralMetric, key=key) for key in STRUCTURAL}
+MEASURES |= {key: partial(_structural, key=key) for key in STRUCTURAL}
 MEASURES |= {
-    f"{key}{CORRECTED}": _corrected(key)
+    f"{key}{CORRECTED}": partial(_corrected, key=key)
     for key in list(MEASURES)
     if f"{key}{CORRECTED}" in further_keys()
 }
-MEASURES["cc_gain"] = lambda context: Corrected(Psnr(context), gain=True)
+MEASURES["cc_gain"] = partial(_corrected, key="psnr", gain=True)
+
+
+def _own(metric: Metric) -> Measure:
+    """A user's metric, which may not know masks."""
+    if isinstance(metric, MaskedMetric):
+        masked: MaskedMetric = metric
+        return lambda image, truth, mask: (
+            masked.measure(image, truth)
+            if mask is None
+            else masked.measure_masked(image, truth, mask)
+        )
+    return lambda image, truth, mask: metric.measure(image, truth)
 
 
 class Evaluator:
@@ -196,18 +173,21 @@ class Evaluator:
         ):
             if unknown := [key for key in given if key not in known]:
                 raise InputError(f"unknown {what} {unknown[0]!r}; choose among {', '.join(known)}")
-        self.protocol = protocol
+        self.protocol: Protocol = protocol
+        self.extra, self.more = dict(extra), tuple(sorted(more))
         self.device = torch.device(device)
         self.unavailable: dict[str, str] = {}
         self.awaited: set[str] = set()
-        self.extra = dict(extra)
-        self.more = tuple(sorted(more))
         self.own = {name: facts_of(name, metric) for name, metric in extra.items()}
         wanted = {f"{LPIPS}{variant}" for variant in (variants if lpips is None else lpips)}
         wanted |= {facts.key for facts in METRICS if not facts.setting}
         wanted |= {*more, *(["flip"] if flip else [])}
-        context = MetricContext(protocol, self.device, weights, download)
-        self._metrics: dict[str, Metric] = {}
+        self._load_lpips = partial(
+            load_lpips, folder=weights, download=download, device=self.device
+        )
+        # each loaded once, or the error for missing weights
+        self._networks: dict[str, Lpips | MissingWeightsError] = {}
+        self._metrics: dict[str, Measure] = {}
         for facts in METRICS:
             if facts.setting == MORE and facts.key not in wanted:
                 # not listed as unavailable: that list is in the keys of results, which a new metric
@@ -216,10 +196,28 @@ class Evaluator:
             try:
                 if facts.key not in wanted:
                     raise UnavailableError(f"not asked for ({facts.setting})")
-                self._metrics[facts.key] = MEASURES[facts.key](context)
+                self._metrics[facts.key] = MEASURES[facts.key](self)
             except UnavailableError as error:
                 self._leave_out(facts.key, error)
-        self._metrics |= extra
+        self._metrics |= {name: _own(metric) for name, metric in extra.items()}
+        self._in_regions = [
+            key
+            for key in self._metrics
+            if (isinstance(extra[key], MaskedMetric) if key in extra else key not in STRUCTURAL)
+            and not key.startswith(LPIPS)
+        ]
+
+    def network(self, net: str) -> Lpips:
+        """The LPIPS network ``net``; raises UnavailableError if its weights are missing."""
+        if net not in self._networks:
+            try:
+                self._networks[net] = self._load_lpips(net)
+            except MissingWeightsError as error:
+                self._networks[net] = error
+        network = self._networks[net]
+        if isinstance(network, MissingWeightsError):
+            raise UnavailableError(str(network), awaited=True)
+        return network
 
     def evaluate_view(
         self,
@@ -244,23 +242,17 @@ class Evaluator:
         image, target = self._prepare(render), self._prepare(ground_truth)  # [H, W, 3]
         counted = None if mask is None else torch.as_tensor(mask, device=self.device)  # [H, W]
         image = replace_ignored(image, target, None if counted is None else counted[..., None])
-        values = {}
-        measures: list[tuple[str, Metric, Tensor | None]]
-        measures = [(key, metric, counted) for key, metric in self._metrics.items()]
+        values, places = {}, [(key, counted) for key in self._metrics]
         for name, pixels in regions.items():
             inside = torch.as_tensor(pixels, device=self.device)  # [H, W]
             inside = inside if counted is None else inside & counted
             if float(inside.float().mean()) >= LEAST_SHARE:
-                measures += [
-                    (f"{key}{AT}{name}", metric, inside)
-                    for key, metric in self._metrics.items()
-                    if isinstance(metric, MaskedMetric) and not key.startswith(LPIPS)
-                ]
-        for key, metric, within in measures:
+                places += [(f"{key}{AT}{name}", inside) for key in self._in_regions]
+        for key, within in places:
             if is_left_out(key, self.unavailable):
                 continue
             try:
-                value = self._measure(key.partition(AT)[0], metric, image, target, within)
+                value = self._measure(key.partition(AT)[0], image, target, within)
                 if not math.isfinite(value):
                     raise UnavailableError(f"the value of a view is {value}")
                 values[key] = value
@@ -268,15 +260,10 @@ class Evaluator:
                 self._leave_out(key, error)
         return values
 
-    def _measure(
-        self, key: str, metric: Metric, image: Tensor, target: Tensor, mask: Tensor | None
-    ) -> float:
+    def _measure(self, key: str, image: Tensor, target: Tensor, mask: Tensor | None) -> float:
+        value: Any
         try:
-            value: Any
-            if mask is not None and isinstance(metric, MaskedMetric):
-                value = metric.measure_masked(image, target, mask)
-            else:
-                value = metric.measure(image, target)
+            value = self._metrics[key](image, target, mask)
         except UnavailableError:
             raise
         except SystemExit as error:  # would end gsbench without a message
@@ -289,16 +276,13 @@ class Evaluator:
             raise InputError(f"eval.extra.{key} raised {raised(error)}: correct it") from error
         if isinstance(value, Tensor | np.ndarray | np.generic) and math.prod(value.shape) == 1:
             value = value.item()
+        must = f"eval.extra.{key} must return a number for each view, got"
         if isinstance(value, bool) or not isinstance(value, Real):
-            raise InputError(
-                f"eval.extra.{key} must return a number for each view, got {value!r:.80}"
-            )
+            raise InputError(f"{must} {value!r:.80}")
         try:
             return float(value)
         except OverflowError:
-            raise InputError(
-                f"eval.extra.{key} must return a number for each view, got one that is too large"
-            ) from None
+            raise InputError(f"{must} one that is too large") from None
 
     def _leave_out(self, key: str, error: UnavailableError) -> None:
         self.unavailable[key] = " ".join(str(error).split())

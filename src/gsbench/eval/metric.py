@@ -3,9 +3,13 @@
 docs/metric.md has an example.
 """
 
+from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
 from torch import Tensor
+
+# A metric of gsbench, of images as in `Metric` and a mask [H, W] of the pixels that count, or None.
+Measure = Callable[[Tensor, Tensor, Tensor | None], float]
 
 
 class Metric(Protocol):

@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -10,17 +10,18 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from plyfile import PlyData, PlyElement
+from plyfile import PlyData, PlyElement, PlyProperty
 
 from gsbench.errors import InputError
 from gsbench.files import DAMAGE, atomic, require_regular
 from gsbench.gaussians.model import MAX_SH_DEGREE, NUM_SH_REST, Gaussians
 from gsbench.gaussians.ply_files import (
     check_columns,
+    filtered,
+    is_filter,
     read_header,
     read_ply_data,
     report_header,
-    with_filter_applied,
 )
 from gsbench.normalization import IDENTITY, Normalization
 from gsbench.words import counted
@@ -29,20 +30,21 @@ log = logging.getLogger(__name__)
 
 # f_rest is stored channel by channel: 15 of red, 15 of green, 15 of blue
 NUM_REST = 3 * NUM_SH_REST
+REST = "f_rest_"
 POSITION = ["x", "y", "z"]
-COLUMNS = (
-    [*POSITION, "nx", "ny", "nz"]
-    + [f"f_dc_{i}" for i in range(3)]
-    + [f"f_rest_{i}" for i in range(NUM_REST)]
-    + ["opacity"]
-    + [f"scale_{i}" for i in range(3)]
-    + [f"rot_{i}" for i in range(4)]
-)
+DC, SCALES = ([f"{kind}_{i}" for i in range(3)] for kind in ("f_dc", "scale"))
+ROTATIONS = [f"rot_{i}" for i in range(4)]
+REQUIRED = [*POSITION, *DC, "opacity", *SCALES, *ROTATIONS]
+COLUMNS = [
+    *[*POSITION, "nx", "ny", "nz", *DC, *[f"{REST}{i}" for i in range(NUM_REST)]],
+    *["opacity", *SCALES, *ROTATIONS],
+]
+Column = NDArray[Any]  # [N]
+Columns = dict[str, Column]
 
 # Marks files of gsbench, whose values need no doubt.
 OWN_COMMENT = "written by gsbench"
 
-REST = "f_rest_"
 REST_COUNTS = tuple(3 * ((degree + 1) ** 2 - 1) for degree in range(MAX_SH_DEGREE + 1))
 # Replaces an infinite logit; negated for an opacity of 0. Its opacity, 1 - 2^-23, is as close to 1
 # as float32 allows with a gradient.
@@ -50,10 +52,6 @@ MAX_LOGIT = 23 * math.log(2)
 # typical scale of a Gaussian over the size of its model; medians of trained models: 0.009 to 0.035
 TYPICAL_SCALE = 0.02
 MIN_TEXT_BYTES = 2  # minimum bytes of a value in an ASCII file: a digit and a space
-# bytes of PLY's types; all other types have 1
-SIZES = dict.fromkeys(["short", "ushort", "int16", "uint16"], 2)
-SIZES |= dict.fromkeys(["int", "uint", "int32", "uint32", "float", "float32"], 4)
-SIZES |= dict.fromkeys(("double", "float64"), 8)
 
 
 def write_ply(gaussians: Gaussians, path: Path, normalization: Normalization = IDENTITY) -> None:
@@ -121,45 +119,44 @@ def _check_length(path: Path) -> None:
             if count < 0:
                 raise ValueError("the count of an element is negative")
         elif words[:1] == ["property"]:
-            announced += count * (MIN_TEXT_BYTES if is_text else SIZES.get(words[1], 1))
+            announced += count * (MIN_TEXT_BYTES if is_text else _bytes_of(words[1]))
     if announced > path.stat().st_size:
         raise ValueError(f"it is cut short: its header promises {announced} bytes or more")
 
 
-def _with_finite_opacities(vertices: NDArray[Any], path: Path) -> NDArray[Any]:
+def _bytes_of(kind: str) -> int:
+    """The bytes of a value of a PLY's type; of a list, those of its length at least."""
+    return 1 if kind == "list" else np.dtype(PlyProperty("", kind).dtype()).itemsize
+
+
+def _finite_logits(logits: Column, path: Path) -> Column:
     """Replace infinite logits by plus or minus `MAX_LOGIT`, with a warning.
 
     Other programs write them for opacities of exactly 0 and 1.
     """
-    logits = vertices["opacity"]
     infinite = np.isinf(logits) if logits.dtype.kind == "f" else np.zeros(len(logits), bool)
     if not infinite.any():
-        return vertices
-    log.warning("%s: %s an opacity of exactly 0 or 1", path, _have(int(infinite.sum())))
-    changed = vertices.copy()
-    changed["opacity"] = np.where(infinite, np.sign(logits) * MAX_LOGIT, logits)
-    return changed
+        return logits
+    count = int(infinite.sum())
+    have = "has" if count == 1 else "have"
+    log.warning("%s: %s %s an opacity of exactly 0 or 1", path, counted(count, "Gaussian"), have)
+    return np.where(infinite, np.sign(logits) * MAX_LOGIT, logits)
 
 
-def _have(count: int) -> str:
-    return f"{counted(count, 'Gaussian')} {'has' if count == 1 else 'have'}"
+def _check_finite(column: Column, name: str, path: Path) -> None:
+    where = ""
+    if column.dtype.kind in "fiu":
+        with np.errstate(over="ignore"):  # a float64 value may be beyond the range of float32
+            (bad,) = np.nonzero(~np.isfinite(column.astype(np.float32)))
+        if not len(bad):
+            return
+        where = f": it is {column[bad[0]]} in row {bad[0]} and in {len(bad) - 1} more"
+    raise InputError(
+        f"{path}: {name} is not a finite number everywhere{where}: export the model again"
+    )
 
 
-def _check_finite(column: NDArray[Any], name: str, path: Path) -> None:
-    if column.dtype.kind not in "fiu":
-        raise InputError(
-            f"{path}: {name} is not a finite number everywhere: export the model again"
-        )
-    with np.errstate(over="ignore"):  # a float64 value may be beyond the range of float32
-        (bad,) = np.nonzero(~np.isfinite(column.astype(np.float32)))
-    if len(bad):
-        raise InputError(
-            f"{path}: {name} is not a finite number everywhere: it is {column[bad[0]]} in row "
-            f"{bad[0]} and in {len(bad) - 1} more: export the model again"
-        )
-
-
-def _warn_of_activated(vertices: NDArray[Any], path: Path) -> None:
+def _warn_of_activated(vertices: Columns, path: Path) -> None:
     """Log a warning if values look as if 3DGS's activations, exp and sigmoid, were applied."""
     if _look_like_lengths(vertices):
         log.warning(
@@ -179,15 +176,17 @@ def _warn_of_activated(vertices: NDArray[Any], path: Path) -> None:
             )
 
 
-def _look_like_lengths(vertices: NDArray[Any]) -> bool:
+def _look_like_lengths(vertices: Columns) -> bool:
     """Return whether the stored scales are more plausible as lengths than as logarithms of lengths.
 
     The sign does not decide: in a scene measured in millimetres, all logarithms can be positive.
     """
-    scales = np.stack([vertices[f"scale_{axis}"] for axis in range(3)]).astype(np.float64)  # [3, N]
+    scales, positions = (
+        np.stack([vertices[name] for name in names]).astype(np.float64)  # [3, N]
+        for names in (SCALES, POSITION)
+    )
     if not (scales > 0).all():
         return False
-    positions = np.stack([vertices[axis] for axis in POSITION]).astype(np.float64)  # [3, N]
     offsets = positions - np.median(positions, axis=1, keepdims=True)
     size = float(np.median(np.linalg.norm(offsets, axis=0)))
     if size == 0:
@@ -209,52 +208,52 @@ def read_ply(
     """
     with _checked(path):
         content = read_ply_data(path)
-        vertices = content["vertex"].data
-    required, rest = _checked_columns(vertices, path)
-    vertices = _with_finite_opacities(vertices, path)
-    for name in (*required, *rest):
-        _check_finite(vertices[name], name, path)
-    if not np.any([vertices[f"rot_{i}"] != 0 for i in range(4)], axis=0).all():
+        table = content["vertex"].data
+    rest = _check_properties(table, path)
+    vertices = {name: table[name] for name in (*REQUIRED, *rest)}
+    vertices["opacity"] = _finite_logits(vertices["opacity"], path)
+    for name, column in vertices.items():
+        _check_finite(column, name, path)
+    if not np.any([vertices[name] != 0 for name in ROTATIONS], axis=0).all():
         raise InputError(
             f"{path}: a Gaussian has a rotation of (0, 0, 0, 0): export the model again"
         )
-
     if OWN_COMMENT not in content.comments:
         _warn_of_activated(vertices, path)
         names = [element.name for element in content]
         report_header([*content.comments, *content.obj_info], names, path)
-    vertices = with_filter_applied(vertices, path, MAX_LOGIT)
+    if sizes := [name for name in table.dtype.names if is_filter(name)]:
+        vertices |= filtered(vertices, SCALES, table[sizes[0]], path, MAX_LOGIT)
 
-    def columns(names: list[str]) -> torch.Tensor:
-        table = np.stack([vertices[name].astype(np.float32) for name in names], axis=1)
-        return torch.from_numpy(table).to(device)
+    def columns(names: Sequence[str]) -> torch.Tensor:
+        stacked = np.stack([vertices[name].astype(np.float32) for name in names], axis=1)
+        return torch.from_numpy(stacked).to(device)
 
     positions = np.stack([vertices[name] for name in POSITION], axis=1)  # [N, 3]
-    n, stored = len(vertices), len(rest) // 3  # coefficients per channel
+    n, stored = len(table), len(rest) // 3  # coefficients per channel
     sh_rest = torch.zeros(n, NUM_SH_REST, 3, device=device)
     if stored:
         sh_rest[:, :stored] = columns(rest).reshape(n, 3, stored).transpose(1, 2)
     return Gaussians(
         means=torch.from_numpy(normalization.apply(positions).astype(np.float32)).to(device),
-        log_scales=columns([f"scale_{i}" for i in range(3)]) + math.log(normalization.scale),
-        quaternions=columns([f"rot_{i}" for i in range(4)]),
+        log_scales=columns(SCALES) + math.log(normalization.scale),
+        quaternions=columns(ROTATIONS),
         opacity_logits=columns(["opacity"]).squeeze(-1),
-        sh_dc=columns([f"f_dc_{i}" for i in range(3)]),
+        sh_dc=columns(DC),
         sh_rest=sh_rest,
     )
 
 
-def _checked_columns(vertices: Any, path: Path) -> tuple[list[str], list[str]]:
-    """The names of the required columns, and of the harmonics above degree 0.
+def _check_properties(vertices: Any, path: Path) -> list[str]:
+    """The names of the harmonics above degree 0.
 
-    Raises InputError unless they are those of a 3DGS PLY.
+    Raises InputError unless the properties are those of a 3DGS PLY.
     """
-    check_columns(vertices.dtype.names or (), COLUMNS, path)
     present = set(vertices.dtype.names or ())
+    check_columns(vertices.dtype.names or (), COLUMNS, path)
     present_rest = {name for name in present if name.startswith(REST)}
     rest = [f"{REST}{i}" for i in range(len(present_rest))]
-    required = [name for name in COLUMNS if not name.startswith((REST, "n"))]
-    missing = [name for name in required if name not in present]
+    missing = [name for name in REQUIRED if name not in present]
     odd = present_rest - set(rest)
     if odd or len(rest) not in REST_COUNTS:
         example = f", with {min(odd)}" if odd else ""
@@ -269,10 +268,10 @@ def _checked_columns(vertices: Any, path: Path) -> tuple[list[str], list[str]]:
         if missing == ["scale_2"]:
             hint = ": it has flat Gaussians (2DGS), and gsbench draws 3D Gaussians alone"
         raise InputError(f"{path}: not a 3DGS PLY; missing or odd properties: {listed}{hint}")
-    for name in (*required, *rest):
+    for name in (*REQUIRED, *rest):
         if name not in POSITION and vertices.dtype[name].kind in "iu":
             raise InputError(
                 f"{path}: {name} has whole numbers, as in a compressed model: export it with "
                 "floating-point numbers"
             )
-    return required, rest
+    return rest

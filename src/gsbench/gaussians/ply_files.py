@@ -6,7 +6,7 @@ import logging
 import re
 import zipfile
 import zlib
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -183,9 +183,7 @@ def check_columns(names: Collection[str], known: Collection[str], path: Path) ->
                 f"{path}: it has the column {name}: {reason}, and gsbench draws Gaussians alone"
             )
     if unknown:
-        noun, verb = ("column", "is") if len(unknown) == 1 else ("columns", "are")
-        listed = ", ".join(unknown)
-        log.warning("%s: the %s %s %s not known and not used", path, noun, listed, verb)
+        log.warning("%s: not known and not used: column %s", path, ", ".join(unknown))
 
 
 def is_filter(name: str) -> bool:
@@ -193,34 +191,29 @@ def is_filter(name: str) -> bool:
     return name.lower() == FILTER.lower()
 
 
-def with_filter_applied(vertices: NDArray[Any], path: Path, largest_logit: float) -> NDArray[Any]:
-    """Apply Mip-Splatting's 3D filter, if there is one: to scales and opacities, with a log line.
+def filtered(
+    vertices: Mapping[str, NDArray[Any]],
+    names: Sequence[str],
+    column: NDArray[Any],
+    path: Path,
+    largest_logit: float,
+) -> dict[str, NDArray[Any]]:
+    """Scales (the columns ``names``) and opacities after Mip-Splatting's 3D filter; logs a line.
 
     As its ``create_fused_ply.py``: each scale s becomes sqrt(s² + f²), and the opacity is
     multiplied by the ratio of the volumes before and after (Yu et al. 2024, equation 7). Logits
     are limited to ``largest_logit``.
     """
-    column = next(filter(is_filter, vertices.dtype.names or ()), None)
-    if column is None:
-        return vertices
-    sizes = vertices[column].astype(np.float64)  # [N]
+    sizes = column.astype(np.float64)  # [N]
     if not (np.isfinite(sizes) & (sizes >= 0)).all():
         raise InputError(f"{path}: {FILTER} is negative or not a finite number: export it again")
     log.warning("%s: Mip-Splatting's %s is applied to scales and opacities", path, FILTER)
-    names = [f"scale_{axis}" for axis in range(3)]
     logs = np.stack([vertices[name] for name in names]).astype(np.float64)  # [3, N]
+    logits = vertices["opacity"].astype(np.float64)
     with np.errstate(divide="ignore"):
         fused = 0.5 * np.logaddexp(2 * logs, 2 * np.log(sizes))  # log sqrt(s² + f²)
-    logits = vertices["opacity"].astype(np.float64)
-    # log of the new opacity, then its logit: log p - log(1 - p)
-    log_opacity = -np.logaddexp(0.0, -logits) + (logs - fused).sum(axis=0)
-    with np.errstate(divide="ignore"):
+        # log of the new opacity, then its logit: log p - log(1 - p)
+        log_opacity = -np.logaddexp(0.0, -logits) + (logs - fused).sum(axis=0)
         new_logits = log_opacity - np.log(-np.expm1(np.minimum(log_opacity, 0.0)))
-    kinds = [(name, vertices.dtype[name]) for name in vertices.dtype.names or ()]
-    changed = vertices.astype(
-        [(name, "f8" if name in (*names, "opacity") else kind) for name, kind in kinds]
-    )
-    for name, values in zip(names, fused, strict=True):
-        changed[name] = values
-    changed["opacity"] = new_logits.clip(-largest_logit, largest_logit)
-    return changed
+    opacities = new_logits.clip(-largest_logit, largest_logit)
+    return {**dict(zip(names, fused, strict=True)), "opacity": opacities}

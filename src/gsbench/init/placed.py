@@ -6,12 +6,11 @@ The points are those of the reference, random, or from a file. A file holds poin
 
 from __future__ import annotations
 
-import shutil
-from abc import abstractmethod
 from dataclasses import asdict, dataclass
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import numpy as np
 from annotated_types import Interval
@@ -22,7 +21,6 @@ from gsbench.errors import InputError
 from gsbench.files import file_sha256
 from gsbench.init.base import (
     GAUSSIANS_FILE,
-    WORK_FOLDER,
     Initializer,
     InitReport,
     PointCloud,
@@ -43,7 +41,7 @@ if TYPE_CHECKING:
     import pycolmap
 
 
-class GivenCameras(Initializer):
+class PlacedCloud(Initializer):
     """Base of initialisers that keep the reference's cameras. Subclasses are dataclasses."""
 
     def __post_init__(self) -> None:
@@ -68,46 +66,58 @@ class GivenCameras(Initializer):
                 "with init=sfm first"
             )
         output_dir.mkdir(parents=True, exist_ok=True)
-        return run_with_progress(
-            _build, (self, capture, output_dir, reference), progress, what=self.name
-        )
+        given = capture, output_dir, reference
+        return run_with_progress(self.build, given, progress, what=self.name)
 
-    @abstractmethod
+    def build(self, given: tuple[Capture, Path, Path | None], progress: Progress) -> InitReport:
+        """Write the model and the report; runs in the isolated process."""
+        from gsbench.init.colmap.reconstruct import load_reference
+        from gsbench.init.report import make_report, write_result
+
+        capture, output_dir, reference = given
+        timer = Timer()
+        with timer.phase("read"):
+            model = load_reference(capture, reference)
+        assert model is not None
+        with timer.phase("place"):
+            points = self.set_points(model, capture, output_dir)
+        report = make_report(
+            self.name,
+            "shared",
+            capture,
+            model,
+            ("pycolmap", "numpy"),
+            scale_to_reference=1.0,
+            settings=asdict(self),  # type: ignore[call-overload]
+            seconds=timer.rounded(),
+            training_points=points,
+        )
+        write_result(model, report, output_dir)
+        return report
+
     def set_points(
         self, model: pycolmap.Reconstruction, capture: Capture, output_dir: Path
     ) -> TrainingPoints | None:
-        """Set the points of the reference ``model``; runs in the isolated process."""
+        """Replace the points of the reference ``model`` by those of `cloud`."""
+        replace_points(model, self.cloud(capture, model))
+        return None
+
+    def cloud(self, capture: Capture, model: pycolmap.Reconstruction) -> PointCloud:
+        """The points for the reference ``model``; runs in the isolated process."""
+        raise NotImplementedError
 
 
-def _build(job: tuple[GivenCameras, Capture, Path, Path | None], progress: Progress) -> InitReport:
-    from gsbench.init import report
-    from gsbench.init.colmap.reconstruct import load_reference
+def replace_points(model: pycolmap.Reconstruction, cloud: PointCloud) -> None:
+    """Replace all points of ``model`` by those of ``cloud``, which no image observes."""
+    import pycolmap
 
-    initializer, capture, output_dir, reference = job
-    timer = Timer()
-    with timer.phase("read"):
-        model = load_reference(capture, reference)
-    assert model is not None
-    with timer.phase("place"):
-        training_points = initializer.set_points(model, capture, output_dir)
-    settings: dict[str, Any] = asdict(initializer)  # type: ignore[call-overload]
-    result = report.make_report(
-        initializer.name,
-        "shared",
-        capture,
-        model,
-        1.0,
-        ("pycolmap", "numpy"),
-        settings=settings,
-        seconds=timer.rounded(),
-        training_points=training_points,
-    )
-    report.write_result(model, result, output_dir)
-    return result
+    model.delete_all_points2D_and_points3D()
+    for point, color in zip(cloud.points, cloud.colors, strict=True):
+        model.add_point3D(point, pycolmap.Track(), color)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Dataset(GivenCameras):
+class Dataset(PlacedCloud):
     """Uses the capture's own model, restricted to the selected images and fitted to their files.
 
     ``points_from=train`` keeps the points that at least two training views see, in the colours of
@@ -136,36 +146,9 @@ class Dataset(GivenCameras):
             )
         if self.points_from == "all":
             return None
-        work = output_dir / WORK_FOLDER
-        work.mkdir(exist_ok=True)
-        try:
-            images = readable_images(capture.images, capture.train_names, work)
+        with TemporaryDirectory(dir=output_dir) as work:
+            images = readable_images(capture.images, capture.train_names, Path(work))
             return keep_training_points(model, capture.train_names, images)
-        finally:
-            shutil.rmtree(work, ignore_errors=True)
-
-
-class PlacedCloud(GivenCameras):
-    """Base of initialisers that replace the reference's points. Subclasses are dataclasses."""
-
-    def set_points(
-        self, model: pycolmap.Reconstruction, capture: Capture, output_dir: Path
-    ) -> TrainingPoints | None:
-        replace_points(model, self.cloud(capture, model))
-        return None
-
-    @abstractmethod
-    def cloud(self, capture: Capture, model: pycolmap.Reconstruction) -> PointCloud:
-        """The points for the reference ``model``; runs in the isolated process."""
-
-
-def replace_points(model: pycolmap.Reconstruction, cloud: PointCloud) -> None:
-    """Replace all points of ``model`` by those of ``cloud``, which no image observes."""
-    import pycolmap
-
-    model.delete_all_points2D_and_points3D()
-    for point, color in zip(cloud.points, cloud.colors, strict=True):
-        model.add_point3D(point, pycolmap.Track(), color)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -195,8 +178,8 @@ class Random(PlacedCloud):
         generator = np.random.default_rng(self.seed)
         center = training_centers(model, capture).mean(axis=0)
         cube = generator.uniform(-1.0, 1.0, (self.count, 3))
-        points = center + self.size * extent * cube
-        return PointCloud(points, generator.integers(0, 256, (self.count, 3), dtype=np.uint8))
+        colors = generator.integers(0, 256, (self.count, 3), dtype=np.uint8)
+        return PointCloud(center + self.size * extent * cube, colors)
 
 
 def points_in_view(
@@ -225,7 +208,7 @@ GREY = 128  # for points without a colour in the file and out of view of all tra
 
 
 @dataclass(frozen=True, kw_only=True)
-class FromFile(GivenCameras):
+class FromFile(PlacedCloud):
     """Base of initialisers that read the file ``path``."""
 
     path: AnyPath  # the file, for example a trial's point_cloud.ply
@@ -248,7 +231,7 @@ class FromFile(GivenCameras):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Points(FromFile, PlacedCloud):
+class Points(FromFile):
     """The points of a file, which must have the coordinates of the reference cameras.
 
     At most ``max_points`` random points are kept. If the file has no colours, a point's colour

@@ -19,6 +19,8 @@ from gsbench.scene.types import Array
 
 log = logging.getLogger(__name__)
 
+Columns = Mapping[str, NDArray[np.generic]]  # [P] by the names in the file
+
 DC_NAMES = ("f_dc_0", "f_dc_1", "f_dc_2")
 SH_C0 = 0.5 / math.sqrt(math.pi)  # the constant spherical harmonic, by which 3DGS multiplies f_dc
 TEXT_SUFFIXES = (".xyz", ".txt", ".csv", ".pts", ".asc")
@@ -28,12 +30,15 @@ WITHOUT_COLOR = frozenset(("x", "y", "z", "nx", "ny", "nz"))
 PREFIX = re.compile(
     r"^(pos(ition)?|coord(inate)?|point|vertex|colou?r|rgb|diffuse|ambient|scalar)(?=[\W_])"
 )
-# Columns of red, green and blue in a table without names, by its number of columns.
-COLORS = {3: [], 6: [3, 4, 5]}
-PTS_COLORS = COLORS | {4: [], 7: [4, 5, 6]}  # scanners write the intensity before the colour
+# Columns of a table without names, by their number.
+LAYOUTS = {3: "x y z", 6: "x y z red green blue"}
+# scanners write the intensity before the colour
+PTS_LAYOUTS = LAYOUTS | {4: "x y z intensity", 7: "x y z intensity red green blue"}
 # Colours up to this are fractions, even if tone mapping or rounding went beyond 1. As bytes they
 # would all be black.
 MAX_FRACTION = 2.0
+ASIDE = ("#", "//")  # begin a comment, or the line of names
+OF_COLMAP = "it belongs to a COLMAP model: init=dataset reads its folder"
 REMEDY = (
     "wanted are rows of x y z [red green blue] with decimal points, below a first line such as "
     "x,y,z,red,green,blue if there are other columns: save it so, or as PLY with CloudCompare"
@@ -45,18 +50,19 @@ def read_points(path: Path) -> tuple[Array, NDArray[np.uint8] | None]:
 
     The suffix tells the format. A ``.ply`` file, text or binary, has vertices with x, y, z in any
     order and type, and colours as whole numbers or in [0, 1]. A text file has the columns that its
-    first line names, else those of `COLORS`. Raises ``InputError`` for a file that cannot be read,
+    first line names, else those of `LAYOUTS`. Raises ``InputError`` for a file that cannot be read,
     holds no point, or has a coordinate or colour that is not a finite number.
     """
     suffix = path.suffix.lower()
     require_regular(path)
     try:
         if suffix == ".ply":
-            points, colors = _read_ply(path)
+            columns = _read_ply(path)
         elif suffix in TEXT_SUFFIXES:
-            points, colors = _read_table(path)
+            columns = _read_table(path)
         else:
             raise ValueError(_other_format(path))
+        points, colors = _points_and_colors(columns, path)
     except DAMAGE as error:
         raise InputError(
             f"{path}: not a readable file of points ({one_line(str(error))})"
@@ -78,69 +84,75 @@ def read_points(path: Path) -> tuple[Array, NDArray[np.uint8] | None]:
 
 def _other_format(path: Path) -> str:
     if path.stem in ("points3D", "images", "cameras"):
-        return "it belongs to a COLMAP model: init=dataset reads its folder"
+        return OF_COLMAP
     if kind := recognised_format(path):
         return f"it is {kind}"
     known = ", ".join((".ply", *TEXT_SUFFIXES))
     return f"known are {known}: convert it to PLY, for example with CloudCompare"
 
 
-def _read_ply(path: Path) -> tuple[Array, NDArray[np.generic] | None]:
+def _read_ply(path: Path) -> Columns:
     content = read_ply_data(path)
     if "vertex" not in content:
         elements = ", ".join(element.name for element in content)
         raise ValueError(f"it has no element vertex, only {elements or 'a header'}")
     vertices = content["vertex"].data
-    written = vertices.dtype.names or ()
-    names = {_plain(name): name for name in written} | {name.lower(): name for name in written}
-    if lacking := [name for name in "xyz" if name not in names]:
-        raise ValueError(f"its vertices have no property {', '.join(lacking)}")
-
-    def columns(wanted: Iterable[str]) -> NDArray[np.generic]:
-        return np.stack([vertices[names[name]] for name in wanted], axis=1)
-
-    points = columns("xyz").astype(np.float64)
-    if set(DC_NAMES) <= set(written):  # a model of Gaussians
-        dc = np.stack([vertices[name] for name in DC_NAMES], axis=1).astype(np.float64)
-        return points, np.clip(0.5 + SH_C0 * dc, 0.0, 1.0)  # NaN stays; `read_points` refuses it
-    colored = _color_names(names, path)
-    return points, columns(colored) if colored else None
+    return {name: vertices[name] for name in vertices.dtype.names or ()}
 
 
-def _read_table(path: Path) -> tuple[Array, Array | None]:
-    """Read points [P, 3] and colours [P, 3], or None, from rows of numbers.
+def _read_table(path: Path) -> Columns:
+    """Read rows of numbers; raises ValueError for other tables.
 
     Names may come first, also behind ``//`` or ``#``. A line of one number is the count of points,
-    with which each scan of a ``.pts`` file begins. Raises ValueError for other tables.
+    with which each scan of a ``.pts`` file begins.
     """
     text = without_byte_order_mark(path.read_bytes()).decode(errors="replace")
     if "POINT3D_ID" in text[:1000]:
-        raise ValueError("it belongs to a COLMAP model: init=dataset reads its folder")
+        raise ValueError(OF_COLMAP)
     lines = [line.strip(" \t,;") for line in text.splitlines() if line.strip()]
     first = next((k for k, line in enumerate(lines) if _is_row(line)), len(lines))
-    titles, rows = lines[:first], [line for line in lines[first:] if not _is_aside(line)]
+    rows = [line for line in lines[first:] if not (line.isdecimal() or line.startswith(ASIDE))]
     if not rows:
         raise ValueError(f"no line is a row of numbers: {REMEDY}")
     between = next((mark for mark in ",;" if mark in rows[0]), r"\s+")
     try:
-        table = pd.read_csv(io.StringIO("\n".join(rows)), sep=between, header=None).to_numpy(
-            dtype=np.float64
-        )  # [P, columns]
+        table = pd.read_csv(io.StringIO("\n".join(rows)), sep=between, header=None)
+        values = table.to_numpy(dtype=np.float64)  # [P, columns]
     except ValueError as error:  # pandas' errors are
         raise ValueError(f"{error}; {REMEDY}") from error
-    count = table.shape[1]
-    written = _words(titles[-1]) if titles else []
-    if len(written) == count:
-        columns = {_plain(word): k for k, word in enumerate(written)}
-        if not columns.keys() >= set("xyz"):
-            raise ValueError(f"none of its columns are called x, y and z: {REMEDY}")
-        names = dict(zip(columns, written, strict=False))
-        colors = [columns[name] for name in _color_names(names, path)]
-        return table[:, [columns[axis] for axis in "xyz"]], table[:, colors] if colors else None
-    layouts = PTS_COLORS if path.suffix.lower() == ".pts" else COLORS
-    if count not in layouts:
-        raise ValueError(f"it has {count} columns without names: {REMEDY}")
-    return table[:, :3], table[:, layouts[count]] if layouts[count] else None
+    count, written = values.shape[1], _words(lines[first - 1]) if first else []
+    if len(written) != count:
+        layouts = PTS_LAYOUTS if path.suffix.lower() == ".pts" else LAYOUTS
+        written = layouts.get(count, "").split()
+        if not written:
+            raise ValueError(f"it has {count} columns without names: {REMEDY}")
+    return dict(zip(written, values.T, strict=True))
+
+
+def _points_and_colors(columns: Columns, path: Path) -> tuple[Array, NDArray[np.generic] | None]:
+    """Points [P, 3] and colours [P, 3], or None, from columns with any of the known names.
+
+    One log line names the columns that are not used if there is no colour.
+    """
+
+    def stacked(names: Iterable[str]) -> NDArray[np.generic]:
+        return np.stack([columns[known.get(name, name)] for name in names], axis=1)
+
+    known = {_plain(name): name for name in columns} | {name.lower(): name for name in columns}
+    if lacking := [name for name in "xyz" if name not in known]:
+        raise ValueError(f"it has no column {', '.join(lacking)}: {REMEDY}")
+    points = stacked("xyz").astype(np.float64)
+    if columns.keys() >= {*DC_NAMES}:  # a model of Gaussians
+        dc = stacked(DC_NAMES).astype(np.float64)
+        return points, np.clip(0.5 + SH_C0 * dc, 0.0, 1.0)  # NaN stays; `read_points` refuses it
+    for group in COLOR_NAMES:
+        if known.keys() >= {*group}:
+            return points, stacked(group)
+    if others := [name for name in columns if _plain(name) not in WITHOUT_COLOR]:
+        log.warning(
+            "%s: it has no red, green and blue, and its %s is not used", path, ", ".join(others)
+        )
+    return points, None
 
 
 def _words(line: str) -> list[str]:
@@ -149,16 +161,12 @@ def _words(line: str) -> list[str]:
     return [word.strip(" \t\"'") for word in words]
 
 
-def _is_aside(line: str) -> bool:
-    return line.isdecimal() or line.startswith(("#", "//"))  # a count of points, or a comment
-
-
 def _is_row(line: str) -> bool:
     try:
         float(_words(line)[0])
     except ValueError:
         return False
-    return not line.startswith(("#", "//"))
+    return not line.startswith(ASIDE)
 
 
 def _plain(word: str) -> str:
@@ -166,21 +174,6 @@ def _plain(word: str) -> str:
     name = PREFIX.sub("", re.sub(r"[\[(].*", "", word.lower()).strip())
     name = re.sub(r"[^a-z_]", "", name).strip("_")
     return name[0] if name in ("rf", "gf", "bf") else name  # as CloudCompare writes
-
-
-def _color_names(names: Mapping[str, str], path: Path) -> tuple[str, ...]:
-    """The plain names of red, green and blue among ``names``, plain and as written; () if none.
-
-    Then one log line names the columns that are not used.
-    """
-    for group in COLOR_NAMES:
-        if names.keys() >= set(group):
-            return group
-    if others := [written for name, written in names.items() if name not in WITHOUT_COLOR]:
-        log.warning(
-            "%s: it has no red, green and blue, and its %s is not used", path, ", ".join(others)
-        )
-    return ()
 
 
 def _eight_bits(colors: NDArray[np.generic]) -> NDArray[np.uint8]:

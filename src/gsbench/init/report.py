@@ -13,11 +13,7 @@ from typing import Any
 
 import pycolmap
 
-from gsbench.init.base import (
-    MODEL_FOLDER,
-    REPORT_FILE,
-    InitReport,
-)
+from gsbench.init.base import MODEL_FOLDER, REPORT_FILE, InitReport
 from gsbench.init.colmap.alignment import measure_gauge, training_extent
 from gsbench.init.colmap.reconstruct import poses_by_name
 from gsbench.runs.trial_record import Oddity
@@ -31,13 +27,13 @@ def make_report(
     poses: str,
     capture: Capture,
     model: pycolmap.Reconstruction,
-    scale_to_reference: float | None,
     packages: Sequence[str],
     warnings: Sequence[str] = (),
+    scale_to_reference: float | None = None,
     **further: Any,
 ) -> InitReport:
     """The report on ``model``, with versions of ``packages`` and further fields."""
-    placed = set(poses_by_name(model))
+    placed = poses_by_name(model)
     observed = any(point.track.length() > 0 for point in model.points3D.values())
     report = InitReport(
         init=init,

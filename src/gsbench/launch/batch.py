@@ -5,6 +5,7 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
+from gsbench.analysis.results import group_by
 from gsbench.config.compose import Trial
 from gsbench.config.groups import options
 from gsbench.config.schema import COMPONENTS
@@ -13,12 +14,13 @@ from gsbench.files import FORBIDDEN, checked_runs_folder, make_runs_folder, stor
 from gsbench.launch.dry_run import unavailable_now
 from gsbench.launch.jobs import run_local, run_serial
 from gsbench.launch.outcomes import Outcome, outcome_of_results
-from gsbench.launch.record import asked_metrics, record
+from gsbench.launch.record import asked_metrics, record, remove
 from gsbench.launch.slurm import run_slurm
 from gsbench.runs.freshness import Change
 from gsbench.runs.keys import STAGES, VIEWS
 from gsbench.runs.layout import STORE
 from gsbench.runs.store import Store
+from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.user_code import PERMISSIONS
 from gsbench.system.stopping import stop_on_signals
 from gsbench.tracking import Mirror
@@ -30,34 +32,42 @@ log = logging.getLogger(__name__)
 def run_batch(trials: Sequence[Trial], asks: bool = True) -> list[Outcome]:
     """Run the unfinished trials by their launcher, and return the outcomes of all.
 
-    With ``asks``, their questions are written down first.
+    With ``asks``, their questions are written down first. If nothing but bad input came out of the
+    trials that began now, they are forgotten, as if the command had been refused before.
     """
     launcher = trials[0].values["launch"]["name"]
     with storage_errors(checked_runs_folder(trials[0].values["runs"])), stop_on_signals():
         # A wrong folder of weights is an error even if all trials are done.
         if launcher != "slurm" and (missing := missing_weights(trials)):
             raise InputError("; ".join(missing))
-        outcomes, unfinished = _skip_finished(trials)
-        _begin(trials, unfinished, asks)
+        unfinished = begin(trials, asks)
+        left = {trial.folder for trial in unfinished}
+        done = {trial.folder: trial for trial in trials if trial.folder not in left}
+        outcomes = [outcome_of_results(folder, one.files.record()) for folder, one in done.items()]
+        for outcome in outcomes:
+            log.info("%s: already done  %s", outcome.label, outcome.message)
+        new = [folder for folder in left if not folder.exists()]
         if unfinished and launcher == "slurm":
             outcomes += run_slurm(unfinished)
         elif unfinished:
             run = run_serial if launcher == "serial" else run_local
             with Mirror() as mirror:
                 outcomes += run(unfinished, mirror)
+        if all(outcome.status == "failed" and outcome.bad_input for outcome in outcomes):
+            for home, own in group_by(new, lambda folder: TrialFolder(folder).home).items():
+                remove(home, own)
         return outcomes
 
 
-def begin_for_another_launcher(trials: Sequence[Trial], asks: bool = True) -> None:
-    """Check, plan and declare trials that a Hydra plug-in will run, perhaps several at once."""
-    with storage_errors(checked_runs_folder(trials[0].values["runs"])):
-        _begin(trials, [trial for trial in trials if _why_not_done(trial)], asks)
+def begin(trials: Sequence[Trial], asks: bool = True) -> list[Trial]:
+    """Check, plan and declare trials before they run; returns those that are not done.
 
-
-def _begin(trials: Sequence[Trial], unfinished: Sequence[Trial], asks: bool = True) -> None:
-    """Refuse trials known to fail; make the runs folder, tidy the store, write the plan."""
+    Raises InputError for trials that are known to fail.
+    """
     asked_metrics(trials)  # raises for two metrics in one experiment, before anything is written
     runs = checked_runs_folder(trials[0].values["runs"])
+    by_folder = {trial.folder: trial for trial in trials}
+    unfinished = [trial for trial in by_folder.values() if _why_not_done(trial)]
     # A node of a cluster may have folders and devices that this machine lacks.
     here = trials[0].values["launch"]["name"] != "slurm"
     if here and (missing := missing_folders(unfinished)):
@@ -71,22 +81,10 @@ def _begin(trials: Sequence[Trial], unfinished: Sequence[Trial], asks: bool = Tr
         if unfinished or error.errno not in FORBIDDEN:
             raise
         log.info("%s cannot be written to (%s), so its plan stays as it is", runs, error.strerror)
-        return
-    Store(runs / STORE).sweep((*STAGES, VIEWS))
-    record(trials, asks)
-
-
-def _skip_finished(trials: Sequence[Trial]) -> tuple[list[Outcome], list[Trial]]:
-    """The outcomes of finished trials, and the unfinished trials; each folder counts once."""
-    outcomes: list[Outcome] = []
-    unfinished: list[Trial] = []
-    for folder, trial in {trial.folder: trial for trial in trials}.items():
-        if _why_not_done(trial):
-            unfinished.append(trial)
-        else:
-            outcomes.append(outcome_of_results(folder, trial.files.record()))
-            log.info("%s: already done  %s", outcomes[-1].label, outcomes[-1].message)
-    return outcomes, unfinished
+    else:
+        Store(runs / STORE).sweep((*STAGES, VIEWS))
+        record(trials, asks)
+    return unfinished
 
 
 def _why_not_done(trial: Trial) -> Change | None:

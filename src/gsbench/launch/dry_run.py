@@ -6,7 +6,6 @@ import json
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from statistics import fmean
@@ -16,7 +15,6 @@ import numpy as np
 from PIL import Image
 
 from gsbench.config.compose import Trial
-from gsbench.eval.facts import LPIPS
 from gsbench.launch.states import arm_names, ask_queue, label_of, state_in_queue, summary_of
 from gsbench.parsing import DamagedError
 from gsbench.runs.layout import RESULTS, TRIAL_GLOB
@@ -128,16 +126,9 @@ def describe_plan(trials: Sequence[Trial], parallel: int = 1) -> list[str]:
 
 def _what_is_left(trial: Trial) -> str:
     """A note on what a run would do with a finished trial; "" if nothing. Downloads nothing."""
-    change = trial.files.why_not_done(trial.values, lambda options: ())
-    if change is not None and change.kind == "computable":
-        lacking, asked = change.name.split(", "), trial.values["eval"]
-        absent = unavailable_now(asked | {"download": False})
-        here = [name for name in lacking if name not in absent]
-        if not here:
-            weights = ", ".join(name for name in lacking if name.startswith(LPIPS))
-            note = f"  lacks {weights}: its weights are not here; a run will try to download them"
-            return note if weights and asked["download"] else ""
-        change = replace(change, name=", ".join(here))
+    change = trial.files.why_not_done(
+        trial.values, lambda options: unavailable_now(options | {"download": False})
+    )
     return "" if change is None else f"  will be checked: {change}"
 
 

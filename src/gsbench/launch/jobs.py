@@ -14,9 +14,9 @@ import secrets
 import signal
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -45,9 +45,10 @@ from gsbench.tracking import Mirror
 from gsbench.words import command, counted
 
 if TYPE_CHECKING:
-    from submitit import Executor, Job
+    from submitit import Job
     from submitit.helpers import DelayedSubmission
 
+    Running = tuple[Trial, Job[Outcome]]
 
 JOB_LINK = re.compile(r"\.submission_file_.*\.sh")
 
@@ -122,17 +123,23 @@ class TrialJob:
     When its time is up, submitit requeues what ``checkpoint`` returns.
     """
 
-    values: dict[str, Any]
-    path: list[str]  # sys.path of the submitting process
-    own: dict[str, str]  # the user's modules that may be imported, with their paths
-    visible_gpus: str | None  # CUDA_VISIBLE_DEVICES of the submitting process
+    trial: Trial
+    # sys.path of the submitting process
+    path: list[str] = field(default_factory=lambda: [entry for entry in sys.path if entry])
+    # the user's modules that may be imported, with their paths
+    own: dict[str, str] = field(default_factory=allowed_modules)
+    visible_gpus: str | None = field(default_factory=lambda: os.environ.get("CUDA_VISIBLE_DEVICES"))
     digest: str = ""  # of settings and code when the command was given
+
+    def __post_init__(self) -> None:
+        self.digest = self.digest or digest_of(self.trial.values)
 
     def __call__(self) -> Outcome:
         sys.path[:] = [*self.path, *(entry for entry in sys.path if entry not in self.path)]
         adopt_modules(self.own)
         set_up_logging()
-        launch = self.values["launch"]
+        trial, values = self.trial, self.trial.values
+        launch = values["launch"]
         # submitit's own handler requeues the job; it is called below, after the trial has saved a
         # checkpoint.
         requeue = signal.getsignal(signal.SIGUSR2) if hasattr(signal, "SIGUSR2") else None
@@ -144,17 +151,14 @@ class TrialJob:
                 ExitStack() as stack,
             ):
                 if launch["name"] == "local":
-                    slot = stack.enter_context(
-                        take_slot(TrialFolder.of(self.values).runs, launch["parallel"])
-                    )
+                    slot = stack.enter_context(take_slot(trial.files.runs, launch["parallel"]))
                     # A number as in cuda:1 counts the GPUs that the parent sees.
-                    if not names_one_gpu(self.values["device"]):
+                    if not names_one_gpu(values["device"]):
                         assign_gpu(slot, self.visible_gpus)
-                assign_threads(self.values["threads"], launch["parallel"])
+                assign_threads(values["threads"], launch["parallel"])
                 # With launch=local, the sweep's own process mirrors all of its trials.
                 mirror = stack.enter_context(Mirror(idle=launch["name"] == "local"))
-                trial = Trial(self.values, ())
-                if self.digest and digest_of(self.values) != self.digest:
+                if digest_of(values) != self.digest:
                     error = InputError("code changed since the command; give it again")
                     outcome = outcome_of_error(trial.folder, error)
                 else:
@@ -178,11 +182,14 @@ class TrialJob:
 
 
 def run_local(trials: Sequence[Trial], mirror: Mirror) -> list[Outcome]:
-    """Run the trials in processes of this machine, ``launch.parallel`` at once, to the end."""
-    values = trials[0].values
-    parallel, name = values["launch"]["parallel"], values["name"]
+    """Run the trials in processes of this machine, ``launch.parallel`` at once, to the end.
+
+    If this process is stopped, it stops them; if it is killed, they go on.
+    """
     import submitit
 
+    values = trials[0].values
+    parallel, name = values["launch"]["parallel"], values["name"]
     # Nothing else is printed until the first trial ends, since trials write to their own logs.
     log.info(
         "%s, %d at once; to see how far they are: %s",
@@ -192,25 +199,45 @@ def run_local(trials: Sequence[Trial], mirror: Mirror) -> list[Outcome]:
     )
     executor = submitit.LocalExecutor(new_job_folder(values))
     executor.update_parameters(timeout_min=values["launch"]["timeout_min"] or 365 * DAYS)
-    with bar(values["name"]) as report:
-
-        def show(ended: int, running: Sequence[Trial]) -> None:
-            done = ended + sum(
-                trial.files.share_done(trial.values["train"]["iterations"]) for trial in running
-            )
-            note = f"{ended} of {len(trials)} trials, {len(running)} running"
-            report("trials", round(BAR * done), BAR * len(trials), note)
-
-        return _run(trials, executor, parallel, mirror, show)
-
-
-def job_folder(values: dict[str, Any]) -> Path:
-    """The folder for the output of an experiment's jobs; it is made if it does not exist."""
-    runs = TrialFolder.of(values).runs
-    folder = runs / JOBS / values["name"]
-    check_job_links(runs, folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
+    waiting, running, outcomes = clouds_first(trials), dict[Path, "Running"](), list[Outcome]()
+    labels, repeats = labels_of(trials), Repeats()
+    try:
+        with bar(name) as report:
+            while waiting or running:
+                while waiting and len(running) < parallel:
+                    trial = waiting.pop(0)
+                    if repeated := repeats.of(trial):
+                        outcomes.append(repeated)
+                        continue
+                    # Ctrl-C reaches all processes of a terminal: jobs ignore it, and this process
+                    # passes it on below.
+                    with interrupts_ignored():
+                        running[trial.folder] = trial, executor.submit(TrialJob(trial))
+                    mirror.follow(trial.folder, trial.values)
+                ended = [folder for folder, (_, job) in running.items() if job.done()]
+                for folder in ended:
+                    trial, job = running.pop(folder)
+                    outcomes.append(collect(job, trial))
+                    mirror.trial_ended()
+                    repeats.note(trial, outcomes[-1])
+                    say_last(outcomes, labels)
+                done = len(outcomes) + sum(
+                    trial.files.share_done(trial.values["train"]["iterations"])
+                    for trial, _ in running.values()
+                )
+                note = f"{len(outcomes)} of {len(trials)} trials, {len(running)} running"
+                report("trials", round(BAR * done), BAR * len(trials), note)
+                if not ended:
+                    time.sleep(SECONDS_BETWEEN_POLLS)
+    except KeyboardInterrupt:
+        for _, job in running.values():
+            # submitit's own `cancel` kills at once; its process is no public attribute
+            process = getattr(job, "_process", None)
+            if process is not None and process.poll() is None:
+                # submitit's controller passes it on; the trial saves a checkpoint
+                process.send_signal(signal.SIGTERM)
+        raise
+    return outcomes
 
 
 def check_job_links(runs: Path, folder: Path) -> None:
@@ -228,60 +255,17 @@ def check_job_links(runs: Path, folder: Path) -> None:
 
 
 def new_job_folder(values: dict[str, Any]) -> Path:
-    """A new folder in `job_folder`, whose name nobody could guess.
+    """A new folder for the output of an experiment's jobs, whose name nobody could guess.
 
     A job unpickles the first file that has its number in its name. A stranger's runs folder could
     have such files for all numbers.
     """
-    folder = job_folder(values) / secrets.token_hex(8)
-    folder.mkdir()
+    runs = TrialFolder.of(values).runs
+    of_experiment = runs / JOBS / values["name"]
+    check_job_links(runs, of_experiment)
+    folder = of_experiment / secrets.token_hex(8)
+    folder.mkdir(parents=True)
     return folder
-
-
-def _run(
-    trials: Sequence[Trial],
-    executor: Executor,
-    parallel: int,
-    mirror: Mirror,
-    show: Callable[[int, Sequence[Trial]], None] = lambda ended, running: None,
-) -> list[Outcome]:
-    """Run the trials in at most ``parallel`` processes at once.
-
-    ``show`` gets the number of ended trials and those that run. If this process is stopped, it
-    stops them; if it is killed, they go on.
-    """
-    waiting, running, outcomes = clouds_first(trials), dict[Path, "Job[Outcome]"](), list[Outcome]()
-    labels, repeats, by_folder = labels_of(trials), Repeats(), {one.folder: one for one in trials}
-    try:
-        while waiting or running:
-            while waiting and len(running) < parallel:
-                trial = waiting.pop(0)
-                if repeated := repeats.of(trial):
-                    outcomes.append(repeated)
-                    continue
-                # Ctrl-C reaches all processes of a terminal: jobs ignore it, and this process
-                # passes it on below.
-                with interrupts_ignored():
-                    running[trial.folder] = executor.submit(job_of(trial))
-                mirror.follow(trial.folder, trial.values)
-            ended = [folder for folder, job in running.items() if job.done()]
-            for folder in ended:
-                outcomes.append(collect(running.pop(folder), folder, trials))
-                mirror.trial_ended()
-                repeats.note(by_folder[folder], outcomes[-1])
-                say_last(outcomes, labels)
-            show(len(outcomes), [by_folder[folder] for folder in running])
-            if not ended:
-                time.sleep(SECONDS_BETWEEN_POLLS)
-    except KeyboardInterrupt:
-        for job in running.values():
-            # submitit's own `cancel` kills at once; its process is no public attribute
-            process = getattr(job, "_process", None)
-            if process is not None and process.poll() is None:
-                # submitit's controller passes it on; the trial saves a checkpoint
-                process.send_signal(signal.SIGTERM)
-        raise
-    return outcomes
 
 
 def clouds_first(trials: Sequence[Trial]) -> list[Trial]:
@@ -290,40 +274,31 @@ def clouds_first(trials: Sequence[Trial]) -> list[Trial]:
     Trials with the same initial cloud wait for each other, so running them at once would leave
     processes idle.
     """
-    by_cloud: dict[str, Trial] = {}
+    first: dict[str, Path] = {}  # folders by cloud
     for trial in trials:
-        by_cloud.setdefault(sha256_of([trial.values["scene"], trial.values["init"]]), trial)
-    first = list(by_cloud.values())
-    return first + [trial for trial in trials if all(trial is not other for other in first)]
+        first.setdefault(sha256_of([trial.values["scene"], trial.values["init"]]), trial.folder)
+    leading = set(first.values())
+    return sorted(trials, key=lambda trial: trial.folder not in leading)
 
 
-def collect(job: Job[Outcome], folder: Path, trials: Sequence[Trial]) -> Outcome:
+def collect(job: Job[Outcome], trial: Trial) -> Outcome:
     """The outcome of an ended job, from the trial's files, else from the end of its log."""
-    values = next(trial.values for trial in trials if trial.folder == folder)
-    files, log_file = TrialFolder(folder), job.paths.stderr
+    folder, files, log_file = trial.folder, trial.files, job.paths.stderr
     record = files.sound_record()
     # The trial has just ended, so the metrics that it lacked are still unavailable.
     unavailable = () if record is None else record.awaited
-    reason = files.why_not_done(values, lambda options: unavailable)
+    reason = files.why_not_done(trial.values, lambda options: unavailable)
+    bad_input = False
     if record is not None and not reason:
         return outcome_of_results(folder, record)
     if files.has_failed():
         failure = files.failure()
-        return Outcome(folder, "failed", f"{failure.reason}; log: {log_file}", failure.bad_input)
-    if record is not None:
-        return Outcome(
-            folder, "failed", f"its results no longer hold ({reason}): give the command again"
+        bad_input, message = failure.bad_input, f"{failure.reason}; log: {log_file}"
+    elif record is not None:
+        message = f"its results no longer hold ({reason}): give the command again"
+    else:
+        tail = f"; its last lines: {error_tail(log_file)}" if log_file.is_file() else ""
+        message = (
+            f"the process ended without a result (killed, or out of memory){tail}; log: {log_file}"
         )
-    tail = f"; its last lines: {error_tail(log_file)}" if log_file.is_file() else ""
-    return Outcome(
-        folder,
-        "failed",
-        f"the process ended without a result (killed, or out of memory){tail}; log: {log_file}",
-    )
-
-
-def job_of(trial: Trial) -> TrialJob:
-    """The trial as a job with the environment of this process."""
-    path = [entry for entry in sys.path if entry]
-    gpus = os.environ.get("CUDA_VISIBLE_DEVICES")
-    return TrialJob(trial.values, path, allowed_modules(), gpus, digest_of(trial.values))
+    return Outcome(folder, "failed", message, bad_input)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -81,25 +81,20 @@ class Repeats:
         group = named.partition(".")[0]
         read = (group,) if outcome.bad_input and group in ALL else READ_BY.get(stage, ALL)
         change = named or f"a setting of {' or '.join(READ_BY.get(stage, PARTS))}"
-        repeated = Outcome(trial.folder, "failed", outcome.message, outcome.bad_input, change)
-        self._known.append((read, _values(trial, read), repeated))
+        self._known.append((read, _values(trial, read), replace(outcome, change=change)))
 
     def of(self, trial: Trial) -> Outcome | None:
         """The failure that a ``trial`` would repeat, as its own; None if there is none."""
-        for read, values, outcome in self._known:
-            if _values(trial, read) == values:
-                return Outcome(
-                    trial.folder, "failed", outcome.message, outcome.bad_input, outcome.change
-                )
-        return None
+        same = (one for read, values, one in self._known if _values(trial, read) == values)
+        found = next(same, None)
+        return found and replace(found, folder=trial.folder)
 
 
 def setting_in(message: str, values: dict[str, Any]) -> str:
     """The first setting that a message names; "" if it names none."""
-    places = {key: message.find(key) for key in flatten(values) if "." in key}
-    found = [key for key, place in places.items() if place >= 0]
+    found = [key for key in flatten(values) if "." in key and key in message]
     # densify.split and densify.split_size may begin at one place: the longer one is meant
-    return min(found, key=lambda key: (places[key], -len(key)), default="")
+    return min(found, key=lambda key: (message.find(key), -len(key)), default="")
 
 
 def _values(trial: Trial, read: Sequence[str]) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from gsbench.analysis.questions import (
     plan_looks,
     read_least,
 )
-from gsbench.analysis.results import TrialResult, group_by, read_experiment
+from gsbench.analysis.results import group_by, read_experiment
 from gsbench.analysis.trial_result import Planned
 from gsbench.config.compose import Trial
 from gsbench.errors import InputError
@@ -57,49 +57,42 @@ def record(trials: Sequence[Trial], asks: bool = True) -> list[Question]:
     read from its own record has no words and asks nothing. A repeated command adds no line.
     Raises InputError if trials of one experiment name different metrics.
     """
-    asked_now: list[Question] = []
     asked_metrics(trials)
-    for home, own in group_by(trials, lambda trial: trial.files.home).items():
-        typed = [trial for trial in own if trial.overrides]
-        if not typed:
-            continue
-        rows = planned_rows(typed)
-        asked = None
-        if asks and not (home / TUNING).exists() and read_history(home).ledger is None:
-            asked = asked_of(typed, rows)
-        measured = read_experiment(home).trials if asked and home.is_dir() else ()
+    typed = group_by([one for one in trials if one.overrides], lambda one: one.files.home)
+    return [question for home, own in typed.items() for question in _record(home, own, asks)]
 
-        def make(
-            history: History,
-            home: Path = home,
-            typed: Sequence[Trial] = typed,
-            rows: Sequence[Planned] = rows,
-            asked: Asked | None = asked,
-            measured: Sequence[TrialResult] = measured,
-        ) -> Command | None:
-            found, shown = ask(rows, asked, measured, history) if asked else ([], [])
-            asked_now.extend([*found, *(one for one in history.questions if one.id in shown)])
-            if set(shown) <= history.last:
-                shown = []  # they are the newest ones already
-            planned = {
-                trial.folder.relative_to(home).as_posix(): PlannedTrial(
-                    words=tuple(trial.overrides), digest=row.digest
-                )
-                for trial, row in zip(typed, rows, strict=True)
-            }
-            known = history.planned
-            changed = {
-                name: trial
-                for name, trial in planned.items()
-                if (before := known.get(home / name)) is None or before.digest != trial.digest
-            }
-            if not (found or shown or changed):
-                return None
-            return command_now(trials=planned, questions=tuple(found), shows=tuple(shown))
 
-        line = append(home, make)
-        for question in () if line is None else line.questions:
-            log.info("%s: %s", home.name, announce(question))
+def _record(home: Path, trials: Sequence[Trial], asks: bool) -> list[Question]:
+    rows = planned_rows(trials)
+    asked = None
+    if asks and not (home / TUNING).exists() and read_history(home).ledger is None:
+        asked = asked_of(trials, rows)
+    measured = read_experiment(home).trials if asked and home.is_dir() else ()
+    asked_now: list[Question] = []
+
+    def make(history: History) -> Command | None:
+        found, shown = ask(rows, asked, measured, history) if asked else ([], [])
+        asked_now.extend([*found, *(one for one in history.questions if one.id in shown)])
+        if set(shown) <= history.last:
+            shown = []  # they are the newest ones already
+        planned = {
+            trial.folder.relative_to(home).as_posix(): PlannedTrial(
+                words=tuple(trial.overrides), digest=row.digest
+            )
+            for trial, row in zip(trials, rows, strict=True)
+        }
+        known = history.planned
+        is_new = any(
+            (before := known.get(home / name)) is None or before.digest != trial.digest
+            for name, trial in planned.items()
+        )
+        if not (found or shown or is_new):
+            return None
+        return command_now(trials=planned, questions=tuple(found), shows=tuple(shown))
+
+    line = append(home, make)
+    for question in () if line is None else line.questions:
+        log.info("%s: %s", home.name, announce(question))
     return asked_now
 
 
@@ -220,5 +213,6 @@ def remove(home: Path, folders: Iterable[Path]) -> None:
         require_no_links(home.parent, folder, below=True)
         # first: a half-deleted trial must not look complete
         (folder / RESULTS).unlink(missing_ok=True)
-        shutil.rmtree(folder)
+        if folder.is_dir():
+            shutil.rmtree(folder)
     drop(home, folders)

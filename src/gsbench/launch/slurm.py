@@ -13,8 +13,8 @@ from gsbench.config.compose import Trial
 from gsbench.errors import InputError
 from gsbench.launch.jobs import (
     SECONDS_BETWEEN_POLLS,
+    TrialJob,
     collect,
-    job_of,
     labels_of,
     new_job_folder,
     say_last,
@@ -128,7 +128,7 @@ def _submit(trials: Sequence[Trial], executor: SlurmExecutor) -> dict[Path, Job[
             to_submit[folder] = trial
     if to_submit:
         try:
-            submitted = executor.submit_array([job_of(trial) for trial in to_submit.values()])
+            submitted = executor.submit_array(list(map(TrialJob, to_submit.values())))
         except Exception as error:
             raise InputError(
                 f"Slurm refused the job: {' '.join(str(error).split())[:300]}"
@@ -141,7 +141,7 @@ def _submit(trials: Sequence[Trial], executor: SlurmExecutor) -> dict[Path, Job[
 
 def _wait(jobs: dict[Path, Job[Outcome]], trials: Sequence[Trial]) -> list[Outcome]:
     outcomes: list[Outcome] = []
-    labels = labels_of(trials)
+    labels, by_folder = labels_of(trials), {trial.folder: trial for trial in trials}
     submissions = filter(None, map(read_submission, jobs))
     users = {submission.user or current_user() for submission in submissions} | {current_user()}
     unseen = dict.fromkeys(jobs, 0)  # successive checks in which the queue did not list the job
@@ -157,7 +157,7 @@ def _wait(jobs: dict[Path, Job[Outcome]], trials: Sequence[Trial]) -> list[Outco
             lost = [folder for folder in jobs if unseen[folder] >= CHECKS_UNTIL_LOST]
             ended += [folder for folder in lost if folder not in ended]
         for folder in ended:
-            outcomes.append(collect(jobs.pop(folder), folder, trials))
+            outcomes.append(collect(jobs.pop(folder), by_folder[folder]))
             with suppress(OSError):
                 forget_submission(folder)
             say_last(outcomes, labels)

@@ -60,11 +60,7 @@ def measure_folders(
         for done, folder in enumerate(folders, 1):
             method, scene, seed = folder.relative_to(root).parts
             images = pictures_in(truth / scene, settings)
-            matching = match_pictures(list(images.photographs), picture_names(folder))
-            pairs = [
-                PicturePair(view, path, folder / matching.pairs[view])
-                for view, path in images.photographs.items()
-            ]
+            pairs, _ = _pair_up(images, folder)
             check_pairs(pairs, str(folder))
             evaluator = _evaluator(images, None, settings)
             means = summarize(measure(pairs, evaluator), evaluator.unavailable)
@@ -91,12 +87,7 @@ def _measure(
     if options.place is not None:
         destination = find_destination(options.place, options.scene, options.seed, truth, runs)
         check_destination(destination, truth, runs)
-    match = match_by_order if options.by_order else match_pictures
-    matching = match(list(truth.photographs), picture_names(renders))
-    pairs = [
-        PicturePair(view, path, renders / matching.pairs[view], truth.masks.get(view))
-        for view, path in truth.photographs.items()
-    ]
+    pairs, matching = _pair_up(truth, renders, options.by_order)
     odd = check_pairs(pairs, options.renders)
     torch.set_num_threads(available_threads())
     evaluator = _evaluator(truth, options.protocol, options.settings)
@@ -115,6 +106,17 @@ def _measure(
         print(json.dumps(_as_dict(measured, matching, folder), indent=1))
     else:
         print("\n".join(_lines(measured, matching, folder)))
+
+
+def _pair_up(
+    truth: ReferenceImages, renders: Path, by_order: bool = False
+) -> tuple[list[PicturePair], Matching]:
+    match = match_by_order if by_order else match_pictures
+    matching = match(list(truth.photographs), picture_names(renders))
+    return [
+        PicturePair(view, path, renders / matching.pairs[view], truth.masks.get(view))
+        for view, path in truth.photographs.items()
+    ], matching
 
 
 # settings of an evaluation that renders of another program do not use

@@ -8,8 +8,9 @@ has them in ``predictions/``.
 import tarfile
 import tempfile
 import zipfile
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import IO
 
@@ -68,22 +69,29 @@ def _kind_of(place: Path) -> str:
 
 def _unpack(archive: Path, scratch: Path) -> None:
     """Write the renders and photographs of an archive below ``scratch``, and no other member."""
-    if zipfile.is_zipfile(archive):
-        with zipfile.ZipFile(archive) as packed:
-            files = {member.filename: member for member in packed.infolist() if not member.is_dir()}
-            sizes = {name: member.file_size for name, member in files.items()}
-            for name, target in _wanted(archive, sizes).items():
-                with packed.open(files[name]) as source:
-                    _write(source, scratch / target, sizes[name])
-    else:
-        with tarfile.open(archive) as packed_tar:
-            members = {member.name: member for member in packed_tar if member.isfile()}
-            sizes = {name: member.size for name, member in members.items()}
-            for name, target in _wanted(archive, sizes).items():
-                content = packed_tar.extractfile(members[name])
-                assert content is not None  # of a regular file
-                with content:
-                    _write(content, scratch / target, sizes[name])
+    with ExitStack() as opened:
+        # each file's size and what opens it, by its name
+        files: dict[str, tuple[int, Callable[[], IO[bytes] | None]]]
+        if zipfile.is_zipfile(archive):
+            zipped = opened.enter_context(zipfile.ZipFile(archive))
+            files = {
+                member.filename: (member.file_size, partial(zipped.open, member))
+                for member in zipped.infolist()
+                if not member.is_dir()
+            }
+        else:
+            tar = opened.enter_context(tarfile.open(archive))
+            files = {
+                member.name: (member.size, partial(tar.extractfile, member))
+                for member in tar
+                if member.isfile()
+            }
+        for name, target in _wanted(archive, {key: files[key][0] for key in files}).items():
+            size, open_file = files[name]
+            content = open_file()
+            assert content is not None  # of a regular file
+            with content:
+                _write(content, scratch / target, size)
 
 
 def _wanted(archive: Path, sizes: dict[str, int]) -> dict[str, Path]:
@@ -102,11 +110,7 @@ def _wanted(archive: Path, sizes: dict[str, int]) -> dict[str, Path]:
             raise InputError(f"{archive}: {name!r} leads out of the archive, or is no file's name")
         home = Path(*path.parts[: path.parts.index(kind)])
         homes.setdefault(home, {})[name] = path.relative_to(home)
-    both = [
-        places
-        for places in homes.values()
-        if {RENDERED, PHOTOGRAPHS} == {place.parts[0] for place in places.values()}
-    ]
+    both = [own for own in homes.values() if len({place.parts[0] for place in own.values()}) == 2]
     if len(both) != 1:
         raise InputError(
             f"{archive} must have one folder with {RENDERED}/ and {PHOTOGRAPHS}/, as nerfbaselines "
@@ -114,9 +118,9 @@ def _wanted(archive: Path, sizes: dict[str, int]) -> dict[str, Path]:
         )
     total = sum(sizes[name] for name in both[0])
     if total > MAX_TOTAL_BYTES:
-        most = readable_bytes(MAX_TOTAL_BYTES)
         raise InputError(
-            f"{archive} unpacks to {readable_bytes(total)}, more than the limit of {most}"
+            f"{archive} unpacks to {readable_bytes(total)}, more than the limit of "
+            f"{readable_bytes(MAX_TOTAL_BYTES)}"
         )
     return both[0]
 
@@ -124,13 +128,11 @@ def _wanted(archive: Path, sizes: dict[str, int]) -> dict[str, Path]:
 def _write(source: IO[bytes], target: Path, size: int) -> None:
     """Copy exactly ``size`` bytes; raises ValueError for a member with more or fewer."""
     target.parent.mkdir(parents=True, exist_ok=True)
-    written = 0
     with target.open("wb") as file:
-        while piece := source.read(CHUNK):
-            written += len(piece)
-            # A small number in the directory of an archive may hide gigabytes.
-            if written > size:
-                break
+        left = size
+        while left and (piece := source.read(min(CHUNK, left))):
             file.write(piece)
-    if written != size:
-        raise ValueError(f"{target.name} has another size than the archive says")
+            left -= len(piece)
+        # A small number in the directory of an archive may hide gigabytes.
+        if left or source.read(1):
+            raise ValueError(f"{target.name} has another size than the archive says")

@@ -20,7 +20,7 @@ from gsbench.runs.store import remove
 from gsbench.system.locks import BusyError, hold
 
 KEY = re.compile(rb"(?<![0-9a-f])[0-9a-f]{64}(?![0-9a-f])")
-FOLDER = re.compile(r"\.?(?P<key>[0-9a-f]+)(?:\.partial)?")
+FOLDER = re.compile(r"\.?[0-9a-f]+(\.partial)?")
 
 
 @dataclass(frozen=True)
@@ -73,9 +73,7 @@ def _folders(runs: Path) -> Iterator[Path]:
 
 
 def _key_of(place: Path) -> str:
-    match = FOLDER.fullmatch(place.name)
-    assert match is not None
-    return match["key"]
+    return place.name.removeprefix(".").removesuffix(".partial")
 
 
 def _keys_in(*files: Path) -> set[str]:

@@ -137,7 +137,7 @@ def origin_of(
         config=config_hash(values),
         stages={stage.name: stage.version for stage in STAGES},
         pycolmap=version_of("pycolmap"),
-        sources={str(source): source_stamp_of(source) for source in sources},
+        sources={str(source): stamp_of(source, 3) for source in sources},
         # Adding or removing a file changes its folder's time.
         folders={str(source.parent): _changed_at(source.parent) for source in sources},
         entries={name: str(entry) for name, entry in entries.items()},
@@ -169,12 +169,12 @@ def changes(
     if made.pycolmap != (installed := version_of("pycolmap")):
         yield Change("code", "pycolmap", str(made.pycolmap), str(installed))
     for source, stamp in made.sources.items():
-        yield from _change_of(Path(source), stamp, source_stamp_of)
+        yield from _change_of(Path(source), stamp)
     for source_folder, changed in made.folders.items():
         if _changed_at(Path(source_folder)) != changed:
             yield Change("folder", source_folder)
     for name, stamp in made.published.items():
-        yield from _change_of(folder / name, stamp, stamp_of)
+        yield from _change_of(folder / name, stamp)
         is_small = stamp[0] <= MAX_HASHED_BYTES
         if is_small and name in made.digests and digest_of(folder / name) != made.digests[name]:
             yield Change("file", str(folder / name))
@@ -212,25 +212,19 @@ def changed_files(
             yield Change("written", name)
 
 
-def stamp_of(path: Path) -> Stamp:
-    """Size and time of change; raises OSError."""
-    state = os.stat(path)
-    return state.st_size, state.st_mtime_ns
-
-
-def source_stamp_of(path: Path) -> Stamp:
-    """Size, mtime and ctime of a user's file; raises OSError.
+def stamp_of(path: Path, count: int = 2) -> Stamp:
+    """Size, mtime and, of a user's file (``count`` 3), ctime; raises OSError.
 
     A program may replace a file and restore its mtime, but not its ctime. The ctime of gsbench's
     own files is not used: they are hard links, and each further link changes it.
     """
     state = os.stat(path)
-    return state.st_size, state.st_mtime_ns, state.st_ctime_ns
+    return (state.st_size, state.st_mtime_ns, state.st_ctime_ns)[:count]
 
 
-def _change_of(path: Path, stamp: Stamp, stamp_now: Callable[[Path], Stamp]) -> Iterator[Change]:
+def _change_of(path: Path, stamp: Stamp) -> Iterator[Change]:
     try:
-        if stamp_now(path) != stamp:
+        if stamp_of(path, len(stamp)) != stamp:
             yield Change("file", str(path))
     except (OSError, ValueError) as error:
         yield Change("unreadable", str(path), now=str(getattr(error, "strerror", error)))

@@ -159,8 +159,4 @@ def step_of(
         inputs = inputs | {"code": differing}
     # This process keeps running the code that it imported. Processes that a build starts import the
     # files as they are then, so only for these an edit during the build matters.
-    return (
-        Step(stage, inputs, build, states, check)
-        if in_processes
-        else Step(stage, inputs, build, states)
-    )
+    return Step(stage, inputs, build, states, *[check] * in_processes)

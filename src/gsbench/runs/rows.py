@@ -86,17 +86,6 @@ def iterate_rows(content: bytes, kind: type[T], path: Path) -> Iterator[tuple[st
     last line, which a killed process leaves.
     """
     lines = content.splitlines(keepends=True)
-    # Parsing all lines at once is faster. Only if that fails are they parsed one by one.
-    try:
-        rows = parse_typed(b"[" + b",".join(lines) + b"]", list[kind], path)  # type: ignore[valid-type]
-    except DamagedError:
-        rows = []
-    if len(rows) == len(lines):  # otherwise a line holds several values
-        yield from (
-            (line.decode("utf-8").rstrip("\r\n"), row)
-            for line, row in zip(lines, rows, strict=True)
-        )
-        return
     for number, line in enumerate(lines, 1):
         try:
             row = parse_typed(line, kind, path)

@@ -11,7 +11,7 @@ import re
 import shutil
 import stat
 import time
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,6 +29,7 @@ from gsbench.files import (
     write_json,
 )
 from gsbench.parsing import Amount, Count, DamagedError, Raw, Record, fault_of, read_typed
+from gsbench.runs.experiments import stamp_now
 from gsbench.runs.keys import Stage, Step
 from gsbench.runs.layout import MANIFEST
 from gsbench.system.locks import BusyError, hold
@@ -209,7 +210,16 @@ class Store:
 def write_manifest(folder: Path, step: Step, seconds: float) -> None:
     """Write the manifest of ``folder``: checksums of all files, once these are safe on the disk."""
     scratch = set[Path]().union(*map(folder.rglob, step.stage.scratch))
-    outputs = record_files(folder, scratch)
+    outputs = {}
+    for path in sorted(folder.rglob("*")):
+        if path.is_file() and path not in scratch:
+            sync_to_disk(path)
+            state = path.stat()
+            outputs[path.relative_to(folder).as_posix()] = {
+                "size": state.st_size,
+                "mtime_ns": state.st_mtime_ns,
+                "sha256": file_sha256(path),
+            }
     manifest = {
         "stage": step.stage.name,
         "version": step.stage.version,
@@ -218,25 +228,9 @@ def write_manifest(folder: Path, step: Step, seconds: float) -> None:
         "outputs": outputs,
         "seconds": seconds,
         "gsbench": __version__,
-        "created": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        "created": stamp_now(),
     }
     write_json(folder / MANIFEST, manifest)
-
-
-def record_files(folder: Path, without: Collection[Path] = ()) -> dict[str, dict[str, Any]]:
-    """Size, time of change and sha256 of all files in a folder, once these are safe on the disk."""
-    outputs = {}
-    for path in sorted(folder.rglob("*")):
-        if path.is_file() and path not in without:
-            sync_to_disk(path)
-            state = path.stat()
-            recorded = {
-                "size": state.st_size,
-                "mtime_ns": state.st_mtime_ns,
-                "sha256": file_sha256(path),
-            }
-            outputs[path.relative_to(folder).as_posix()] = recorded
-    return outputs
 
 
 def read_manifest(folder: Path, key: str | None = None, thorough: bool = False) -> Manifest:

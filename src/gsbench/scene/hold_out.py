@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsbench.errors import InputError
-from gsbench.scene.options import TEST_EVERY, SplitRule
+from gsbench.scene.options import SplitRule
 from gsbench.scene.types import Array, Camera, CameraModel
 from gsbench.words import counted, some_of
 
@@ -31,18 +31,11 @@ def reference_camera(camera: CameraModel, rotation: Array, translation: Array) -
     return Camera(width, height, width, width, width / 2, height / 2, rotation, translation)
 
 
-@dataclass(frozen=True)
-class Arrangement:
-    """An order of cameras, as indices; ``description`` says what they are ordered by, and why."""
-
-    order: tuple[int, ...]
-    description: str
-
-
-def arrange_cameras(cameras: Sequence[Camera]) -> Arrangement:
+def arrange_cameras(cameras: Sequence[Camera]) -> tuple[list[int], str]:
     """Order cameras by azimuth if they surround the scene, else along their principal axis.
 
-    The azimuths start at the first camera, or after a gap of more than 30 degrees.
+    The azimuths start at the first camera, or after a gap of more than 30 degrees. Returns indices,
+    and what the cameras are ordered by, and why.
     """
     centers = np.array([camera.center for camera in cameras])  # [V, 3]
     azimuths, fault = _azimuths(cameras, centers)
@@ -67,7 +60,7 @@ def arrange_cameras(cameras: Sequence[Camera]) -> Arrangement:
             "by azimuth around the scene's up and centre, as the cameras surround it (gaps up to "
             f"{gap:.0f} degrees)"
         )
-    return Arrangement(tuple(order.tolist()), description)
+    return order.tolist(), description
 
 
 def sector_range(count: int, sector: int, sectors: int, exactly: int | None = None) -> range:
@@ -156,30 +149,19 @@ def select_images(names: Sequence[str], max_images: int) -> list[str]:
 
 
 def split_names(
-    names: Sequence[str],
-    test_every: int = TEST_EVERY,
-    train: Sequence[str] | None = None,
-    test: Sequence[str] | None = None,
+    names: Sequence[str], train: Sequence[str] | None = None, test: Sequence[str] | None = None
 ) -> tuple[list[str], list[str]]:
-    """Split sorted names into (training, test).
+    """Split sorted names into (training, test) by lists.
 
-    Every ``test_every``-th name from the first is a test view. Explicit lists replace this rule. If
-    only one list is given, the other side gets all other names. If both are given, names in neither
-    list are dropped.
-
-    Raises `InputError` if there is no training view or no test view.
+    If only one list is given, the other side gets all other names. If both are given, names in
+    neither list are dropped. Raises `InputError` if there is no training view or no test view.
     """
-    if train is None and test is None:
-        held_out = set(names[::test_every])
-    elif test is None:
-        held_out = set(names) - set(train or ())
-    else:
-        held_out = set(test)
-        if both := sorted(held_out & set(train or ())):
-            raise InputError(
-                f"the split lists hold {some_of(both)} for training and for testing: name each "
-                "image once"
-            )
+    held_out = set(names) - set(train or ()) if test is None else set(test)
+    if both := sorted(held_out & set(train or ())):
+        raise InputError(
+            f"the split lists hold {some_of(both)} for training and for testing: name each "
+            "image once"
+        )
     kept = set(names if train is None else train)
     training = [name for name in names if name in kept and name not in held_out]
     testing = [name for name in names if name in held_out]
@@ -194,7 +176,7 @@ def split_names(
 
 
 # names for training, names for testing
-SplitLists = tuple[Sequence[str] | None, Sequence[str] | None]
+SplitLists = tuple[Sequence[str] | None, ...]
 CamerasByName = Callable[[Sequence[str]], Sequence[Camera]]
 
 
@@ -220,7 +202,6 @@ def hold_out(
     views are dropped and the training views are divided again. Raises InputError if no view is left
     for training or for testing.
     """
-    rule.check()
     split = _divide(names, rule, lists, cameras)
     if not rule.validation:
         return split
@@ -235,21 +216,18 @@ def _divide(
     names: Sequence[str], rule: SplitRule, lists: SplitLists, cameras: CamerasByName | None
 ) -> Split:
     matched = max(1, len(names) // rule.sectors) if rule.match_views else None
+    train, test = lists
     if rule.by_lists:
-        train, test = split_names(names, rule.test_every, *lists)
         description = "by lists"
-    elif rule.split != "sector" and matched is None:
-        train, test = split_names(names, rule.test_every)
-        description = f"every {rule.test_every}th image"
+    elif rule.split == "sector":
+        test, description = _sector(names, rule, matched, cameras)
+    elif matched is None:
+        test, description = names[:: rule.test_every], f"every {rule.test_every}th image"
     else:
-        if rule.split == "sector":
-            chosen, description = _sector(names, rule, matched, cameras)
-        else:
-            assert matched is not None
-            chosen = select_images(names, matched)
-            spread = f"{matched} evenly spread over the sorted names"
-            description = f"{spread}, as many as in a sector of {rule.sectors}"
-        train, test = split_names(names, test=chosen)
+        test = select_images(names, matched)
+        spread = f"{matched} evenly spread over the sorted names"
+        description = f"{spread}, as many as in a sector of {rule.sectors}"
+    train, test = split_names(names, train, test)
     return Split(tuple(train), tuple(test), description)
 
 
@@ -261,7 +239,7 @@ def _sector(
         raise InputError(
             f"scene.sectors={rule.sectors} are more than the {len(names)} images: give fewer"
         )
-    arrangement = arrange_cameras(cameras(names))
+    order, description = arrange_cameras(cameras(names))
     positions = sector_range(len(names), rule.sector, rule.sectors, exactly)
-    test = [names[arrangement.order[position]] for position in positions]
-    return test, f"part {rule.sector} of {rule.sectors} {arrangement.description}"
+    test = [names[order[position]] for position in positions]
+    return test, f"part {rule.sector} of {rule.sectors} {description}"

@@ -63,44 +63,44 @@ def require_enough(count: int, folder: Path, which: str, remedy: str = "") -> No
     given("too-few-images", count, str(folder), which=which, mend=mend)
 
 
-SplitName = Literal["every_nth", "sector", "matched", "list"]
 TEST_EVERY = 8  # Mip-NeRF 360 and 3DGS hold out every 8th image, from the first
 SECTORS = 8  # a sector then has as many views as every_nth holds out by default
-TRAIN_LIST, TEST_LIST = "train_list.txt", "test_list.txt"  # as nerfbaselines names them
+LISTS = ("train_list.txt", "test_list.txt")  # as nerfbaselines names them
 
 
-@dataclass(frozen=True)
+@dataclass
 class SplitRule:
-    """Settings that say which views are held out; the fields are those of `SceneConfig`.
+    """Settings that say which views are held out.
 
     ``every_nth`` holds out every ``test_every``-th name, from the first. ``sector`` holds out
     sector number ``sector`` of ``sectors`` contiguous ones
     (`gsbench.scene.hold_out.arrange_cameras`). ``list`` follows the lists. With ``match_views``,
     ``every_nth`` holds out as many views as a sector has, so both leave equally many for training.
     With ``validation``, the held-out views are dropped, and the rule is applied again to the rest.
+    Raises InputError for settings that contradict each other.
     """
 
-    split: SplitName = "every_nth"
-    test_every: int = TEST_EVERY
-    train_list: str | None = None
-    test_list: str | None = None
-    sector: int = 0
-    sectors: int = SECTORS
-    match_views: bool = False
-    validation: bool = False
+    # views held out: every test_every-th image, a sector, lists; matched: says how to sweep
+    split: Literal["every_nth", "sector", "matched", "list"] = "every_nth"
+    # every_nth: hold out every so-many-th sorted name
+    test_every: Annotated[int, Ge(2)] = TEST_EVERY
+    # file of names, one a line; null with split=list: train_list.txt
+    train_list: PathName | None = None
+    test_list: PathName | None = None  # the same; null with split=list: test_list.txt
+    sector: NonNegativeInt = 0  # number of the sector that is held out
+    sectors: Annotated[int, Ge(2)] = SECTORS  # contiguous parts of the cameras
+    match_views: bool = False  # every_nth and sector hold out equally many views
+    validation: bool = False  # drop the test views, and measure on views held out of the rest
+
+    @property
+    def lists(self) -> tuple[str | None, ...]:
+        return self.train_list, self.test_list
 
     @property
     def by_lists(self) -> bool:
-        return self.split == "list" or self.train_list is not None or self.test_list is not None
+        return self.split == "list" or any(self.lists)
 
-    @property
-    def asks_the_capture(self) -> bool:
-        """Return whether the capture's own list of test views applies."""
-        return self.split == "list" and self.train_list is None and self.test_list is None
-
-    def check(self) -> None:
-        """Raise InputError for settings that contradict each other."""
-        lists = [key for key in ("train_list", "test_list") if getattr(self, key) is not None]
+    def __post_init__(self) -> None:
         if self.split == "matched":
             raise InputError(
                 "scene.split=matched is a pair of trials: sweep it, as in -m "
@@ -111,9 +111,9 @@ class SplitRule:
                 f"scene.sector={self.sector}: of scene.sectors={self.sectors} the last is "
                 f"{self.sectors - 1}"
             )
-        if self.split == "sector" and lists:
+        if self.split == "sector" and self.by_lists:
             raise InputError(
-                f"scene.split=sector and scene.{lists[0]} both say what is held out: give one"
+                "scene.split=sector and a list both say what is held out: give one of them"
             )
         if self.match_views and self.by_lists:
             raise InputError(
@@ -145,7 +145,7 @@ def folder_name(path: str | None) -> str:
 
 
 @dataclass
-class SceneConfig:
+class SceneConfig(SplitRule):
     name: FolderName | None = MISSING  # null: the name of the folder `path`
     kind: Literal["colmap", "photos", "transforms", "courtyard", "reader"] = MISSING
     # scene=reader: a class of your own that reads the capture; its options are further keys
@@ -165,17 +165,6 @@ class SceneConfig:
     max_size: Annotated[int, Ge(MIN_SIZE)] | None = None  # longest side, px; never enlarges
     resample: Literal["lanczos", "area", "bicubic"] = "lanczos"
     max_images: Annotated[int, Ge(MIN_IMAGES)] = MAX_IMAGES  # evenly spaced over the sorted names
-    # every_nth: hold out every so-many-th sorted name
-    test_every: Annotated[int, Ge(2)] = TEST_EVERY
-    # views held out: every test_every-th image, a sector, lists; matched: see `check`
-    split: SplitName = "every_nth"
-    # file of names, one a line; null with split=list: train_list.txt
-    train_list: PathName | None = None
-    test_list: PathName | None = None  # the same; null with split=list: test_list.txt
-    sector: NonNegativeInt = 0  # number of the sector that is held out
-    sectors: Annotated[int, Ge(2)] = SECTORS  # contiguous parts of the cameras
-    match_views: bool = False  # every_nth and sector hold out equally many views
-    validation: bool = False  # drop the test views, and measure on views held out of the rest
     # ids of rules (docs/captures.md) whose refusal becomes a line in log, results and tables
     accept: list[str] = field(default_factory=list)
     # centred: moved to the image centre, as 3DGS assumes
@@ -207,7 +196,7 @@ class SceneConfig:
                 "is scene=reader scene._target_=mine.MyReader"
             )
         self._check_that_all_is_read()
-        self.split_rule.check()
+        super().__post_init__()
         check_accept(self.accept)
         if self.split == "sector" and self.kind == "photos":
             raise InputError(
@@ -235,8 +224,3 @@ class SceneConfig:
                     f"scene.{key}={getattr(self, key)} is not read with scene.split={self.split}: "
                     "add scene.split=sector, or leave it out"
                 )
-
-    @property
-    def split_rule(self) -> SplitRule:
-        """The settings that say which views are held out."""
-        return SplitRule(**{entry.name: getattr(self, entry.name) for entry in fields(SplitRule)})

@@ -2,8 +2,8 @@
 
 import hashlib
 import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
@@ -15,13 +15,12 @@ from gsbench.files import require_regular
 from gsbench.normalization import IDENTITY, find_normalization
 from gsbench.parsing import text_of
 from gsbench.scene.colmap_files import model_files, require_subfolder
-from gsbench.scene.hold_out import hold_out, reference_camera, select_images
+from gsbench.scene.hold_out import SplitLists, hold_out, reference_camera, select_images
 from gsbench.scene.images import check_picture_names
 from gsbench.scene.masks import check_masks, find_masks
 from gsbench.scene.names import match
 from gsbench.scene.options import (
-    TEST_LIST,
-    TRAIN_LIST,
+    LISTS,
     SceneConfig,
     check_final_size,
     require_enough,
@@ -35,29 +34,17 @@ from gsbench.words import some_of
 
 log = logging.getLogger(__name__)
 
-Lists = tuple[Sequence[str] | None, Sequence[str] | None]  # for training, for testing
 
-
-@dataclass(frozen=True)
-class Wish:
-    """The settings of a scene, the folder that its paths start from, and its split lists."""
-
-    options: SceneConfig
-    root: Path
-    lists: Lists
-
-
-def drop_copies(raw: RawCapture, wish: Wish) -> RawCapture:
+def drop_copies(raw: RawCapture, lists: SplitLists) -> RawCapture:
     """Drop photographs of one name that differ in the extension; listed ones are kept."""
-    wanted = set(chain.from_iterable(filter(None, wish.lists)))
+    wanted = set(chain.from_iterable(filter(None, lists)))
     return _without(raw, copies_by_name(raw.names, wanted))
 
 
-def hold_out_views(raw: RawCapture, wish: Wish) -> RawCapture:
+def hold_out_views(raw: RawCapture, options: SceneConfig, lists: SplitLists) -> RawCapture:
     """Choose the photographs that are used, and give each its role."""
-    options, rule = wish.options, wish.options.split_rule
     names, by_name = raw.names, {row.name: row for row in raw.photographs}
-    train, test = (_resolve(wanted, names, raw.folder) for wanted in wish.lists)
+    train, test = (_resolve(wanted, names, raw.folder) for wanted in lists)
     if train is not None and test is not None:
         names = sorted({*train, *test})
     cameras = (
@@ -65,49 +52,26 @@ def hold_out_views(raw: RawCapture, wish: Wish) -> RawCapture:
         if raw.has_cameras
         else None
     )
-    split = hold_out(select_images(names, options.max_images), rule, (train, test), cameras)
+    split = hold_out(select_images(names, options.max_images), options, (train, test), cameras)
     roles: dict[str, Role] = dict.fromkeys(split.train, "train")
     roles.update((name, "test") for name in split.test)
     kept = [replace(by_name[name], role=roles[name]) for name in sorted(roles)]
     return replace(raw, photographs=tuple(kept), held_out=split.description)
 
 
-def drop_copies_of_test_views(raw: RawCapture, wish: Wish) -> RawCapture:
+def drop_copies_of_test_views(raw: RawCapture) -> RawCapture:
     """Drop training photographs with the content of a test view, which would measure memory."""
-    copies = copies_of_test_views(raw.folder, raw.named("train"), raw.named("test"))
-    raw = _without(raw, copies)
-    which = "in the split lists" if wish.options.split_rule.by_lists else "left by the split"
-    require_enough(len(raw.photographs), raw.folder, which)
-    return raw
+    return _without(raw, copies_of_test_views(raw.folder, raw.named("train"), raw.named("test")))
 
 
-def match_masks(raw: RawCapture, wish: Wish) -> RawCapture:
+def match_masks(raw: RawCapture, root: Path, masks: str | None) -> RawCapture:
     """Give each photograph its mask from the folder ``scene.masks``, and check all masks."""
     rows = raw.photographs
-    if wish.options.masks is not None:
-        folder = require_subfolder(wish.root, wish.options.masks, "scene.masks")
-        masks = find_masks(folder, raw.names)
-        rows = tuple(replace(row, mask=masks[row.name]) for row in rows)
+    if masks is not None:
+        found = find_masks(require_subfolder(root, masks, "scene.masks"), raw.names)
+        rows = tuple(replace(row, mask=found[row.name]) for row in rows)
     check_masks(rows)
     return replace(raw, photographs=rows)
-
-
-def check_names_and_sizes(raw: RawCapture, wish: Wish) -> RawCapture:
-    """Raise InputError for a name or a size that no view can have."""
-    options = wish.options
-    check_picture_names(raw.named("test"), raw.folder)
-    for row in raw.photographs:
-        check_final_size(row.size, options.downscale, options.max_size, str(row.file))
-    return raw
-
-
-PIPE: tuple[Callable[[RawCapture, Wish], RawCapture], ...] = (
-    drop_copies,
-    hold_out_views,
-    drop_copies_of_test_views,
-    match_masks,
-    check_names_and_sizes,
-)
 
 
 def read_capture(options: SceneConfig) -> Capture:
@@ -124,11 +88,10 @@ def prepare(raw: RawCapture, options: SceneConfig, root: Path, model: Path | Non
     left, or a file, a list or a mask cannot be used.
     """
     has_own = any(row.role for row in raw.photographs)
-    rule = options.split_rule
-    if has_own and rule.asks_the_capture:
-        lists: Lists = raw.named("train"), raw.named("test")
+    if has_own and options.split == "list" and not any(options.lists):
+        lists: SplitLists = raw.named("train"), raw.named("test")
     else:
-        if has_own and not rule.by_lists:
+        if has_own and not options.by_lists:
             log.warning("%s has its own split: scene.split=list uses it", [*raw.files, root][0])
         lists = _read_lists(root, options)
     centers = raw.centers
@@ -136,8 +99,15 @@ def prepare(raw: RawCapture, options: SceneConfig, root: Path, model: Path | Non
         centers = np.array([row.center for row in raw.photographs])
     accept = tuple(options.accept)
     oddities = inspect("read", raw.noted, str(raw.folder), accept)
-    for step in PIPE:
-        raw = step(raw, Wish(options, root, lists))
+    raw = drop_copies(raw, lists)
+    raw = hold_out_views(raw, options, lists)
+    raw = drop_copies_of_test_views(raw)
+    which = "in the split lists" if options.by_lists else "left by the split"
+    require_enough(len(raw.photographs), raw.folder, which)
+    raw = match_masks(raw, root, options.masks)
+    check_picture_names(raw.named("test"), raw.folder)
+    for row in raw.photographs:
+        check_final_size(row.size, options.downscale, options.max_size, str(row.file))
     oddities += inspect("capture", raw, str(raw.folder), accept)
     # Only the courtyard has exact poses, and its units fit the paper's threshold.
     exact = options.kind == "courtyard"
@@ -208,18 +178,18 @@ def _resolve(wanted: Sequence[str] | None, names: Sequence[str], folder: Path) -
     return sorted(matches.values())
 
 
-def _read_lists(root: Path, options: SceneConfig) -> Lists:
+def _read_lists(root: Path, options: SceneConfig) -> SplitLists:
     """The training and the test list; ``split=list`` without files reads those of nerfbaselines."""
-    train, test = options.train_list, options.test_list
-    if options.split == "list" and train is None and test is None:
-        train = TRAIN_LIST if (root / TRAIN_LIST).is_file() else None
-        test = TEST_LIST if (root / TEST_LIST).is_file() else None
-        if train is None and test is None:
+    files = options.lists
+    if options.split == "list" and not any(files):
+        files = tuple(name if (root / name).is_file() else None for name in LISTS)
+        if not any(files):
             raise InputError(
-                f"scene.split=list: neither {TRAIN_LIST} nor {TEST_LIST} is in {root}: name the "
+                f"scene.split=list: neither {' nor '.join(LISTS)} is in {root}: name the "
                 "files with scene.train_list and scene.test_list"
             )
-    return _read_list(root, train, "scene.train_list"), _read_list(root, test, "scene.test_list")
+    keys = "scene.train_list", "scene.test_list"
+    return tuple(_read_list(root, file, key) for file, key in zip(files, keys, strict=True))
 
 
 def _read_list(root: Path, file: str | None, key: str) -> list[str] | None:

@@ -8,7 +8,7 @@ and its measure. The site shows the table (scripts/reference.py).
 import logging
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -57,12 +57,15 @@ Stage = Literal["file", "read", "capture", "lens", "views", "scene", "model", "c
 class Rule:
     """One row. ``say`` and ``mend`` are formatted with the finding (`gsbench.words.FORM`).
 
-    A ``fixed`` rule is one of arithmetic or safety, and cannot be accepted.
+    ``measure`` is a function of the subject, or the name of its attribute, a number, None if it is
+    not known, or a list of names, which are counted. A subject that is a mapping has its findings
+    by the ids of rules. ``it`` is the subject in sentences. A ``fixed`` rule is one of arithmetic
+    or safety, and cannot be accepted.
     """
 
     id: str
     stage: Stage
-    measure: Callable[[Any], Iterable[Finding]]
+    measure: str | Callable[[Any], Iterable[Finding]]
     fine: Range
     say: str
     mend: str
@@ -71,11 +74,7 @@ class Rule:
 
     def judge(self, subject: Any) -> Oddity | None:
         """The oddity of a subject, told by its worst finding; None if all is fine."""
-        return self.tell(self.measure(subject))
-
-    def tell(self, measured: Iterable[Finding]) -> Oddity | None:
-        """The oddity among findings."""
-        odd = [found for found in measured if not _within(found.value, self.fine)]
+        odd = [found for found in self._findings(subject) if not _within(found.value, self.fine)]
         if not odd:
             return None
         worst = max(odd, key=lambda found: _beyond(found.value, self.fine))
@@ -84,10 +83,20 @@ class Rule:
         value = min(max(worst.value, -MAX_NUMBER), MAX_NUMBER) if worst.value == worst.value else -1
         return Oddity(
             rule=self.id,
-            line=FORM.format(f"{self.say}: {self.mend}", **facts),
+            line=FORM.format(f"{self.say}: {self.mend}", it=subject, **facts),
             value=value,
             refused=not all(_within(found.value, self.usable) for found in odd),
         )
+
+    def _findings(self, subject: Any) -> Iterable[Finding]:
+        if callable(self.measure):
+            return self.measure(subject)
+        if isinstance(subject, Mapping):
+            return subject.get(self.id, ())
+        value = getattr(subject, self.measure)
+        if isinstance(value, Sequence):
+            return [Finding(len(value), value)]
+        return [] if value is None else [Finding(value)]
 
 
 def _within(value: float, limits: Range) -> bool:
@@ -151,7 +160,7 @@ def _far_cameras(scene: Scene) -> Iterable[Finding]:
     typical = float(np.median(distances))
     for view, distance in zip(scene.train, distances, strict=True):
         if typical > 0:
-            yield Finding(float(distance) / typical, [view.name], {"extent": scene.extent})
+            yield Finding(float(distance) / typical, [view.name])
 
 
 def _each_camera(value: Callable[[Camera], float]) -> Callable[[Scene], Iterable[Finding]]:
@@ -182,41 +191,15 @@ def _near_twins(scene: Scene) -> Iterable[Finding]:
     yield Finding(len(names), names, {"tested": len(scene.test)})
 
 
-def _kept(part: str) -> Callable[[Any], Iterable[Finding]]:
-    """A measure that counts the views of a part that is left."""
-    return lambda subject: [Finding(len(getattr(subject, part)))]
-
-
 def _left_out(subject: Any) -> Iterable[Finding]:
     """The photographs left out of a capture or a scene as copies of others."""
     twins = getattr(subject, "twins", subject).left_out
     yield Finding(len(twins), [f"{name} ({other} is used)" for name, other in twins.items()])
 
 
-def _fact(name: str, *more: str) -> Callable[[Any], Iterable[Finding]]:
-    """A measure that is an attribute of the subject, if known; ``more`` are for the sentence."""
-
-    def measure(subject: Any) -> Iterable[Finding]:
-        value = getattr(subject, name)
-        if value is not None:
-            yield Finding(value, (), {key: getattr(subject, key) for key in more})
-
-    return measure
-
-
-def _findings(name: str) -> Callable[[Any], Iterable[Finding]]:
-    """A measure whose findings the subject has already, by the name of what was measured."""
-    return lambda subject: subject.get(name, ())
-
-
-def _names(name: str) -> Callable[[Any], Iterable[Finding]]:
-    """A measure that counts names of images that the subject lists."""
-    return lambda subject: [Finding(len(getattr(subject, name)), getattr(subject, name))]
-
-
 def given(rule: str, value: float, where: str, **facts: Any) -> None:
     """Judge a value that the caller measured by one rule that cannot be accepted."""
-    found = BY_ID[rule].tell([Finding(value, (), facts)])
+    found = BY_ID[rule].judge({rule: [Finding(value, (), facts)]})
     settle([] if found is None else [found], where)
 
 
@@ -225,59 +208,60 @@ def _panoramas(raw: Any) -> Iterable[Finding]:
     yield Finding(len(names), names)
 
 
-def _always(
-    id: str,
-    stage: Stage,
-    measure: Callable[[Any], Iterable[Finding]],
-    usable: Range,
-    say: str,
-    mend: str,
-) -> Rule:
-    """A rule that cannot be accepted."""
-    return Rule(id, stage, measure, usable, say, mend, usable, fixed=True)
-
-
-def _of_file(id: str, usable: Range, say: str, mend: str) -> Rule:
-    """A rule for a value that the caller measured (`given`)."""
-    return _always(id, "file", _fact("value"), usable, say, mend)
+def _fixed(*row: Any) -> Rule:
+    """A rule that refuses what is not fine, and cannot be accepted."""
+    return replace(Rule(*row), usable=row[3], fixed=True)
 
 
 ELSEWHERE = "the cloud may lie in other coordinates, or have another scale, than the cameras"
+GIVEN = ""  # the measure of a rule whose findings the subject has
 RULES = (
     # ---- files
-    _of_file(
+    _fixed(
         "too-few-images",
+        "file",
+        GIVEN,
         at_least(MIN_IMAGES),
         "{value:n image} {which}, but at least 3 are needed",
         "{mend}",
     ),
-    _of_file(
+    _fixed(
         "view-size",
+        "file",
+        GIVEN,
         at_least(MIN_SIZE),
         "scene.downscale={downscale}{limit} leaves {size} px of {full}",
         "at least 16 px are needed",
     ),
-    _of_file(
+    _fixed(
         "principal-point-of-other-size",
+        "file",
+        GIVEN,
         (1 / 1.5, 1.5),  # copies are halved; other points are off by few percent
         "its principal point ({cx:g}, {cy:g}) is the centre of a photograph of another size than "
         "{width}x{height} px",
         "add w and h",
     ),
-    _of_file(
+    _fixed(
         "mask-of-other-size",
+        "file",
+        GIVEN,
         at_most(0),
         "the mask is {size} px and its image {name} {full}",
         "give masks of the images' size",
     ),
-    _of_file(
+    _fixed(
         "black-mask",
+        "file",
+        GIVEN,
         ABOVE_ZERO,
         "the mask is black all over, so no pixel counts",
         "correct it, or leave the image out",
     ),
-    _of_file(
+    _fixed(
         "grey-mask",
+        "file",
+        GIVEN,
         at_most(0.05),  # a photograph has far more
         "{value:.0%} of its pixels are grey, so it is not a mask",
         "make it black where pixels are ignored, else white",
@@ -286,7 +270,7 @@ RULES = (
     Rule(
         "no-pose",
         "read",
-        _findings("no-pose"),
+        GIVEN,
         at_most(0),
         "{count:n photograph} without a pose in the model: {names:few}",
         "they are not used",
@@ -294,7 +278,7 @@ RULES = (
     Rule(
         "no-file",
         "read",
-        _findings("no-file"),
+        GIVEN,
         at_most(0),
         "{count:n image} with a camera but without a file: {names:few}",
         "they are not used",
@@ -302,7 +286,7 @@ RULES = (
     Rule(
         "found-by-last-part",
         "read",
-        _findings("found-by-last-part"),
+        GIVEN,
         at_most(0),
         "files found by the last part of their path: {names:few}",
         "name the photographs as the model does",
@@ -310,7 +294,7 @@ RULES = (
     Rule(
         "focal-length-and-field",
         "read",
-        _findings("focal-length-and-field"),
+        GIVEN,
         (1 / 1.05, 1.05),  # rounding, and a shift of the principal point, are far less
         "its focal length is {given:g} px, but its field of view means {meant:g} px: {names:few}",
         "the focal length is used",
@@ -337,7 +321,7 @@ RULES = (
     Rule(
         "lens-turns-back",
         "lens",
-        _findings("lens-turns-back"),
+        GIVEN,
         at_most(0.0),
         "the camera of {names:few} ({camera}) turns back inside the picture: {value:.1%} of the "
         "undistorted photograph would be a mirrored ghost",
@@ -348,24 +332,24 @@ RULES = (
     Rule(
         "little-left",
         "lens",
-        _findings("little-left"),
+        GIVEN,
         at_least(0.25),
         "the camera of {names:few} ({camera}) leaves {size} of {full} px undistorted",
         "check its lens",
     ),
     # ---- views
-    _always(
+    _fixed(
         "no-training-view",
         "views",
-        _kept("train"),
+        "train",
         at_least(1),
         "no training view has a pose, or all of them are copies of test views",
         "change the split or the init",
     ),
-    _always(
+    _fixed(
         "no-test-view",
         "views",
-        _kept("test"),
+        "test",
         at_least(1),
         "no test view has a pose, so nothing could be measured",
         "change the split or the init, or leave out photographs of another camera",
@@ -373,7 +357,7 @@ RULES = (
     Rule(
         "views-without-pose",
         "views",
-        _names("unplaced"),
+        "unplaced",
         at_most(0),
         "{count:n view} without a pose left out: {names:few}",
         "take photographs with more overlap, or another init",
@@ -400,7 +384,7 @@ RULES = (
         _far_cameras,
         at_most(20.0),
         "the camera of {names:few} is {value:,.0f} times as far from the others as they usually "
-        "are, and sets the scene extent to {extent:.4g}",
+        "are, and sets the scene extent to {it.extent:.4g}",
         "check its pose, or leave the image out",
     ),
     Rule(
@@ -442,15 +426,16 @@ RULES = (
     Rule(
         "few-placed",
         "model",
-        _fact("placed_share", "num_registered", "num_images", "unregistered"),
+        "placed_share",
         at_least(0.9),
-        "only {num_registered} of {num_images} images have a pose (missing: {unregistered:few})",
+        "only {it.num_registered} of {it.num_images} images have a pose (missing: "
+        "{it.unregistered:few})",
         "the other photos are not used; more overlap or texture would help",
     ),
     Rule(
         "few-points",
         "model",
-        _fact("num_points"),
+        "num_points",
         at_least(100),
         "only {value} points",
         "training starts from next to nothing",
@@ -458,7 +443,7 @@ RULES = (
     Rule(
         "reprojection-error",
         "model",
-        _fact("mean_reprojection_error"),
+        "mean_reprojection_error",
         at_most(1.5),  # px; correct models stay below 0.7 with SIFT, 1.2 with learned features
         "mean reprojection error {value:.2f} px is large",
         "the cameras or the matches are probably wrong",
@@ -466,18 +451,18 @@ RULES = (
     Rule(
         "cameras-turned",
         "model",
-        _fact("rotation_error", "truth"),
+        "rotation_error",
         at_most(2.0),  # degrees; correct models stay below 0.5, wrong ones reach 20 and more
-        "the cameras are turned {value:.1f} degrees against the {truth} ones on average",
+        "the cameras are turned {value:.1f} degrees against the {it.truth} ones on average",
         "the model is wrong although its images are placed (views at most 7.5 degrees apart are "
         "safe)",
     ),
     Rule(
         "cameras-moved",
         "model",
-        _fact("center_error", "truth"),
+        "center_error",
         at_most(0.05),
-        "the cameras are {value:.1%} of the scene extent away from the {truth} ones",
+        "the cameras are {value:.1%} of the scene extent away from the {it.truth} ones",
         "the model is probably wrong",
     ),
     Rule(
@@ -489,27 +474,27 @@ RULES = (
         "give init.focal_length in px",
     ),
     # ---- the points that training starts from
-    _always(
+    _fixed(
         "cameras-at-one-place",
         "cloud",
-        _fact("extent"),
+        "extent",
         ABOVE_ZERO,
         "all training cameras stand at one place, so no depth can be learnt",
         "take photographs from several places",
     ),
-    _always(
+    _fixed(
         "point-beyond-range",
         "cloud",
-        _fact("farthest", "number", "total", "place"),
+        "farthest",
         at_most(1e7),  # squares of larger lengths leave the range in which float32 can train
-        "initial point {number} of {total:,} is {value:.3g} times as far from the cameras as they "
-        "are from each other, at {place}",
+        "initial point {it.number} of {it.total:,} is {value:.3g} times as far from the cameras as "
+        "they are from each other, at {it.place}",
         "remove it from the cloud",
     ),
-    _always(
+    _fixed(
         "points-out-of-view",
         "cloud",
-        _fact("seen_by_one"),
+        "seen_by_one",
         ABOVE_ZERO,
         "no training view has one of the initial points in view",
         "the cloud lies in other coordinates than the cameras; bring it into theirs",
@@ -517,9 +502,10 @@ RULES = (
     Rule(
         "points-share-places",
         "cloud",
-        _fact("identical", "first_place"),
+        "identical",
         at_most(0.5),
-        "{value:.0%} of the initial points share their place with another, such as {first_place}",
+        "{value:.0%} of the initial points share their place with another, such as "
+        "{it.first_place}",
         "thin or rebuild the cloud",
         usable=at_most(math.nextafter(1, 0)),
         fixed=True,
@@ -527,7 +513,7 @@ RULES = (
     Rule(
         "points-far-off",
         "cloud",
-        _fact("far"),
+        "far",
         at_most(0),
         "{value:n initial point} more than 10,000 times as far off as the cameras",
         "clean the cloud",
@@ -535,7 +521,7 @@ RULES = (
     Rule(
         "points-seen-once",
         "cloud",
-        _fact("seen"),
+        "seen",
         at_least(0.1),  # clouds by structure from motion have 0.97 and more
         "only {value:.1%} of the initial points are in view of two training views",
         ELSEWHERE,
@@ -543,7 +529,7 @@ RULES = (
     Rule(
         "points-in-a-heap",
         "cloud",
-        _fact("spread"),
+        "spread",
         at_least(0.02),
         "half of the initial points lie within {value:.2g} of the cameras' distances",
         ELSEWHERE,
@@ -551,7 +537,7 @@ RULES = (
     Rule(
         "colours-disagree",
         "cloud",
-        _fact("color_agreement"),
+        "color_agreement",
         at_least(0.25),  # sound clouds have 0.6 to 0.9, other scales or axes -0.1 to 0.2
         "the colours of the initial points hardly agree with the photographs (agreement "
         "{value:.2f}; 0 is chance, 1 is equal)",
@@ -560,9 +546,9 @@ RULES = (
     Rule(
         "cloud-of-one-colour",
         "cloud",
-        _fact("color_spread", "first_color"),
+        "color_spread",
         at_least(1.0),
-        "all initial points have the colour {first_color}",
+        "all initial points have the colour {it.first_color}",
         "export the cloud with its colours",
     ),
 )

@@ -24,11 +24,17 @@ LAST_ROW = [0.0, 0.0, 0.0, 1.0]
 OPENGL = np.diag([1.0, -1.0, -1.0])  # from OpenCV's camera axes to OpenGL's, and back
 PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 FISHEYE = "OPENCV_FISHEYE"
+RATIONAL = "FULL_OPENCV"  # OpenCV's: a polynomial of k1, k2, k3 divided by one of k4, k5, k6
+# the coefficients of each camera model, in COLMAP's order
+MODELS = {
+    **dict.fromkeys(PERSPECTIVE, ("k1", "k2", "p1", "p2")),
+    RATIONAL: ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    FISHEYE: ("k1", "k2", "k3", "k4"),
+}
 FOCAL_KEYS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov")
 # A principal point may be the centre of a copy of another size if it is off by one factor along
 # both sides, up to a tenth.
 SAME_SCALE = 0.1
-RATIONAL = "FULL_OPENCV"  # OpenCV's: a polynomial of k1, k2, k3 divided by one of k4, k5, k6
 
 
 class Intrinsics(Record):
@@ -144,15 +150,11 @@ def camera_of(image: Path, path: Path, record: TransformsRecord, frame: FrameRec
         _check_center(where, (width, height), (value("cx"), value("cy")))
     if width != int(width) or height != int(height) or min(width, height) < 1:
         raise InputError(f"{where}: w and h must be whole numbers of px, got {width} and {height}")
-    source = _source(record, frame, FOCAL_KEYS)
-    focal_x = _focal_length(width, source.fl_x, source.camera_angle_x, source.x_fov)
-    focal_y = _focal_length(height, source.fl_y, source.camera_angle_y, source.y_fov)
+    sides = _fields_of_view(record, frame, width, height)
+    focals = [meant if given is None else given for given, meant in sides]
     # Pixels are square if only one of both is given, as in instant-ngp and nerfstudio.
-    focal_x, focal_y = (
-        focal_y if focal_x is None else focal_x,
-        focal_x if focal_y is None else focal_y,
-    )
-    if focal_x is None or focal_y is None or min(focal_x, focal_y) <= 0.0:
+    known = [focal for focal in focals if focal is not None]
+    if not known or min(known) <= 0.0:
         raise InputError(
             f"{where}: no focal length: fl_x, camera_angle_x (between 0 and pi) or x_fov (between "
             "0 and 180) must be given, or the same for y"
@@ -160,7 +162,8 @@ def camera_of(image: Path, path: Path, record: TransformsRecord, frame: FrameRec
     cx, cy = value("cx"), value("cy")
     center = (width / 2 if cx is None else cx, height / 2 if cy is None else cy)
     model, distortion = _distortion(where, record, frame)
-    return CameraModel(model, int(width), int(height), (focal_x, focal_y, *center, *distortion))
+    params = known[0], known[-1], *center, *distortion
+    return CameraModel(model, int(width), int(height), params)
 
 
 def _source(record: TransformsRecord, frame: FrameRecord, keys: Collection[str]) -> Intrinsics:
@@ -201,65 +204,52 @@ def _distortion(
     where: str, record: TransformsRecord, frame: FrameRecord
 ) -> tuple[str, tuple[float, ...]]:
     """COLMAP's name of the camera model, and its parameters after the principal point."""
-    names = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-    source = _source(record, frame, names)
-    k1, k2, k3, k4, k5, k6, p1, p2 = (getattr(source, name) or 0.0 for name in names)
+    source = _source(record, frame, MODELS[RATIONAL])
+    given = {name: getattr(source, name) or 0.0 for name in MODELS[RATIONAL]}
     fisheye = record.is_fisheye if frame.is_fisheye is None else frame.is_fisheye
     model = frame.camera_model or record.camera_model or (FISHEYE if fisheye else "OPENCV")
-    if model == FISHEYE:
-        if any((k5, k6, p1, p2)):
-            raise InputError(
-                f"{where}: {FISHEYE} has k1 to k4 alone, but k5, k6, p1 or p2 is not 0"
-            )
-        return model, (k1, k2, k3, k4)
-    if model == RATIONAL:
-        return model, (k1, k2, p1, p2, k3, k4, k5, k6)
-    if model not in PERSPECTIVE:
+    if model not in MODELS:
+        raise InputError(f"{where}: camera_model {model} is not known here ({', '.join(MODELS)})")
+    if model in PERSPECTIVE:
+        # k4 is a coefficient of r^8 in nerfstudio and Metashape, but a divisor in OpenCV; only
+        # RATIONAL says which.
+        needs_k3 = given["k3"] and not any(given[name] for name in ("k4", "k5", "k6"))
+        model = RATIONAL if needs_k3 else "OPENCV"
+    if unread := [name for name in given if given[name] and name not in MODELS[model]]:
         raise InputError(
-            f"{where}: camera_model {model} is not known here "
-            f"({', '.join((*PERSPECTIVE, RATIONAL, FISHEYE))})"
+            f"{where}: {', '.join(unread)} must be 0 with {model}; of the models that are read, "
+            f"only {FISHEYE} has k4, and {RATIONAL} has k4, k5 and k6: make a COLMAP model"
         )
-    # k4 is a coefficient of r^8 in nerfstudio and Metashape, but a divisor in OpenCV; only RATIONAL
-    # says which.
-    if any((k4, k5, k6)):
-        raise InputError(
-            f"{where}: k4, k5 and k6 are read of {FISHEYE} and {RATIONAL} alone: make a COLMAP "
-            "model"
-        )
-    if k3:
-        return RATIONAL, (k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
-    return ("OPENCV", (k1, k2, p1, p2)) if any((k1, k2, p1, p2)) else ("PINHOLE", ())
+    params = tuple(given[name] for name in MODELS[model])
+    return (model, params) if any(params) or model != "OPENCV" else ("PINHOLE", ())
 
 
-def _focal_length(
-    side: float, given: float | None, angle: float | None, degrees: float | None
-) -> float | None:
-    """The focal length in px along a side, given or from the field of view (radians or degrees).
+def _fields_of_view(
+    record: TransformsRecord, frame: FrameRecord, width: float, height: float
+) -> list[tuple[float | None, float | None]]:
+    """For x and for y the focal length in px that is given, and that which the field of view means.
 
-    None if nothing is given, and 0 if the field of view is not between 0 and 180 degrees.
+    The latter is 0 if the field of view is not between 0 and 180 degrees.
     """
-    if given is not None:
-        return given
-    if angle is None and degrees is not None:
-        angle = math.radians(degrees)
-    if angle is None:
-        return None
-    return side / (2 * math.tan(angle / 2)) if 0 < angle < math.pi else 0.0
-
-
-def focal_ratios(record: TransformsRecord, camera: CameraModel) -> list[Finding]:
-    """Focal lengths over those that fields of view mean, where a record gives both."""
     found = []
-    for source in (record, *record.frames):
-        width = camera.width if source.w is None else source.w
-        height = camera.height if source.h is None else source.h
-        given = (source.fl_x, source.fl_y)
-        meant = (
-            _focal_length(width, None, source.camera_angle_x, source.x_fov),
-            _focal_length(height, None, source.camera_angle_y, source.y_fov),
-        )
-        for length, other in zip(given, meant, strict=True):
-            if length and other:
-                name = [source.file_path] if isinstance(source, FrameRecord) else ["the file"]
-                found.append(Finding(length / other, name, {"given": length, "meant": other}))
+    source = _source(record, frame, FOCAL_KEYS)
+    for side, axis in ((width, "x"), (height, "y")):
+        angle, degrees = getattr(source, f"camera_angle_{axis}"), getattr(source, f"{axis}_fov")
+        if angle is None and degrees is not None:
+            angle = math.radians(degrees)
+        meant = None
+        if angle is not None:
+            meant = side / (2 * math.tan(angle / 2)) if 0 < angle < math.pi else 0.0
+        found.append((getattr(source, f"fl_{axis}"), meant))
     return found
+
+
+def focal_ratios(
+    record: TransformsRecord, frame: FrameRecord, camera: CameraModel
+) -> list[Finding]:
+    """Focal lengths over those that fields of view mean, where both are given."""
+    return [
+        Finding(given / meant, [frame.file_path], {"given": given, "meant": meant})
+        for given, meant in _fields_of_view(record, frame, camera.width, camera.height)
+        if given and meant
+    ]

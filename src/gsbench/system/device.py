@@ -18,28 +18,23 @@ def select_device(name: str, setting: str = "device") -> torch.device:
         raise InputError(
             f"{setting}={name} is not known to torch; use auto, cpu, cuda or cuda:1"
         ) from error
-    if device.type == "cuda" and not torch.cuda.is_available():
+    if device.type != "cuda":
+        return device
+    if available == "cpu":
         raise InputError(
             f"{setting}={name}: torch finds no CUDA device here; use {setting}=cpu, or install "
             "torch for CUDA"
         )
-    if (
-        device.type == "cuda"
-        and device.index is not None
-        and device.index >= torch.cuda.device_count()
-    ):
+    if (device.index or 0) >= (count := torch.cuda.device_count()):
+        raise InputError(f"{setting}={name}: there are {count} CUDA devices, numbered from 0")
+    disable_tf32()
+    try:
+        torch.cuda.mem_get_info(device)
+    except RuntimeError as error:
+        reason = str(error).partition("\n")[0]
         raise InputError(
-            f"{setting}={name}: there are {torch.cuda.device_count()} CUDA devices, numbered from 0"
-        )
-    if device.type == "cuda":
-        disable_tf32()
-        try:
-            torch.cuda.mem_get_info(device)
-        except RuntimeError as error:
-            reason = str(error).partition("\n")[0]
-            raise InputError(
-                f"{setting}={name}: {reason}; does another program hold the GPU (see nvidia-smi)?"
-            ) from error
+            f"{setting}={name}: {reason}; does another program hold the GPU (see nvidia-smi)?"
+        ) from error
     return device
 
 

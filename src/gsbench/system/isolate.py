@@ -29,11 +29,11 @@ from collections.abc import Callable
 from contextlib import suppress
 from logging.handlers import QueueHandler
 from pathlib import Path
-from queue import SimpleQueue
-from typing import Any, BinaryIO, TypeVar
+from types import SimpleNamespace
+from typing import IO, Any, TypeVar
 
 from gsbench.errors import GsbenchError
-from gsbench.logs import LOGGER, Progress
+from gsbench.logs import LOGGER, Progress, no_progress
 from gsbench.system.programs import allowed_modules
 
 PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36  # linux/prctl.h
@@ -141,51 +141,36 @@ class CrashError(GsbenchError):
 
 
 def run_isolated(
-    function: Callable[..., T], *args: Any, what: str | None = None, log: Path | None = None
+    function: Callable[..., T],
+    *args: Any,
+    what: str | None = None,
+    log: Path | None = None,
+    progress: Progress | None = None,
 ) -> T:
     """Return ``function(*args)``, computed in a fresh child process.
 
     ``function`` must be a top-level function of a module other than ``__main__``. The function, its
     arguments and its result are pickled. ``what`` names the work in errors ("undistortion"). The
     output of the child, also of native libraries, is appended to the file ``log``; without ``log``
-    it is dropped on success. Warnings that the function logs are logged here.
+    it is dropped on success. What the function logs is logged here. With ``progress``, its last
+    argument is a `Progress` that is forwarded.
 
     An exception of the function is raised again here, with the child's traceback as a note. A crash
     of the process raises `CrashError`, whose message ends with the last error lines of the output.
     """
     what = what or function.__name__
-    with tempfile.TemporaryDirectory(prefix="gsbench-isolate-") as folder:
-        call, result = Path(folder, "call.pickle"), Path(folder, "result.pickle")
-        call.write_bytes(pickle.dumps((function, args)))
-        output = log if log is not None else Path(folder, "output.txt")
-        with output.open("ab") as stream:
-            start = stream.seek(0, os.SEEK_END)
-            code = _run_child(call, result, stream)
-        if code != 0 or not result.is_file():
-            raise CrashError(
-                f"{what} {describe_exit(code)}; its last lines: {error_tail(output, start)}"
-            )
-        succeeded, value, trace, records = pickle.loads(result.read_bytes())
-    for record in records:
-        logging.getLogger(record.name).handle(record)
+    call = pickle.dumps((function, args, progress is not None))
+    with log.open("ab+") if log else tempfile.TemporaryFile() as output:
+        start = output.seek(0, os.SEEK_END)
+        code, result = _run_child(call, output, progress or no_progress)
+        if code != 0 or result is None:
+            reason = error_tail(os.dup(output.fileno()), start)
+            raise CrashError(f"{what} {describe_exit(code)}; its last lines: {reason}")
+    succeeded, value, trace = result
     if succeeded:
         return value
     value.add_note(f"raised in the isolated process of {what}:\n{trace}")
     raise value
-
-
-POLL_SECONDS = 0.25
-
-
-class ProgressFile:
-    """A `Progress` that appends short lines to a file, from which the parent process reads."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __call__(self, phase: str, done: int, total: int | None, note: str = "") -> None:
-        with self.path.open("a", encoding="utf-8") as file:
-            file.write(f"{phase}\t{done}\t{'' if total is None else total}\t{note}\n")
 
 
 def run_with_progress(
@@ -196,33 +181,7 @@ def run_with_progress(
     log: Path | None = None,
 ) -> T:
     """Return ``function(job, progress)``, computed by `run_isolated`; its progress is forwarded."""
-    with tempfile.TemporaryDirectory(prefix="gsbench-progress-") as folder:
-        channel = ProgressFile(Path(folder, "progress.txt"))
-        channel.path.touch()
-        ended = threading.Event()
-        listener = threading.Thread(
-            target=_listen, args=(channel.path, progress, ended), daemon=True
-        )
-        listener.start()
-        try:
-            return run_isolated(function, job, channel, what=what, log=log)
-        finally:
-            ended.set()
-            listener.join()
-
-
-def _listen(path: Path, progress: Progress, ended: threading.Event) -> None:
-    rest = ""
-    with path.open(encoding="utf-8") as file:
-        while True:
-            last = ended.wait(POLL_SECONDS)
-            *lines, rest = (rest + file.read()).split("\n")
-            for line in lines:
-                phase, done, total, note = line.split("\t")
-                with suppress(BrokenPipeError):  # a closed terminal must not stop the work
-                    progress(phase, int(done), int(total) if total else None, note)
-            if last:
-                return
+    return run_isolated(function, job, what=what, log=log, progress=progress)
 
 
 def python_command(module: str, name: str, *arguments: str) -> list[str]:
@@ -243,24 +202,43 @@ def python_command(module: str, name: str, *arguments: str) -> list[str]:
     ]
 
 
-def _run_child(call: Path, result: Path, output: BinaryIO) -> int:
-    """Start the child, wait for it and return its exit code; end it on any exception, as Ctrl-C."""
-    command = python_command("gsbench.system.isolate", "_child", str(call), str(result))
+def _run_child(call: bytes, output: IO[bytes], progress: Progress) -> tuple[int, Any]:
+    """Run the ``call`` in a child; returns its exit code and its result, None without one.
+
+    It is ended on any exception, as Ctrl-C.
+    """
+    command = python_command("gsbench.system.isolate", "_child", str(len(call)))
     # In its own session, the child does not receive Ctrl-C. The parent does and ends it: one
-    # traceback, not two. Nothing is written to the pipe at stdin. When it closes, the child ends,
-    # because the parent wants it or is gone.
+    # traceback, not two. After the call nothing is written to the pipe at stdin. When it closes,
+    # the child ends, because the parent wants it or is gone.
     child = subprocess.Popen(
         command,
         stdin=subprocess.PIPE,
-        stdout=output,
-        stderr=subprocess.STDOUT,
+        stdout=subprocess.PIPE,
+        stderr=output,
         start_new_session=True,
     )
+    assert child.stdin is not None
+    assert child.stdout is not None
+    result = None
     try:
-        return child.wait()
+        with suppress(EOFError, pickle.UnpicklingError, BrokenPipeError):  # the child has ended
+            child.stdin.write(call)
+            child.stdin.flush()
+            while True:
+                content = pickle.load(child.stdout)
+                if isinstance(content, logging.LogRecord):
+                    logging.getLogger(content.name).handle(content)
+                elif isinstance(content, dict):
+                    with suppress(BrokenPipeError):  # a closed terminal must not stop the work
+                        progress(**content)
+                else:
+                    result = content
+        return child.wait(), result
     finally:
-        assert child.stdin is not None
-        child.stdin.close()
+        with suppress(BrokenPipeError):
+            child.stdin.close()
+        child.stdout.close()
         try:
             child.wait(_SECONDS_TO_END if hasattr(os, "fork") else 0)
         except subprocess.TimeoutExpired:
@@ -278,26 +256,37 @@ def _end_group(leader: int) -> None:
 
 
 def _child() -> None:
-    """The main function of the child.
+    """The main function of the child, which gets the pickled call by its standard input.
 
-    The arguments of the process are the paths of the pickled call and of the result to write.
+    Log records, progress (a mapping) and the result go to its standard output, each pickled. What
+    the function itself prints goes to standard error.
     """
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    call = sys.stdin.buffer.read(int(sys.argv[2]))
     if not continue_in_child():
         threading.Thread(target=_end_with_parent, daemon=True).start()
-    call, result = Path(sys.argv[2]), Path(sys.argv[3])
-    function, args = pickle.loads(call.read_bytes())
-    logged = SimpleQueue[logging.LogRecord]()
-    LOGGER.addHandler(QueueHandler(logged))
+    channel, one_at_a_time = os.fdopen(os.dup(1), "wb"), threading.Lock()
+    os.dup2(2, 1)
+
+    def send(content: Any) -> None:
+        message = pickle.dumps(content)
+        with one_at_a_time:
+            channel.write(message)
+            channel.flush()
+
+    def report(phase: str, done: int, total: int | None, note: str = "") -> None:
+        send({"phase": phase, "done": done, "total": total, "note": note})
+
+    LOGGER.addHandler(QueueHandler(SimpleNamespace(put_nowait=send)))
+    function, args, reports = pickle.loads(call)
     try:
-        succeeded, value, trace = True, function(*args), ""
+        result = True, function(*args, *[report] * reports), ""
     except Exception as error:  # noqa: BLE001  raised again in the parent
-        succeeded, value, trace = False, _portable(error), traceback.format_exc()
-    records = [logged.get() for _ in range(logged.qsize())]
-    result.write_bytes(pickle.dumps((succeeded, value, trace, records)))
+        result = False, _portable(error), traceback.format_exc()
+    send(result)
     sys.stdout.flush()
     sys.stderr.flush()
-    # Native libraries are not unloaded, because they may crash then. The result is already written.
+    # Native libraries are not unloaded, because they may crash then. The result is already sent.
     os._exit(0)
 
 
@@ -321,9 +310,9 @@ def describe_exit(code: int) -> str:
     return f"ended early (exit code {code})"
 
 
-def error_tail(output: Path, start: int = 0) -> str:
-    """`error_lines` of the end of an output file, from byte ``start`` on."""
-    with output.open("rb") as stream:
+def error_tail(output: Path | int, start: int = 0) -> str:
+    """`error_lines` of the end of an output (file or descriptor), from byte ``start`` on."""
+    with open(output, "rb") as stream:
         stream.seek(max(start, stream.seek(0, os.SEEK_END) - _TAIL_BYTES))
         return error_lines(stream.read(_TAIL_BYTES))
 

@@ -15,7 +15,7 @@ from gsbench.tracking.mlflow_sink import (
     tracker_uri,
 )
 from gsbench.tracking.sinks import Run, Sink, TensorBoard, WandB
-from gsbench.tracking.trial import Picture, Scalar, TrackedTrial
+from gsbench.tracking.trial import Picture, Scalar, TrackedTrial, Update
 
 __all__ = [
     "MLflow",
@@ -26,6 +26,7 @@ __all__ = [
     "Sink",
     "TensorBoard",
     "TrackedTrial",
+    "Update",
     "WandB",
     "connect",
     "default_uri",

@@ -28,6 +28,8 @@ from gsbench.system.programs import safe_environment
 log = logging.getLogger(__name__)
 
 SECONDS_TO_STOP = 3.0  # patience after a signal that asks to end
+# between two sends: the start of a process that imports a tracker takes 4 CPU-seconds
+SECONDS_BETWEEN_SENDS = 15.0
 # to tell the tracker how trials ended after the sweep's process was killed
 SECONDS_AFTER_PARENT = 10.0
 
@@ -35,9 +37,9 @@ SECONDS_AFTER_PARENT = 10.0
 class Mirror:
     """Sends the trials that begin within a ``with`` block to their trackers; ``idle``: sends none.
 
-    While the block runs, a process sends every ``tracking.flush_seconds``, and whenever a trial has
-    ended; at the end it gets ``tracking.patience_seconds``. Errors of a tracker are never raised:
-    one line in the log says what is missing.
+    While the block runs, a process sends every ``tracking.flush_seconds``, and soon after a trial
+    has ended; at the end it gets ``tracking.patience_seconds``. Errors of a tracker are never
+    raised: one line in the log says what is missing.
     """
 
     def __init__(self, idle: bool = False) -> None:
@@ -91,10 +93,12 @@ class Mirror:
             pauses = [
                 values["tracking"]["flush_seconds"] for _, values in [*self._followed.values()]
             ]
-            self._looks.wait(min(pauses, default=1.0))
+            pause = min(pauses, default=1.0)
+            self._looks.wait(pause)
             self._looks.clear()
             last = self._stop.is_set()
             self._send()
+            self._stop.wait(min(pause, SECONDS_BETWEEN_SENDS))
 
     def _send(self) -> None:
         """Send the followed trials of each experiment, and forget those that have ended."""

@@ -8,7 +8,8 @@ mean. Only public functions of MLflow are used.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,7 +17,7 @@ from filelock import FileLock
 
 from gsbench.analysis.cells import make_cell
 from gsbench.analysis.comparison import Comparison, compare
-from gsbench.analysis.quantities import Quantity, metric_keys
+from gsbench.analysis.quantities import Quantity
 from gsbench.analysis.results import (
     Arm,
     Experiment,
@@ -32,7 +33,7 @@ from gsbench.analysis.table_formats import to_markdown
 from gsbench.analysis.tables import build_table
 from gsbench.errors import InputError
 from gsbench.tracking.mlflow_sink import DESCRIPTION, LOCK, MAX_TAG, connect, ensure_experiment
-from gsbench.tracking.trial import EVAL, eval_name
+from gsbench.tracking.trial import EVAL, numbers_of
 from gsbench.words import counted, markdown_code, markdown_text
 
 if TYPE_CHECKING:
@@ -118,17 +119,14 @@ def _update(
 
 def _means(trials: Sequence[TrialResult]) -> dict[str, float]:
     """Means over scenes of the means over seeds, deviations over seeds, and the count of trials."""
-    readers: dict[str, Callable[[TrialResult], float | None]] = {
-        eval_name(key): lambda trial, key=key: trial.metrics.get(key)  # type: ignore[misc]
-        for key in metric_keys(trials)
-    }
-    readers[f"{EVAL}/gaussians"] = lambda trial: trial.record.num_gaussians
-    readers[f"{EVAL}/minutes"] = lambda trial: (
-        trial.record.seconds["train"] / 60 if "train" in trial.record.seconds else None
-    )
+    measured = {trial.path: numbers_of(trial.record) for trial in trials}
     scenes = sorted({trial.scene for trial in trials})
     numbers: dict[str, float] = {"trials": len(trials)}
-    for name, read in readers.items():
+    for name in dict.fromkeys(chain(*measured.values())):
+
+        def read(trial: TrialResult, name: str = name) -> float | None:
+            return measured[trial.path].get(name)
+
         cell = make_cell(trials, Quantity(name, name, 0, 0, read), scenes, len(trials))
         if cell.mean is not None:
             numbers[name] = cell.mean

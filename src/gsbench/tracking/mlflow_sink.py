@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,8 +21,8 @@ from gsbench.errors import InputError
 from gsbench.files import atomic, require_no_links
 from gsbench.parsing import read_tail
 from gsbench.runs.layout import ARTIFACTS, DATABASE
-from gsbench.tracking.sinks import Run, Status
-from gsbench.tracking.trial import NOTE, Picture, Scalar, TrackedTrial
+from gsbench.tracking.sinks import Run
+from gsbench.tracking.trial import NOTE, TrackedTrial, Update
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -227,36 +226,25 @@ class MLflow:
                 self._client.delete_tag(self._id, ERROR_TAG)
         return self._id
 
-    def params(self, values: Mapping[str, str]) -> None:
-        """Log the settings."""
-        from mlflow.entities import Param
+    def send(self, update: Update) -> None:
+        """Show what is new: the note is the run's description, a failure's reason a tag."""
+        from mlflow.entities import Metric, Param, RunTag
 
-        params = [Param(key, value[:MAX_VALUE]) for key, value in values.items()]
-        self._client.log_batch(self._id, params=params)
-
-    def tags(self, values: Mapping[str, str]) -> None:
-        """Set tags; the note becomes the run's description."""
-        from mlflow.entities import RunTag
-
-        named = {DESCRIPTION if key == NOTE else key: text for key, text in values.items()}
-        tags = [RunTag(key, text[:MAX_TAG]) for key, text in named.items()]
-        self._client.log_batch(self._id, tags=tags)
-
-    def metrics(self, scalars: Sequence[Scalar]) -> None:
-        """Log numbers, which MLflow sends in batches."""
-        from mlflow.entities import Metric
-
-        metrics = [
-            Metric(scalar.key, scalar.value, self._time_of(scalar.seconds), scalar.step)
-            for scalar in scalars
-        ]
-        self._client.log_batch(self._id, metrics=metrics)
-
-    def artifacts(self, files: Mapping[str, Path], pictures: Sequence[Picture]) -> None:
-        """Upload files, and show the pictures in MLflow's grid."""
-        for name, path in files.items():
+        named = {DESCRIPTION if key == NOTE else key: text for key, text in update.tags.items()}
+        if update.reason is not None:
+            named[ERROR_TAG] = update.reason
+        self._client.log_batch(
+            self._id,
+            metrics=[
+                Metric(scalar.key, scalar.value, self._time_of(scalar.seconds), scalar.step)
+                for scalar in update.scalars
+            ],
+            params=[Param(key, value[:MAX_VALUE]) for key, value in update.params.items()],
+            tags=[RunTag(key, text[:MAX_TAG]) for key, text in named.items()],
+        )
+        for name, path in update.files.items():
             self._client.log_artifact(self._id, str(path), name.rpartition("/")[0] or None)
-        for picture in pictures:
+        for picture in update.pictures:
             self._client.log_image(
                 self._id,
                 picture.pixels,
@@ -265,12 +253,8 @@ class MLflow:
                 timestamp=self._time_of(picture.seconds),
                 synchronous=True,
             )
-
-    def close(self, status: Status, reason: str | None) -> None:
-        """End the run; the reason of a failure becomes a tag."""
-        if reason is not None:
-            self._client.set_tag(self._id, ERROR_TAG, reason[:MAX_TAG])
-        self._client.set_terminated(self._id, status)
+        if update.status is not None:
+            self._client.set_terminated(self._id, update.status)
 
     def _found(self, experiment: str, token: str | None) -> Any:
         same = f"tags.`{TOKEN_TAG}` = '{token}'"

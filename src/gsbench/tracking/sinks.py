@@ -3,18 +3,14 @@
 import os
 import shutil
 import uuid
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 from gsbench.files import require_no_links
 from gsbench.parsing import Count, Record
 from gsbench.runs import layout
 from gsbench.system.install import require_package
-from gsbench.tracking.trial import NOTE, Picture, Scalar, TrackedTrial
-
-Status = Literal["FINISHED", "FAILED", "KILLED"]
+from gsbench.tracking.trial import NOTE, TrackedTrial, Update
 
 
 class Run(Record):
@@ -33,31 +29,27 @@ class Run(Record):
 class Sink(Protocol):
     """One trial in a tracker; a new object is made for each.
 
-    The methods are called in a process of their own, in the order below; each may raise any error,
-    which ends the mirroring and harms no trial. The process may be killed at any moment, and ends
-    without clean-up. So each method must send at once what it gets, and may get it again.
+    The methods are called in a process of their own; each may raise any error, which ends the
+    mirroring and harms no trial. The process may be killed at any moment, and ends without
+    clean-up. So `send` must send at once what it gets, and may get it again.
 
     Examples:
         Only the last value of each metric is kept:
 
         >>> from types import SimpleNamespace
+        >>> from gsbench.tracking import Scalar, Update
         >>> class Latest:
         ...     def open(self, trial, run):
         ...         self.shown = {}
         ...         return run.token
         ...
-        ...     def metrics(self, scalars):
-        ...         self.shown |= {one.key: one.value for one in scalars}
-        ...
-        ...     def params(self, values): ...
-        ...     def tags(self, values): ...
-        ...     def artifacts(self, files, pictures): ...
-        ...     def close(self, status, reason): ...
+        ...     def send(self, update):
+        ...         self.shown |= {one.key: one.value for one in update.scalars}
 
         >>> latest = Latest()
         >>> latest.open(None, SimpleNamespace(token="a"))
         'a'
-        >>> latest.metrics([SimpleNamespace(key="loss", value=0.2, step=100)])
+        >>> latest.send(Update(scalars=[Scalar("loss", 0.2, step=100, seconds=3.0)]))
         >>> latest.shown
         {'loss': 0.2}
     """
@@ -69,20 +61,8 @@ class Sink(Protocol):
         ``run.replaces`` may be deleted. If ``run.complete``, the tracker may lack nothing.
         """
 
-    def params(self, values: Mapping[str, str]) -> None:
-        """Show the trial's settings."""
-
-    def tags(self, values: Mapping[str, str]) -> None:
-        """Show texts by which the trial is found; `NOTE` describes it."""
-
-    def metrics(self, scalars: Sequence[Scalar]) -> None:
-        """Log numbers."""
-
-    def artifacts(self, files: Mapping[str, Path], pictures: Sequence[Picture]) -> None:
-        """Keep files, by their paths in the tracker, and show pictures of test views."""
-
-    def close(self, status: Status, reason: str | None) -> None:
-        """Show that the trial has ended; ``reason`` is that of a failure."""
+    def send(self, update: Update) -> None:
+        """Show what is new: first settings and tags, then curves, then the end of the trial."""
 
 
 class TensorBoard:
@@ -102,30 +82,19 @@ class TensorBoard:
         self._writer, self._run = SummaryWriter(str(folder)), run
         return uuid.uuid4().hex
 
-    def params(self, values: Mapping[str, str]) -> None:
-        self._table("settings", values)
-
-    def tags(self, values: Mapping[str, str]) -> None:
-        self._table("trial", values)
-
-    def metrics(self, scalars: Sequence[Scalar]) -> None:
-        for scalar in scalars:
+    def send(self, update: Update) -> None:
+        for name, values in (("settings", update.params), ("trial", update.tags)):
+            rows = "".join(f"| {key} | {value} |\n" for key, value in values.items())
+            if rows:
+                self._writer.add_text(name, f"| | |\n|---|---|\n{rows}")
+        for scalar in update.scalars:
             time = self._run.started / 1000 + scalar.seconds
             self._writer.add_scalar(scalar.key, scalar.value, scalar.step, time)
-        self._writer.flush()
-
-    def artifacts(self, files: Mapping[str, Path], pictures: Sequence[Picture]) -> None:
-        for picture in pictures:
+        for picture in update.pictures:
             self._writer.add_image(picture.key, picture.pixels, picture.step, dataformats="HWC")
+        if update.status:
+            self._writer.add_text("status", ": ".join(filter(None, [update.status, update.reason])))
         self._writer.flush()
-
-    def close(self, status: Status, reason: str | None) -> None:
-        self._writer.add_text("status", status if reason is None else f"{status}: {reason}")
-        self._writer.flush()
-
-    def _table(self, name: str, values: Mapping[str, str]) -> None:
-        rows = "".join(f"| {key} | {value} |\n" for key, value in values.items())
-        self._writer.add_text(name, f"| | |\n|---|---|\n{rows}")
 
 
 # gsbench's axis: W&B's step must only grow, and two files of curves are read one after the other
@@ -154,46 +123,41 @@ class WandB:
         import wandb
 
         folder = trial.folder.runs / layout.WANDB
-        for name in ("wandb", ".wandb"):  # where its client writes
-            require_no_links(trial.folder.runs, folder / name)
+        for place in ("wandb", ".wandb"):  # where its client writes
+            require_no_links(trial.folder.runs, folder / place)
         folder.mkdir(exist_ok=True)
-        self._root = trial.folder.path
+        self._root, scene = trial.folder.path, trial.values["scene"]["name"]
         self._run: Any = wandb.init(
             project=trial.values["name"],
             name=trial.label,
             id=run.token,
             resume="allow",
-            group=f"{trial.values['scene']['name']} {trial.arm}",
-            tags=[trial.values["scene"]["name"], trial.arm],
+            group=f"{scene} {trial.arm}",
+            tags=[scene, trial.arm],
             dir=str(folder),
             settings=wandb.Settings(silent=True, console="off"),
         )
         self._run.define_metric("*", step_metric=STEP)
         return name
 
-    def params(self, values: Mapping[str, str]) -> None:
-        self._run.config.update(dict(values), allow_val_change=True)
+    def send(self, update: Update) -> None:
+        import wandb
 
-    def tags(self, values: Mapping[str, str]) -> None:
-        self._run.notes = values.get(NOTE, self._run.notes)
-        self.params({key: value for key, value in values.items() if key != NOTE})
-
-    def metrics(self, scalars: Sequence[Scalar]) -> None:
+        shown = {**update.params, **update.tags}
+        self._run.notes = shown.pop(NOTE, self._run.notes)
+        self._run.config.update(shown, allow_val_change=True)
         by_step: dict[int, dict[str, float]] = {}
-        for scalar in scalars:
+        for scalar in update.scalars:
             by_step.setdefault(scalar.step, {})[scalar.key] = scalar.value
         for step, values in by_step.items():
             self._run.log({STEP: step, **values})
-
-    def artifacts(self, files: Mapping[str, Path], pictures: Sequence[Picture]) -> None:
-        import wandb
-
-        for picture in pictures:
+        for picture in update.pictures:
             self._run.log({STEP: picture.step, picture.key: wandb.Image(picture.pixels)})
-        for path in files.values():
+        for path in update.files.values():
             self._run.save(str(path), base_path=str(self._root), policy="now")
-
-    def close(self, status: Status, reason: str | None) -> None:
-        if status != "FINISHED":
-            self._run.summary["error" if reason else "status"] = reason or status
-        self._run.finish(int(status != "FINISHED"))
+        if update.status in ("FAILED", "KILLED"):
+            self._run.summary["error" if update.reason else "status"] = (
+                update.reason or update.status
+            )
+        if update.status:
+            self._run.finish(int(update.status != "FINISHED"))

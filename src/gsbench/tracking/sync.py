@@ -24,7 +24,7 @@ from gsbench.system.programs import own_folder
 from gsbench.tracking.ideas import show_ideas
 from gsbench.tracking.mlflow_sink import VARIABLE, absolute_address
 from gsbench.tracking.sinks import Run, Sink
-from gsbench.tracking.trial import TrackedTrial
+from gsbench.tracking.trial import TrackedTrial, Update
 from gsbench.words import counted
 
 OWN = "gsbench.tracking."
@@ -185,39 +185,33 @@ def mirror(
         if name != run.id:
             run = Run(token=run.token, started=run.started, id=name)
         if not run.described:
-            sink.params(trial.params())
-            sink.tags(trial.tags())
+            sink.send(Update(params=trial.params(), tags=trial.tags()))
         run = keep(run, described=True)
         is_shown = run.ended == trial.ending() if results is None else run.complete == results
         if is_shown and not live:
             return False
         for name, newest, scalars in trial.curves(run.logged, live):
-            sink.metrics(scalars)
+            sink.send(Update(scalars=scalars))
             run = keep(run, logged=run.logged | {name: newest})
         if not live:
-            if _end(sink, trial, options):
+            ending = _ending(trial, options)
+            sink.send(ending)
+            if ending.status == "FINISHED":
                 keep(run, complete=trial.results_hash())
             else:
                 keep(run, ended=trial.ending())
         return True
 
 
-def _end(sink: Sink, trial: TrackedTrial, options: Mapping[str, Any]) -> bool:
-    """Close the run as the trial's files say: failed, done, else killed; True if it is done."""
+def _ending(trial: TrackedTrial, options: Mapping[str, Any]) -> Update:
+    """The end of a trial as its files say: failed, done, else killed."""
     folder = trial.folder
     if folder.has_failed():
-        sink.artifacts(trial.files((CONFIG, FAILED, LOG)), ())
-        sink.close("FAILED", folder.failure().reason)
-    elif (results := folder.sound_record()) is None:
-        sink.close("KILLED", None)
-    else:
-        summary = trial.summary(results, int(options["images"]), bool(options.get("model")))
-        sink.metrics(summary.scalars)
-        sink.tags(summary.tags)
-        sink.artifacts(summary.files, summary.pictures)
-        sink.close("FINISHED", None)
-        return True
-    return False
+        files = trial.files((CONFIG, FAILED, LOG))
+        return Update(files=files, status="FAILED", reason=folder.failure().reason)
+    if (results := folder.sound_record()) is None:
+        return Update(status="KILLED")
+    return trial.summary(results, int(options["images"]), bool(options.get("model")))
 
 
 def _state_file(folder: TrialFolder, options: Mapping[str, Any]) -> Path:

@@ -2,9 +2,9 @@
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,6 +71,20 @@ def eval_name(key: str) -> str:
     return f"{EVAL}/{key}_{unit}" if unit else f"{EVAL}/{key}"
 
 
+def numbers_of(results: TrialRecord) -> dict[str, float]:
+    """The numbers at the end of a trial by their names in a tracker, results first."""
+    numbers: dict[str, float | None] = {
+        eval_name(key): value for key, value in results.metrics.items()
+    }
+    # None: unknown, for renders of another program
+    numbers[f"{EVAL}/gaussians"] = results.num_gaussians
+    numbers[f"{EVAL}/init_points"] = results.num_init_points
+    numbers[f"{EVAL}/peak_memory_MB"] = results.peak_memory_mb
+    if "train" in results.seconds:
+        numbers[f"{EVAL}/minutes"] = results.seconds["train"] / 60
+    return {name: value for name, value in numbers.items() if value is not None}
+
+
 @dataclass(frozen=True)
 class Scalar:
     """One number of a trial: its name, value, iteration, and the seconds of training until then."""
@@ -92,13 +106,20 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Summary:
-    """The parts of a finished trial that a tracker shows; the tag ``note`` is in Markdown."""
+class Update:
+    """The part of a trial that a tracker is to show from now on, beside what it shows.
 
-    scalars: Sequence[Scalar]
-    tags: dict[str, str]
-    files: dict[str, Path]  # by their paths in the tracker
-    pictures: Sequence[Picture]
+    Settings and tags are texts by their names; the tag `NOTE` describes the trial in Markdown.
+    ``status`` says that the trial has ended, ``reason`` why it failed.
+    """
+
+    params: Mapping[str, str] = field(default_factory=dict)
+    tags: Mapping[str, str] = field(default_factory=dict)
+    scalars: Sequence[Scalar] = ()
+    files: Mapping[str, Path] = field(default_factory=dict)  # by their paths in the tracker
+    pictures: Sequence[Picture] = ()
+    status: Literal["FINISHED", "FAILED", "KILLED"] | None = None
+    reason: str | None = None
 
 
 @dataclass(frozen=True)
@@ -175,25 +196,16 @@ class TrackedTrial:
                     ],
                 )
 
-    def summary(self, results: TrialRecord, images: int, with_model: bool) -> Summary:
+    def summary(self, results: TrialRecord, images: int, with_model: bool) -> Update:
         """The finished trial with at most ``images`` test views, and its model ``with_model``."""
         step, seconds = results.iterations, results.seconds.get("train", results.iterations / 1000)
-        numbers = {eval_name(key): value for key, value in results.metrics.items()}
-        counts = {
-            "gaussians": results.num_gaussians,
-            "init_points": results.num_init_points,
-            "peak_memory_MB": results.peak_memory_mb,
-        }
-        # None: unknown, for renders of another program
-        numbers |= {f"{EVAL}/{key}": value for key, value in counts.items() if value is not None}
-        if "train" in results.seconds:
-            numbers[f"{EVAL}/minutes"] = results.seconds["train"] / 60
         scalars = []
         for at, measured in results.metrics_at.items():
             then = seconds * int(at) / max(1, step)
             for key, value in measured.metrics.items():
                 scalars.append(Scalar(eval_name(key), float(value), int(at), then))
-        scalars += [Scalar(key, float(value), step, seconds) for key, value in numbers.items()]
+        numbers = numbers_of(results).items()
+        scalars += [Scalar(key, float(value), step, seconds) for key, value in numbers]
         tags = {
             "protocol": results.protocol,
             "raster": results.raster,
@@ -208,7 +220,7 @@ class TrackedTrial:
         pictures = [
             Picture(key, pixels, step, seconds) for key, pixels in self._pictures(images).items()
         ]
-        return Summary(scalars, tags, files, pictures)
+        return Update(tags=tags, scalars=scalars, files=files, pictures=pictures, status="FINISHED")
 
     def files(self, names: Sequence[str]) -> dict[str, Path]:
         """The files among ``names`` that the trial's folder has."""

@@ -11,7 +11,6 @@ from gsbench.init.colmap.alignment import (
     align_poses,
     fit_similarity,
     rotation_angles,
-    transformed_rotations,
 )
 
 TRUE_SCALE = 2.5
@@ -48,8 +47,7 @@ def test_reflected_points_give_a_rotation():
 
 def test_three_cameras_give_a_similarity_and_two_do_not():
     assert align_poses(*poses(3)).scale == pytest.approx(TRUE_SCALE, rel=1e-9)
-    with pytest.raises(ValueError, match="at least 3 common cameras, got 2"):
-        align_poses(*poses(2))
+    assert align_poses(*poses(2)) is None
 
 
 @pytest.mark.parametrize("away", [0.0, 1000.0])
@@ -64,7 +62,7 @@ def test_wrong_cameras_do_not_change_the_alignment(away):
     assert_allclose(similarity(centers), moved, atol=1e-8)
     # wrong cameras do move plain least squares
     assert abs(fit_similarity(centers, wrong).scale - TRUE_SCALE) > 0.5
-    angles = rotation_angles(transformed_rotations(similarity, rotations), moved_rotations)
+    angles = rotation_angles(rotations @ similarity.rotation.T, moved_rotations)
     assert angles.max() < 1e-6
 
 
@@ -78,10 +76,9 @@ def test_cameras_on_a_line_are_aligned_by_their_orientations():
 
 
 @pytest.mark.parametrize("centers", [np.zeros((2, 3)), np.ones((5, 3))])
-def test_too_few_or_coinciding_cameras_are_refused(centers):
+def test_too_few_or_coinciding_cameras_are_not_aligned(centers):
     rotations = np.tile(np.eye(3), (len(centers), 1, 1))
-    with pytest.raises(ValueError, match="similarity needs"):
-        align_poses(centers, rotations, centers, rotations)
+    assert align_poses(centers, rotations, centers, rotations) is None
 
 
 @pytest.mark.parametrize("degrees", [0.0, 1e-6, 0.05, 30.0, 179.9, 180.0])

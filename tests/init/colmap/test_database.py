@@ -1,7 +1,6 @@
 """COLMAP's database as pycolmap reads it back: shared cameras, strongest features, counts."""
 
 import itertools
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,7 +31,8 @@ SIZES["c.png"] = (40, 32)
 
 
 def groups_of(images, names=tuple(SIZES), sharing="exif", focal=None):
-    return made.unknown_camera_groups(images, list(names), sharing, "SIMPLE_RADIAL", focal)
+    options = Sfm(camera=sharing, focal_length=focal)
+    return made.unknown_camera_groups(images, list(names), options)
 
 
 @pytest.fixture
@@ -160,9 +160,6 @@ def test_ids_follow_the_names_and_each_camera_has_a_rig(database):
         for image in stored:
             camera = by_id[image.camera_id]
             assert (camera.width, camera.height) == SIZES[image.name]
-    with made.image_ids_as_names(database) as names:
-        assert made.image_ids(database) == {number: int(number) for number in names.values()}
-    assert made.image_ids(database).keys() == SIZES.keys()
 
 
 def test_the_strongest_features_are_those_of_the_largest_area(database):
@@ -194,46 +191,27 @@ def write_geometries(database, inliers):
 
 def test_verified_pairs_are_counted_only_with_inliers(database):
     keypoints = {name: np.ones((10 + place, 2)) for place, name in enumerate(SIZES)}
-    made.write_keypoints(database, keypoints)
     matches, inliers = np.stack([np.arange(9)] * 2, axis=1), {"ab": 1, "bc": 7, "ac": 0}
     pairs = {(f"{a}.png", f"{b}.png"): count for (a, b), count in inliers.items()}
-    made.write_matches(database, dict.fromkeys(pairs, matches))
+    made.write_features(database, keypoints, dict.fromkeys(pairs, matches))
     write_geometries(database, {pair: matches[:count] for pair, count in pairs.items()})
     counts = {"features": 60, "pairs_matched": 3, "pairs_verified": 2, "inlier_matches": 8}
     assert made.database_counts(database) == counts
 
 
 def test_assumed_focal_lengths_count_as_known(database):
-    made.write_keypoints(database, dict.fromkeys(SIZES, np.ones((3, 2))))
-    some, none = np.zeros((1, 2)), np.zeros((0, 2))
-    matches = {("c.png", "b.png"): some, ("a.png", "b.png"): some, ("a.png", "c.png"): none}
-    made.write_matches(database, matches)
+    some = np.zeros((1, 2))
+    keypoints = dict.fromkeys(SIZES, np.ones((3, 2)))
+    made.write_features(database, keypoints, {("a.png", "b.png"): some})
     write_geometries(database, {("a.png", "b.png"): some})
     assert made.cameras_without_prior(database)
     for factor in (0.9, 5.0):  # at the second factor no focal length is unknown
-        pairs = made.assume_focal_lengths(database, factor)
-        assert pairs == [("a.png", "b.png"), ("b.png", "c.png")]
+        made.assume_focal_lengths(database, factor)
         assert not made.cameras_without_prior(database)
         with pycolmap.Database.open(database) as opened:
             assert [camera.focal_length for camera in opened.read_all_cameras()] == [36.0, 36.0]
             # they were verified with other focal lengths
             assert opened.num_verified_image_pairs() == 0
-
-
-@pytest.mark.parametrize("count, each", [(30, 50), (120, 50), (2100, 105)])
-def test_verification_reports_progress_in_parts(database, monkeypatch, count, each):
-    """A part has 50 pairs, or a twentieth of all; each pair is listed once, by image ids."""
-    pairs, listed, told = [("a.png", "b.png"), ("left/a.png", "c.png")] * (count // 2), [], []
-
-    def verify(path, file, options):
-        listed.extend(file.read_text().splitlines())
-
-    monkeypatch.setattr(pycolmap, "verify_matches", verify)
-    matches.verify_pairs(database, pairs, None, lambda *state: told.append(state))
-    assert told == [("verify", done, count) for done in (*range(0, count, each), count)]
-    ids = made.image_ids(database)
-    assert listed == [f"{ids[first]} {ids[second]}" for first, second in pairs]
-    assert not list(database.parent.glob("*.txt"))
 
 
 @pytest.mark.parametrize("threads, each", [(1, 8), (4, 8), (9, 18)])
@@ -244,8 +222,9 @@ def test_features_are_extracted_from_eight_images_at_a_time_or_two_per_thread(
     monkeypatch.setattr(pycolmap, "extract_features", lambda *_, **options: calls.append(options))
     masks = images if threads == 4 else None
     own = {"max_num_features": 70, "peak_threshold": 0.01, "edge_threshold": 9.0, "first_octave": 1}
-    settings, tell = Sfm(max_image_size=500, **own), lambda *state: told.append(state)
-    matches.extract_sift(Path("x.db"), images, names, settings, threads, tell, masks)
+    settings = Sfm(max_image_size=500, threads=threads, **own)
+    task = made.DatabaseTask(Path("x.db"), images, names, [])
+    matches.extract_sift(task, settings, lambda *state: told.append(state), masks)
     assert [name for call in calls for name in call["image_names"]] == names
     assert told == [("extract", done, 40) for done in (*range(0, 40, each), 40)]
     for call in calls:
@@ -269,16 +248,6 @@ def test_images_that_colmap_cannot_read_become_png_under_the_same_name(images, t
     assert made.readable_images(images, names, tmp_path / "work") == folder  # made again
 
 
-def test_masks_have_the_names_that_colmap_expects(images, tmp_path):
-    assert made.colmap_masks({}, tmp_path) is None
-    given = {"a.png": images / "b.png", "left/b.png": images / "c.png"}
-    for _ in range(2):
-        folder = made.colmap_masks(given, tmp_path)
-        for name, mask in given.items():
-            assert (folder / f"{name}.png").resolve() == mask
-        assert len([path for path in folder.rglob("*.png") if path.is_symlink()]) == 2
-
-
 def test_reference_cameras_are_marked_as_known_and_grouped_with_their_images():
     model = pycolmap.Reconstruction()
     for number, focal in ((1, 50.0), (2, 60.0)):
@@ -295,29 +264,20 @@ def test_reference_cameras_are_marked_as_known_and_grouped_with_their_images():
     assert not any(camera.has_prior_focal_length for camera in model.cameras.values())  # copies
 
 
-@pytest.mark.parametrize(
-    "count, processes, size", [(48, 2, 10), (10, 1, 3), (4, 8, 2), (200, 1, 16), (33, 3, 6)]
-)
-def test_parts_are_small_enough_for_six_per_process(count, processes, size):
-    """sqrt(12 processes) blocks, rounded up, with ``size`` images each, at least 2 and at most 16."""
-    assert matches._block_size(count, processes) == size
-
-
 def test_matching_is_divided_over_processes_and_reports_one_sum(database, monkeypatch):
     jobs, told = [], []
 
     def match(function, job, progress, what):
         """Act as a process that finds one match in its first pair."""
         jobs.append(job)
-        assert made.image_ids(job.template) == {str(number): number for number in range(1, 6)}
-        shutil.copyfile(job.template, job.result)
+        assert made.image_ids(job.result) == {str(number): number for number in range(1, 6)}
         with pycolmap.Database.open(job.result) as opened:
             opened.write_matches(*job.parts[0][0], np.array([[3, 4]], dtype=np.uint32))
         progress("match", sum(map(len, job.parts)), None)
 
     monkeypatch.setattr(matches, "run_with_progress", match)
     pairs = list(itertools.combinations(SIZES, 2))
-    matches.match_sift(database, pairs, Sfm(), 3, lambda *state: told.append(state))
+    matches.match_sift(database, pairs, Sfm(threads=3), lambda *state: told.append(state))
     assert (told[0], max(told)) == (("match", 0, 10), ("match", 10, 10))
     assert len({job.result for job in jobs}) == len(jobs) == 3
     divided = [pair for job in jobs for part in job.parts for pair in part]

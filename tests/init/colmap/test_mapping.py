@@ -9,15 +9,15 @@ from PIL import Image
 
 from gsbench.init import Sfm
 from gsbench.init.colmap import mapping
-from gsbench.init.colmap.alignment import similarity_to
+from gsbench.init.colmap.alignment import align_poses
 from gsbench.init.colmap.database import (
+    DatabaseTask,
     create_database,
     unknown_camera_groups,
-    write_keypoints,
-    write_matches,
+    write_features,
 )
-from gsbench.init.colmap.mapping import Attempt, Geometry, map_images, measure_geometry
-from gsbench.init.colmap.matches import verification_options, verify_pairs
+from gsbench.init.colmap.mapping import Geometry, map_images, measure_geometry
+from gsbench.init.colmap.matches import verify_pairs
 from gsbench.init.colmap.pairs import select_pairs
 from gsbench.init.colmap.reconstruct import common_poses
 from gsbench.logs import no_progress
@@ -25,7 +25,6 @@ from tests.helpers import refusal
 from tests.init.models import add_point, camera_at, model_with
 
 WIDTH, HEIGHT, FOCAL = 640, 480, 520.0  # px; COLMAP's guess without EXIF is 1.2 x 640 = 768
-VERIFICATION = verification_options(Sfm())
 
 
 def small_baseline(folder, spread=0.2):
@@ -51,25 +50,26 @@ def small_baseline(folder, spread=0.2):
         keypoints[name] = pixels[inside].astype(np.float32)
     database = folder / "database.db"
     images = folder / "images"
-    create_database(database, unknown_camera_groups(images, names, "single", "SIMPLE_RADIAL", None))
-    write_keypoints(database, keypoints)
+    create_database(database, unknown_camera_groups(images, names, Sfm(camera="single")))
     matches = {}
     for first, second in itertools.combinations(names, 2):
         _, a, b = np.intersect1d(seen[first], seen[second], return_indices=True)
         matches[first, second] = np.stack([a, b], axis=1).astype(np.uint32)
-    write_matches(database, matches)
-    verify_pairs(database, sorted(matches), VERIFICATION, no_progress)
+    write_features(database, keypoints, matches)
+    verify_pairs(database, Sfm(), no_progress)
     return database, centers
 
 
 def mapper_of(folder, options, progress=no_progress):
     """A mapper for three images; its database does not exist."""
-    return mapping._Mapper(folder / "a.db", folder, folder / "out", options, progress, 3)
+    task = DatabaseTask(folder / "a.db", folder, [], [])
+    return mapping._Mapper(task, folder / "out", options, progress, 3)
 
 
-def mapped(database, mapper):
-    images = database.parent / "images"
-    return map_images(database, images, database.parent / "out", Sfm(mapper=mapper), no_progress)
+def mapped(database, mapper, **options):
+    task = DatabaseTask(database, database.parent / "images", [], [])
+    own = Sfm(mapper=mapper, **options)
+    return map_images(task, database.parent / "out", own, no_progress)
 
 
 @pytest.mark.slow
@@ -79,13 +79,13 @@ def test_a_small_baseline_without_a_focal_length_is_placed_by_another_strategy(t
         mapped(database, "incremental")
     result = mapped(database, "auto")
     assert result.model.num_reg_images() == 9
-    assert (result.tried[0].strategy, result.tried[0].images) == ("incremental", 0)
     assert result.strategy != "incremental"
-    (warning,) = result.warnings(Sfm())
-    assert result.strategy in warning
+    (warning,) = result.warnings
+    assert f"{result.strategy!r}: COLMAP's defaults" in warning
+    assert "(images: incremental 0, " in warning
     true = model_with({name: camera_at(center) for name, center in truth.items()})
-    centers, _, true_centers, _ = common_poses(result.model, true)
-    apart = similarity_to(result.model, true)(centers) - true_centers
+    poses = common_poses(result.model, true)
+    apart = align_poses(*poses)(poses[0]) - poses[2]
     assert np.abs(apart).max() < 0.03  # the rig is 0.4 wide
     (camera,) = result.model.cameras.values()
     # such a small baseline determines the focal length weakly
@@ -96,7 +96,7 @@ def test_the_global_mapper_places_all_images(tmp_path):
     database, _ = small_baseline(tmp_path)
     result = mapped(database, "global")
     assert (result.strategy, result.model.num_reg_images()) == ("global", 9)
-    assert result.warnings(Sfm()) == ()
+    assert result.warnings == []
 
 
 @pytest.mark.parametrize("mapper", [pytest.param("auto", marks=pytest.mark.slow), "global"])
@@ -149,8 +149,8 @@ def test_strategies_are_tried_until_one_places_nine_of_ten_images(
     place = next(k for k, sizes in enumerate(found) if best in sizes)
     assert (result.strategy, result.models) == (f"way {place}", len(found[place]))
     most = [max(sizes, default=(0, 0))[0] for sizes in found[:tried]]
-    assert result.tried == tuple(Attempt(f"way {k}", count, "") for k, count in enumerate(most))
-    assert bool(result.warnings(Sfm())) == (tried > 1)
+    tries = ", ".join(f"way {k} {count}" for k, count in enumerate(most))
+    assert [f"images: {tries})" in line for line in result.warnings] == [True] * (tried > 1)
     for sizes, said in (([], "found no pair of images"), ([(2, 99)], "placed only 2 of 10 images")):
         ways[:] = [way("only", sizes)]
         with refusal(said):
@@ -291,12 +291,12 @@ def test_a_smaller_sound_model_is_kept_and_the_setting_is_named(tmp_path, monkey
     monkeypatch.setattr(mapping, "measure_geometry", lambda model: model.geometry)
     ways = [("small", lambda: [Model(7)]), ("large", lambda: [Model(10, 99, 4000.0)])]
     monkeypatch.setattr(mapping._Mapper, "strategies", lambda mapper: iter(ways))
-    result = mapped(tmp_path / "database.db", "auto")
+    result = mapped(tmp_path / "database.db", "auto", pairs="sequential")
     assert (result.strategy, result.model.images) == ("small", 7)
-    (line,) = result.warnings(Sfm(pairs="sequential"))
+    (line,) = result.warnings
     assert "small 7, large 10 (collapsed: depths of its images differ by a factor of 4,000)" in line
     assert "init.pairs=exhaustive may place more" in line
-    assert "init.pairs" not in result.warnings(Sfm())[0]
+    assert "init.pairs" not in mapped(tmp_path / "database.db", "auto").warnings[0]
     ways[:] = ways[1:]
     with refusal("made no sound model of 10 images .large 10 .collapsed"):
         mapped(tmp_path / "database.db", "auto")
@@ -310,8 +310,8 @@ def test_settings_reach_colmaps_mappers(tmp_path, monkeypatch, intrinsics):
     tracks = refine = intrinsics == "estimate"
     own = {"seed": 7, "mapper_threads": 3, "min_model_size": 5, "two_view_tracks": tracks}
     mapper = mapper_of(tmp_path, Sfm(**own, intrinsics=intrinsics))
-    mapper.incremental(mapper.database)
-    mapper.incremental(mapper.database, 2.5)
+    mapper.incremental(mapper.task.database)
+    mapper.incremental(mapper.task.database, 2.5)
     mapper.global_mapping()
     *incremental, together = given
     assert [options.mapper.init_min_tri_angle for options in incremental] == [16.0, 2.5]
@@ -338,16 +338,15 @@ def test_focal_lengths_are_assumed_in_a_copy_whose_pairs_are_verified_again(tmp_
     def note(owner, name, result):
         monkeypatch.setattr(owner, name, lambda *given: calls.append(given) or result)
 
-    note(mapping.colmap_database, "assume_focal_lengths", [("a", "b")])
+    note(mapping.colmap_database, "assume_focal_lengths", None)
     note(mapping.matches, "verify_pairs", None)
     note(mapping._Mapper, "incremental", ["model"])
-    mapper = mapper_of(tmp_path, Sfm(seed=4, min_inliers=9))
+    mapper = mapper_of(tmp_path, Sfm(seed=4))
     assert mapper.with_assumed_focal_lengths(1.4) == ["model"]
-    assumed, (copy, pairs, options, progress), (_, *mapped_from) = calls
+    assumed, (copy, *verified), (_, *mapped_from) = calls
     assert assumed == (tmp_path / "assumed-1.4.db", 1.4)
     assert (copy.read_text(), database.read_text()) == ("cameras", "cameras")
-    assert (pairs, progress) == ([("a", "b")], no_progress)
-    assert (options.ransac.random_seed, options.min_num_inliers) == (4, 9)
+    assert verified == [mapper.options, no_progress]
     assert mapped_from == [copy, 2.0]
     assert not journal.exists()
 

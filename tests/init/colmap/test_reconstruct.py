@@ -11,7 +11,7 @@ from gsbench.init import Sfm
 from gsbench.init.base import TrainingPoints
 from gsbench.init.colmap import alignment, mapping, matches, reconstruct
 from gsbench.init.colmap import pairs as pairing
-from gsbench.init.colmap.database import create_database, write_keypoints, write_matches
+from gsbench.init.colmap.database import DatabaseTask, create_database, write_features
 from gsbench.init.colmap.matches import verify_pairs
 from gsbench.logs import no_progress
 from tests.helpers import refusal
@@ -53,20 +53,19 @@ def database(tmp_path_factory):
         keypoints[name] = pixels.astype(np.float32)
     path = folder / "database.db"
     create_database(path, [(camera(), NAMES)])
-    write_keypoints(path, keypoints)
     same = np.stack([np.arange(len(POINTS))] * 2, axis=1).astype(np.uint32)
     pairs = pairing.select_pairs(NAMES, Sfm())
-    write_matches(path, dict.fromkeys(pairs, same))
-    verify_pairs(path, pairs, matches.verification_options(Sfm()), no_progress)
-    return path
+    write_features(path, keypoints, dict.fromkeys(pairs, same))
+    verify_pairs(path, Sfm(), no_progress)
+    return DatabaseTask(path, folder / "images", NAMES, pairs)
 
 
 def test_points_are_triangulated_from_the_named_images_and_cameras_do_not_change(
     database, tmp_path
 ):
     said, tell = [], lambda *at: said.append(at)
-    inputs = database, database.parent / "images", tmp_path, model_of(poses())
-    model = mapping.triangulate(*inputs, NAMES[:3], Sfm(), tell)
+    task = database._replace(names=NAMES[:3])
+    model = mapping.triangulate(task, tmp_path, model_of(poses()), Sfm(), tell)
     assert said == [("triangulate", 0, 1), ("triangulate", 1, 1)]
     placed = {image.name: image for image in model.images.values()}
     assert sorted(placed) == NAMES  # an image without points has its camera, too
@@ -82,10 +81,9 @@ def test_points_are_triangulated_from_the_named_images_and_cameras_do_not_change
 
 
 def test_matches_that_contradict_the_cameras_are_refused(database, tmp_path):
-    images = database.parent / "images"
     reference = model_of(dict(zip(NAMES, reversed(poses().values()), strict=True)))
     with refusal("no point could be triangulated under the reference cameras"):
-        mapping.triangulate(database, images, tmp_path, reference, NAMES, Sfm(), no_progress)
+        mapping.triangulate(database, tmp_path, reference, Sfm(), no_progress)
 
 
 def test_the_poses_of_two_models_are_paired_by_name():
@@ -102,8 +100,8 @@ def test_the_poses_of_two_models_are_paired_by_name():
     assert_allclose(other_centers, scale * centers + shift, atol=1e-12)
     assert_allclose(rotations, turns, atol=1e-12)
     assert_allclose(other_rotations, rotations, atol=1e-12)
-    assert alignment.similarity_to(first, second).scale == pytest.approx(scale)
-    assert alignment.similarity_to(first, model_of({NAMES[0]: poses()[NAMES[0]]})) is None
+    paired = centers, rotations, other_centers, other_rotations
+    assert alignment.align_poses(*paired).scale == pytest.approx(scale)
     nothing = reconstruct.common_poses(first, pycolmap.Reconstruction())
     assert [part.shape for part in nothing] == [(0, 3), (0, 3, 3)] * 2
 

@@ -3,7 +3,6 @@
 import itertools
 import shutil
 from functools import partial
-from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -16,7 +15,7 @@ from gsbench.init.base import Timer
 from gsbench.init.colmap.database import DatabaseTask, create_database, unknown_camera_groups
 from gsbench.init.colmap.matches import distribute_parts, divide_pairs, extract_sift, match_sift
 from gsbench.init.colmap.pairs import best_pairs
-from gsbench.init.sfm import match_by_sift
+from gsbench.init.reconstruction import Job
 from gsbench.logs import no_progress
 
 pairs_of_some_images = st.integers(2, 40).flatmap(
@@ -51,9 +50,10 @@ def features(bare_photos, tmp_path_factory):
     for name, original in zip(names, bare_photos.image_names, strict=True):
         shutil.copy(bare_photos.images / original, folder / "images" / name)
     database, images = folder / "database.db", folder / "images"
-    create_database(database, unknown_camera_groups(images, names, "single", "PINHOLE", 300.0))
-    extract_sift(database, images, names, Sfm(), 1, no_progress)
-    return database, list(itertools.combinations(names, 2))
+    pairs, options = list(itertools.combinations(names, 2)), Sfm(camera="single", threads=1)
+    create_database(database, unknown_camera_groups(images, names, options))
+    extract_sift(DatabaseTask(database, images, names, pairs), options, no_progress)
+    return database, pairs
 
 
 def read_matches(database):
@@ -83,7 +83,7 @@ def test_matches_equal_those_of_colmap_on_one_thread(features, tmp_path, process
     shutil.copy(database, tmp_path / "database.db")
     told = []
     tell = lambda phase, done, total: told.append(done)  # noqa: E731
-    match_sift(tmp_path / "database.db", pairs, Sfm(), processes, tell)
+    match_sift(tmp_path / "database.db", pairs, Sfm(threads=processes), tell)
     ours, theirs = read_matches(tmp_path / "database.db"), read_matches(tmp_path / "colmap.db")
     assert ours == theirs
     assert sum(len(parts[0]) > 0 for parts in theirs.values()) > 10
@@ -108,7 +108,7 @@ def test_colmaps_matcher_never_gets_a_second_thread(features, tmp_path, monkeypa
 
     monkeypatch.setattr(pycolmap, "match_image_pairs", noting)
     told = []
-    match_sift(tmp_path / "database.db", pairs, Sfm(), 1, lambda *state: told.append(state))
+    match_sift(tmp_path / "database.db", pairs, Sfm(threads=1), lambda *at: told.append(at))
     assert set(threads) == {1}
     assert (told[0], told[-1]) == (("match", 0, len(pairs)), ("match", len(pairs), len(pairs)))
     assert sum(bool(parts[0]) for parts in read_matches(tmp_path / "database.db").values()) > 10
@@ -131,13 +131,13 @@ def test_auto_matches_only_the_pairs_that_a_preview_proposes(
     database, pairs = features
     shutil.copy(database, tmp_path / "database.db")
     names = sorted({name for pair in pairs for name in pair})
-    files = tmp_path / "database.db", bare_photos.images
-    task = DatabaseTask(*files, names, pairs, bare_photos, tmp_path)
+    task = DatabaseTask(tmp_path / "database.db", bare_photos.images, names, pairs)
     monkeypatch.setattr("gsbench.init.colmap.pairs.ALL_PAIRS_UP_TO", 5)
     monkeypatch.setattr("gsbench.init.colmap.pairs.best_pairs", partial(best_pairs, partners=2))
     monkeypatch.setattr("gsbench.init.colmap.matches.extract_sift", lambda *_: None)
-    job = SimpleNamespace(options=Sfm(threads=1, pairs="auto"))
-    counts = match_by_sift(task, job, no_progress, Timer())
+    options = Sfm(threads=1, pairs="auto")
+    job = Job(options, bare_photos, tmp_path, tmp_path, None)
+    counts = options.fill(job, task, no_progress, Timer())
     assert counts["pairs_selected"] + counts["pairs_left_out"] == len(pairs)
     assert counts["pairs_left_out"] > 10
     matched = read_matches(task.database)

@@ -28,4 +28,4 @@ def fingerprint(values):
 @njit
 def _distances(layout, points, limit, result):
     for p in range(len(points)):
-        result[p] = nearest_surface(layout, points[p, 0], points[p, 1], points[p, 2], limit)
+        result[p] = nearest_surface(layout, points[p], limit)

@@ -17,7 +17,6 @@ from gsbench.scene.courtyard.render import (
     ring_camera,
 )
 from gsbench.scene.load import load_scene
-from tests.helpers import refusal
 from tests.scene.cameras import cameras_of
 from tests.scene.captures import read_colmap
 from tests.scene.courtyard.surfaces import fingerprint, surface_distance
@@ -85,10 +84,3 @@ def test_the_images_change_only_with_the_version():
         picture = render_view(build_layout(1), ring_camera(angle, 80, 60), 1)
         made.append([fingerprint(picture[..., channel]) for channel in range(3)])
     assert_allclose(made, PICTURES, atol=0.02, err_msg=str(np.round(made, 3).tolist()))
-
-
-def test_too_few_views_and_too_small_images_are_refused():
-    with refusal(r"scene\.views"):
-        courtyard_cameras(2, 40, 30)
-    with refusal(r"scene\.width"):
-        courtyard_cameras(3, 8, 8)

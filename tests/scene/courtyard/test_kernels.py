@@ -69,7 +69,7 @@ def test_a_ray_hits_a_solid_where_samples_along_it_enter_the_solid(name):
         inside = is_inside(kind, size, origin + steps[:, None] * direction)
         if inside[0] or 0 < inside.sum() < 5:
             continue  # the ray starts inside the solid, or only grazes it
-        found = PLAIN.hit_primitive(kind, size, *origin, *direction)
+        found = PLAIN.hit_primitive(kind, size, origin, direction)
         if inside.any():
             hits += 1
             first = int(inside.argmax())
@@ -84,17 +84,17 @@ def test_the_distance_is_zero_at_a_hit_and_its_gradient_is_the_normal(name):
     kind, size = SHAPES[name]
     tried = 0
     for origin, direction in [*rays(2, 80, 2.0), *(rays(3, 40, 0.0) if size[2] == 0.5 else [])]:
-        t = PLAIN.hit_primitive(kind, size, *origin, *direction)
+        t = PLAIN.hit_primitive(kind, size, origin, direction)
         if t == inf or is_inside(kind, size, origin[None])[0]:
             continue
         tried += 1
         point = origin + t * direction
-        assert PLAIN.signed_distance(kind, size, *point) == pytest.approx(0, abs=1e-9)
+        assert PLAIN.signed_distance(kind, size, point) == pytest.approx(0, abs=1e-9)
         moved = [
-            [PLAIN.signed_distance(kind, size, *(point + s * step)) for s in (1, -1)]
+            [PLAIN.signed_distance(kind, size, point + s * step) for s in (1, -1)]
             for step in 1e-6 * np.eye(3)
         ]
-        *normal, u, v = PLAIN.local_normal(kind, size, *point)
+        normal, (u, v) = PLAIN.local_normal(kind, size, point)
         assert_allclose(normal, np.diff(moved, axis=1)[:, 0] / -2e-6, atol=1e-4)
         assert np.dot(normal, direction) < 0
         x, y, z = point
@@ -115,7 +115,7 @@ def test_the_first_hit_equals_that_of_a_search_over_all_primitives():
     for origin, direction in rays(4, 60, 4.0):
         origin = origin * [1, 1, 0.2] + [0, 0, 1.5]
         local = [
-            PLAIN.hit_primitive(kind, size, *((origin - center) @ turn), *(direction @ turn))
+            PLAIN.hit_primitive(kind, size, (origin - center) @ turn, direction @ turn)
             for kind, center, turn, size in zip(*SOLIDS, strict=True)
         ]
         ground = -origin[2] / direction[2] if direction[2] < 0 else inf
@@ -123,9 +123,9 @@ def test_the_first_hit_equals_that_of_a_search_over_all_primitives():
         index = PLAIN.GROUND if expected == ground else int(np.argmin(local))
         if expected == inf:
             index = PLAIN.SKY
-        t, hit = PLAIN.cast(LAYOUT, *origin, *direction, False)
+        t, hit = PLAIN.cast(LAYOUT, origin, direction, False)
         assert (hit, t) == (index, pytest.approx(expected))
-        _, anything = PLAIN.cast(LAYOUT, *origin, *direction, True)
+        _, anything = PLAIN.cast(LAYOUT, origin, direction, True)
         assert (anything == PLAIN.SKY) == (min(local) == inf)
         found.add(hit)
     assert {PLAIN.GROUND, PLAIN.SKY} < found
@@ -138,12 +138,12 @@ def test_the_nearest_surface_equals_that_of_a_search_over_all_primitives():
         [rng.uniform([-7, -7, 0], [7, 7, 3], (40, 3)), LAYOUT.center[::6] + 0.1]
     ):
         distances = [
-            abs(PLAIN.signed_distance(kind, size, *((point - center) @ turn)))
+            abs(PLAIN.signed_distance(kind, size, (point - center) @ turn))
             for kind, center, turn, size in zip(*SOLIDS, strict=True)
         ]
         expected = min(abs(point[2]), *distances)
         for limit in (0.2, 5.0):
-            found = PLAIN.nearest_surface(LAYOUT, *point, limit)
+            found = PLAIN.nearest_surface(LAYOUT, point, limit)
             assert found == pytest.approx(min(expected, limit))
 
 

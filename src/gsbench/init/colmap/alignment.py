@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -21,53 +22,34 @@ from gsbench.scene.colmap import save_model
 from gsbench.scene.types import Array, Capture, extent_of_centers
 
 
-@dataclass(frozen=True)
-class Alignment:
-    """The comparison of a model with the reference; fields are None if there was none."""
-
-    scale_to_reference: float | None = None  # None without a reference
-    own_gauge: Gauge | None = None
-    pose_errors: PoseErrors | None = None
-    warnings: tuple[str, ...] = ()
-
-
 def align(
     model: pycolmap.Reconstruction,
     reference: pycolmap.Reconstruction | None,
     capture: Capture,
     exact: bool,
     own_gauge: Path | None,
-) -> Alignment:
+) -> dict[str, Any]:
     """Compare estimated poses with the reference, and move the model into the reference's gauge.
 
     ``own_gauge`` is the folder for a copy of the model before it is moved; if it is None, the model
-    is not moved. ``exact`` says that the reference is the truth.
+    is not moved. ``exact`` says that the reference is the truth. Returns arguments of
+    `gsbench.init.report.make_report`.
     """
     if reference is None:
-        return Alignment()
-    similarity = similarity_to(model, reference)
+        return {}
+    similarity = align_poses(*common_poses(model, reference))
     if similarity is None:
         few = "too few common cameras with the reference: poses are neither aligned nor compared"
-        return Alignment(warnings=(few,))
+        return {"warnings": (few,)}
     extent = training_extent(reference, capture)
     errors = compare_poses(model, reference, similarity, extent, exact)
     if own_gauge is None:
-        return Alignment(similarity.scale, pose_errors=errors)
+        return {"scale_to_reference": similarity.scale, "pose_errors": errors}
     gauge = measure_gauge(training_extent(model, capture), similarity.scale)
     save_model(model, own_gauge)
     rotation = pycolmap.Rotation3d(similarity.rotation)
     model.transform(pycolmap.Sim3d(similarity.scale, rotation, similarity.translation))
-    return Alignment(1.0, gauge, errors)
-
-
-def similarity_to(
-    model: pycolmap.Reconstruction, reference: pycolmap.Reconstruction
-) -> Similarity | None:
-    """The similarity from ``model`` to ``reference``; None for too few common cameras."""
-    try:
-        return align_poses(*common_poses(model, reference))
-    except ValueError:
-        return None
+    return {"scale_to_reference": 1.0, "own_gauge": gauge, "pose_errors": errors}
 
 
 def training_extent(model: pycolmap.Reconstruction, capture: Capture) -> float:
@@ -109,9 +91,8 @@ def compare_poses(
 ) -> PoseErrors:
     """Pose errors of ``model`` after ``similarity``, over the images with a pose in both models."""
     centers, rotations, reference_centers, reference_rotations = common_poses(model, reference)
-    distances = np.linalg.norm(similarity(centers) - reference_centers, axis=1)  # [N]
-    turned = transformed_rotations(similarity, rotations)
-    angles = rotation_angles(turned, reference_rotations)  # [N]
+    distances = similarity.misses(centers, reference_centers)  # [N]
+    angles = rotation_angles(rotations @ similarity.rotation.T, reference_rotations)  # [N]
     rmse = float(np.sqrt(np.mean(distances**2)))
     return PoseErrors(
         num_images=len(distances),
@@ -145,15 +126,19 @@ class Similarity:
         """Transform ``points`` [N, 3]."""
         return self.scale * points @ self.rotation.T + self.translation
 
+    def misses(self, source: Array, target: Array) -> Array:
+        """Distances [N] of the transformed ``source`` from ``target`` [N, 3]."""
+        distances: Array = np.linalg.norm(self(source) - target, axis=1)
+        return distances
+
 
 def fit_similarity(source: Array, target: Array) -> Similarity:
     """The least-squares similarity of ``source`` to ``target`` [N, 3] (Umeyama 1991, eq. 40-42)."""
     offsets, target_offsets = _centered(source), _centered(target)
     u, singular_values, vt = np.linalg.svd(target_offsets.T @ offsets / len(source))
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
-    rotation = u @ np.diag(signs) @ vt
     scale = float(singular_values @ signs / np.mean(np.sum(offsets**2, axis=1)))
-    return _with_means(scale, rotation, source, target)
+    return _with_means(scale, u @ np.diag(signs) @ vt, source, target)
 
 
 def _with_means(scale: float, rotation: Array, source: Array, target: Array) -> Similarity:
@@ -170,39 +155,29 @@ def _spread(centers: Array) -> NDArray[np.floating]:
     return np.linalg.svd(_centered(centers), compute_uv=False)
 
 
-def _distances(fit: Similarity, source: Array, target: Array) -> Array:
-    distances: Array = np.linalg.norm(fit(source) - target, axis=1)  # [N]
-    return distances
-
-
 def align_poses(
-    source_centers: Array, source_rotations: Array, target_centers: Array, target_rotations: Array
-) -> Similarity:
+    source: Array, source_rotations: Array, target: Array, target_rotations: Array
+) -> Similarity | None:
     """The similarity from one model's cameras to another's, robust to wrong cameras.
 
-    Centres are [N, 3] and rotations (world to camera) [N, 3, 3], in the same order of cameras, N >=
-    3. The similarity is fitted to the centres, by the least median of squared residuals over random
+    Centres are [N, 3] and rotations (world to camera) [N, 3, 3], in the same order of cameras. The
+    similarity is fitted to the centres, by the least median of squared residuals over random
     triples, then by least squares over the inliers. Collinear centres leave the rotation about
-    their line open; then the rotation comes from the cameras' orientations. Raises ``ValueError``
-    if the centres of one model coincide.
+    their line open; then the rotation comes from the cameras' orientations. None for less than
+    three cameras, and if the centres of one model coincide.
     """
-    if len(source_centers) < 3:
-        raise ValueError(f"a similarity needs at least 3 common cameras, got {len(source_centers)}")
-    spreads = [_spread(centers) for centers in (source_centers, target_centers)]
-    if min(spread[0] for spread in spreads) <= 1e-12:
-        raise ValueError("a similarity needs cameras at different places")
-    if min(spread[1] / spread[0] for spread in spreads) < COLLINEAR_RATIO:
-        return _fit_with_orientations(
-            source_centers, source_rotations, target_centers, target_rotations
-        )
-    best = _least_median_fit(source_centers, target_centers)
-    residuals = _distances(best, source_centers, target_centers)
-    inliers = residuals <= max(
-        INLIER_FACTOR * float(np.median(residuals)), 1e-9 * float(spreads[1][0])
-    )
+    if len(source) < 3:
+        return None
+    spreads = np.array([_spread(source), _spread(target)])
+    if spreads[:, 0].min() <= 1e-12:
+        return None
+    if (spreads[:, 1] / spreads[:, 0]).min() < COLLINEAR_RATIO:
+        return _fit_with_orientations(source, source_rotations, target, target_rotations)
+    misses = _least_median_fit(source, target).misses(source, target)
+    inliers = misses <= max(INLIER_FACTOR * float(np.median(misses)), 1e-9 * spreads[1, 0])
     # At least three cameras are inliers: residuals up to the median and, of three cameras, the
     # third one's too, since a least-squares fit leaves residuals that add up to 0.
-    return fit_similarity(source_centers[inliers], target_centers[inliers])
+    return fit_similarity(source[inliers], target[inliers])
 
 
 def rotation_angles(first: Array, second: Array) -> Array:
@@ -213,22 +188,17 @@ def rotation_angles(first: Array, second: Array) -> Array:
     return np.degrees(2 * np.arcsin(np.clip(chords / (2 * np.sqrt(2)), 0.0, 1.0)))
 
 
-def transformed_rotations(similarity: Similarity, rotations: Array) -> Array:
-    """World-to-camera rotations [N, 3, 3] after ``similarity`` has transformed the world."""
-    return rotations @ similarity.rotation.T
-
-
 def _least_median_fit(source: Array, target: Array) -> Similarity:
     generator = np.random.default_rng(0)  # a fixed seed: the triples only guide the search
     best = fit_similarity(source, target)
-    best_median = np.median(_distances(best, source, target))
+    best_median = np.median(best.misses(source, target))
     for _ in range(RANSAC_TRIALS):
         triple = generator.choice(len(source), 3, replace=False)
         spread = _spread(source[triple])
         if spread[1] <= COLLINEAR_RATIO * spread[0]:
             continue
         candidate = fit_similarity(source[triple], target[triple])
-        median = np.median(_distances(candidate, source, target))
+        median = np.median(candidate.misses(source, target))
         if median < best_median:
             best, best_median = candidate, median
     return best

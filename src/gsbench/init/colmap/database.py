@@ -4,8 +4,8 @@ import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pycolmap
@@ -22,12 +22,11 @@ DEFAULT_FOCAL_LENGTH = 1.2  # of the longest side, as in COLMAP
 COLMAP_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
 
 
-# each camera with the names of its images
-CameraGroups = Sequence[tuple[pycolmap.Camera, Sequence[str]]]
+# a camera with the names of its images
+CameraGroup = tuple[pycolmap.Camera, list[str]]
 
 
-@dataclass(frozen=True)
-class DatabaseTask:
+class DatabaseTask(NamedTuple):
     """A database with cameras and images, to be filled with matches of the ``pairs``.
 
     ``images`` is a folder with the names of the capture in which COLMAP can read every file.
@@ -37,8 +36,6 @@ class DatabaseTask:
     images: Path
     names: list[str]
     pairs: list[tuple[str, str]]
-    capture: Capture
-    work_dir: Path
 
 
 def create_task(
@@ -48,18 +45,15 @@ def create_task(
     work_dir: Path,
 ) -> DatabaseTask:
     """Create a database of the capture's images, with the cameras that ``options`` choose."""
-    ignored = options.ignores_test_photographs(reference)
-    used = capture.train_names if ignored else capture.image_names
-    images = readable_images(capture.images, used, work_dir)
+    names = options.select_images(capture, reference)
+    images = readable_images(capture.images, names, work_dir)
     if reference is not None and options.uses_reference_cameras:
         groups = reference_camera_groups(reference)
     else:
-        groups = unknown_camera_groups(
-            images, capture.image_names, options.camera, options.camera_model, options.focal_length
-        )
+        groups = unknown_camera_groups(images, names, options)
     database = work_dir / "database.db"
-    names = [name for name in create_database(database, groups) if name in set(used)]
-    return DatabaseTask(database, images, names, select_pairs(names, options), capture, work_dir)
+    create_database(database, groups)
+    return DatabaseTask(database, images, names, select_pairs(names, options))
 
 
 def readable_images(images: Path, names: Sequence[str], work_dir: Path) -> Path:
@@ -69,51 +63,40 @@ def readable_images(images: Path, names: Sequence[str], work_dir: Path) -> Path:
     ``work_dir`` with links to the readable files and PNG copies of the others. COLMAP recognises
     PNG content under any file name.
     """
-    unreadable = [name for name in names if Path(name).suffix.lower() not in COLMAP_SUFFIXES]
+    unreadable = {name for name in names if Path(name).suffix.lower() not in COLMAP_SUFFIXES}
     if not unreadable:
         return images
-    folder = work_dir / "images"
-    shutil.rmtree(folder, ignore_errors=True)
-    for name in names:
-        target = folder / name
-        target.parent.mkdir(parents=True, exist_ok=True)
-        if name in unreadable:
-            with open_image(images / name) as original:
-                exif = original.info.get("exif", b"")
-            write_png(read_image(images / name), target, exif)
-        else:
-            target.symlink_to((images / name).resolve())
+    folder = linked({name: images / name for name in names}, work_dir / "images")
+    for name in unreadable:
+        (folder / name).unlink()
+        with open_image(images / name) as original:
+            exif = original.info.get("exif", b"")
+        write_png(read_image(images / name), folder / name, exif)
     return folder
 
 
-def colmap_masks(masks: Mapping[str, Path], work_dir: Path) -> Path | None:
-    """A folder below ``work_dir`` of links to the masks, named as COLMAP expects; None if none."""
-    if not masks:
-        return None
-    folder = work_dir / "masks"
+def linked(files: Mapping[str, Path], folder: Path) -> Path:
+    """A new ``folder`` of links to ``files`` by their names there."""
     shutil.rmtree(folder, ignore_errors=True)
-    for name, file in masks.items():
-        link = folder / f"{name}.png"
-        link.parent.mkdir(parents=True, exist_ok=True)
-        link.symlink_to(file.resolve())
+    for name, file in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).symlink_to(file.resolve())
     return folder
 
 
-def reference_camera_groups(
-    reference: pycolmap.Reconstruction,
-) -> list[tuple[pycolmap.Camera, list[str]]]:
+def reference_camera_groups(reference: pycolmap.Reconstruction) -> list[CameraGroup]:
     """The reference's cameras, marked as known, each with the sorted names of its posed images."""
     groups: dict[int, list[str]] = {}
-    for image in reference.images.values():
+    for image in sorted(reference.images.values(), key=lambda image: image.name):
         if image.has_pose:
             groups.setdefault(image.camera_id, []).append(image.name)
     result = []
-    for camera_id, names in sorted(groups.items(), key=lambda group: min(group[1])):
+    for camera_id, names in groups.items():
         original = reference.cameras[camera_id]
         # A copy, because the database gives it another id.
         camera = rescaled_camera(original, original.width, original.height, camera_id=0)
         camera.has_prior_focal_length = True
-        result.append((camera, sorted(names)))
+        result.append((camera, names))
     return result
 
 
@@ -127,35 +110,33 @@ SHARED_BY: dict[str, Callable[[Path, str], object]] = {
 
 
 def unknown_camera_groups(
-    images: Path, names: Sequence[str], sharing: str, model: str, focal_length: float | None
-) -> list[tuple[pycolmap.Camera, list[str]]]:
-    """Cameras to be estimated, each with the names of its images.
+    images: Path, names: Sequence[str], options: ColmapOptions
+) -> list[CameraGroup]:
+    """Cameras to be estimated, each with the names of its images (``init.camera``).
 
-    ``sharing`` is ``exif`` for one camera for all images of a size with the same lens and zoom
-    (`lens_of`), ``single`` for one for all images of a size, ``per_folder`` for one for each size
-    in each sub-folder, or ``per_image``. The initial focal length in px is
-    ``focal_length``, else from the EXIF data of the group's first image if that means a plausible
-    field of view, else `DEFAULT_FOCAL_LENGTH`.
+    The initial focal length in px is that of ``options``, else from the EXIF data of the group's
+    first image if that means a plausible field of view, else `DEFAULT_FOCAL_LENGTH`.
     """
     groups: dict[tuple[object, ...], list[str]] = {}
     for name in names:
-        key = (SHARED_BY[sharing](images, name), image_size(images / name))
+        key = (SHARED_BY[options.camera](images, name), image_size(images / name))
         groups.setdefault(key, []).append(name)
-    options = pycolmap.ImageReaderOptions()
-    options.camera_model = model
+    reading = pycolmap.ImageReaderOptions({"camera_model": options.camera_model})
     result = []
     for group in groups.values():
-        camera = pycolmap.infer_camera_from_image(images / group[0], options)
+        camera = pycolmap.infer_camera_from_image(images / group[0], reading)
         longest = max(camera.width, camera.height)
         most, least = (longest / 2 / math.tan(math.radians(view) / 2) for view in FIELD_OF_VIEW_DEG)
-        inferred = camera.mean_focal_length()
         # EXIF data may be wrong or a division by zero: COLMAP would start from NaN.
-        if focal_length is not None or not least < inferred < most:
-            given = DEFAULT_FOCAL_LENGTH * longest if focal_length is None else focal_length
+        if options.focal_length is not None or not least < camera.mean_focal_length() < most:
             camera = pycolmap.Camera.create_from_model_name(
-                0, model, given, camera.width, camera.height
+                0,
+                options.camera_model,
+                options.focal_length or DEFAULT_FOCAL_LENGTH * longest,
+                camera.width,
+                camera.height,
             )
-            camera.has_prior_focal_length = focal_length is not None
+            camera.has_prior_focal_length = options.focal_length is not None
         result.append((camera, group))
     return result
 
@@ -167,8 +148,8 @@ def writable(path: Path) -> Iterator[pycolmap.Database]:
         yield database
 
 
-def create_database(path: Path, groups: CameraGroups) -> dict[str, int]:
-    """Create a database with cameras and images but no features; returns the image ids by name.
+def create_database(path: Path, groups: Sequence[CameraGroup]) -> None:
+    """Create a database with cameras and images but no features.
 
     The ids follow the sorted names. Because they are fixed here, extraction and matching give the
     same database on any number of threads. Each camera gets its own rig.
@@ -176,7 +157,6 @@ def create_database(path: Path, groups: CameraGroups) -> dict[str, int]:
     # An interrupted run may have left a database whose ids belong to other images.
     remove_database(path)
     ids_of: dict[str, tuple[int, int]] = {}  # of camera and rig
-    image_ids: dict[str, int] = {}
     with writable(path) as database:
         for camera, names in groups:
             camera.camera_id = database.write_camera(camera)
@@ -190,8 +170,6 @@ def create_database(path: Path, groups: CameraGroups) -> dict[str, int]:
             frame.rig_id = rig_id
             frame.add_data_id(image.data_id)
             database.write_frame(frame)
-            image_ids[name] = image.image_id
-    return image_ids
 
 
 def remove_database(path: Path) -> None:
@@ -203,18 +181,19 @@ def remove_database(path: Path) -> None:
         path.with_name(f"{path.name}{suffix}").unlink(missing_ok=True)
 
 
-def write_keypoints(path: Path, keypoints: Mapping[str, NDArray[np.float32]]) -> None:
-    """Add ``keypoints`` [K, 2] by image name, in px of the image file, in COLMAP's convention."""
+def write_features(
+    path: Path,
+    keypoints: Mapping[str, NDArray[np.float32]],
+    matches: Mapping[tuple[str, str], NDArray[np.uint32]],
+) -> None:
+    """Add ``keypoints`` [K, 2] by image, in px of the file, in COLMAP's convention, and matches.
+
+    ``matches`` [M, 2] are indices of keypoints in both images, by pairs of their names.
+    """
     ids = image_ids(path)
     with writable(path) as database:
         for name, points in keypoints.items():
             database.write_keypoints(ids[name], points)
-
-
-def write_matches(path: Path, matches: Mapping[tuple[str, str], NDArray[np.uint32]]) -> None:
-    """Add ``matches`` [M, 2] by pairs of names: indices of keypoints in both images."""
-    ids = image_ids(path)
-    with writable(path) as database:
         for (first, second), indices in matches.items():
             database.write_matches(ids[first], ids[second], indices)
 
@@ -225,11 +204,10 @@ def cameras_without_prior(path: Path) -> bool:
         return any(not camera.has_prior_focal_length for camera in database.read_all_cameras())
 
 
-def assume_focal_lengths(path: Path, factor: float) -> list[tuple[str, str]]:
+def assume_focal_lengths(path: Path, factor: float) -> None:
     """Set each unknown focal length to ``factor`` times the longest side, and mark it as known.
 
-    Drops the geometries that were verified before, and returns the pairs of image names that have
-    matches.
+    Drops the geometries that were verified before.
     """
     with writable(path) as database:
         for camera in database.read_all_cameras():
@@ -238,46 +216,13 @@ def assume_focal_lengths(path: Path, factor: float) -> list[tuple[str, str]]:
                     camera.params[index] = factor * max(camera.width, camera.height)
                 camera.has_prior_focal_length = True
                 database.update_camera(camera)
-        names = {image.image_id: image.name for image in database.read_all_images()}
-        pair_ids, matches = database.read_all_matches()
         database.clear_two_view_geometries()
-        matched = [pair for pair, indices in zip(pair_ids, matches, strict=True) if len(indices)]
-    ids = map(pycolmap.pair_id_to_image_pair, matched)
-    return sorted((names[first], names[second]) for first, second in ids)
-
-
-def write_pairs(path: Path, pairs: Sequence[tuple[str, str]]) -> None:
-    """Write COLMAP's list of pairs of names without spaces (see `image_ids_as_names`)."""
-    path.write_text("".join(f"{first} {second}\n" for first, second in pairs), encoding="utf-8")
-
-
-@contextmanager
-def image_ids_as_names(path: Path) -> Iterator[dict[str, str]]:
-    """Rename the images to their ids within the context; yields the new names by the old ones.
-
-    COLMAP splits the lines of its pair lists at spaces, and names of photographs often contain
-    spaces.
-    """
-    ids = image_ids(path)
-    rename_images(path, {image_id: str(image_id) for image_id in ids.values()})
-    try:
-        yield {name: str(image_id) for name, image_id in ids.items()}
-    finally:
-        rename_images(path, {image_id: name for name, image_id in ids.items()})
 
 
 def image_ids(path: Path) -> dict[str, int]:
     """The ids of the database's images by their names."""
     with pycolmap.Database.open(path) as database:
         return {image.name: image.image_id for image in database.read_all_images()}
-
-
-def rename_images(path: Path, names: Mapping[int, str]) -> None:
-    """Rename the database's images; ``names`` are the new names by image id."""
-    with writable(path) as database:
-        for image in database.read_all_images():
-            image.name = names[image.image_id]
-            database.update_image(image)
 
 
 def strongest_descriptors(path: Path, name: str, count: int) -> NDArray[np.uint8]:

@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pycolmap
@@ -23,6 +23,7 @@ from gsbench.errors import InputError
 from gsbench.init.base import REGISTERED_SHARE, UnplacedError
 from gsbench.init.colmap import database as colmap_database
 from gsbench.init.colmap import matches
+from gsbench.init.colmap.database import DatabaseTask
 from gsbench.init.options import ColmapOptions
 from gsbench.logs import Progress
 from gsbench.scene.rules import MIN_IMAGES
@@ -54,6 +55,10 @@ class Geometry:
     depth_spread: float  # see `MAX_DEPTH_SPREAD`
 
     @property
+    def size(self) -> tuple[int, int]:
+        return self.images, self.points
+
+    @property
     def fault(self) -> str:
         """The reason why the model is wrong, although its images have poses; "" if it is sound."""
         if self.images == 0:
@@ -65,43 +70,19 @@ class Geometry:
         return ""
 
 
-@dataclass(frozen=True)
-class Attempt:
-    """The largest model of a strategy: the images that it places, and its fault or ""."""
-
-    strategy: str
-    images: int
-    fault: str
-
-    def __str__(self) -> str:
-        note = f" ({self.fault})" if self.fault else ""
-        return f"{self.strategy} {self.images}{note}"
-
-
-@dataclass(frozen=True)
-class MappingResult:
-    """The best model, the strategy that made it, and how many models that strategy made."""
+class Mapped(NamedTuple):
+    """The best model, how many models its strategy made, the strategy, and lines for the report."""
 
     model: pycolmap.Reconstruction
     models: int
     strategy: str
-    tried: tuple[Attempt, ...]  # in order
-
-    def warnings(self, options: ColmapOptions) -> tuple[str, ...]:
-        """One line for the report if COLMAP's defaults were not enough, else none."""
-        if len(self.tried) < 2:
-            return ()
-        counts = ", ".join(map(str, self.tried))
-        return (
-            f"cameras come from the strategy {self.strategy!r}: COLMAP's defaults placed too few "
-            f"(images: {counts}){_remedy(options)}",
-        )
+    warnings: list[str]
 
 
 def map_images(
-    database: Path, images: Path, output: Path, options: ColmapOptions, progress: Progress
-) -> MappingResult:
-    """Estimate cameras and points from the matches in ``database``: the largest sound model.
+    task: DatabaseTask, output: Path, options: ColmapOptions, progress: Progress
+) -> Mapped:
+    """Estimate cameras and points from the matches in the database: the largest sound model.
 
     With ``mapper=auto``, the strategies are COLMAP's incremental mapper, the same from a smaller
     initial angle, the global mapper, and assumed focal lengths. The first with a sound model
@@ -110,29 +91,31 @@ def map_images(
 
     Raises UnplacedError if no sound model has at least `MIN_IMAGES` images.
     """
-    with pycolmap.Database.open(database) as opened:
+    with pycolmap.Database.open(task.database) as opened:
         total = opened.num_images()
-    best: tuple[pycolmap.Reconstruction, int, str] | None = None
-    best_size = (0, 0)
-    tried: list[Attempt] = []
-    for strategy, run in _Mapper(database, images, output, options, progress, total).strategies():
+    remedy = "" if options.pairs == "exhaustive" else "; init.pairs=exhaustive may place more"
+    best, best_size = None, (0, 0)
+    tried: list[str] = []  # each strategy with the images of its largest model, and its fault
+    faulty: list[str] = []
+    for strategy, run in _Mapper(task, output, options, progress, total).strategies():
         models = [(measure_geometry(model), model) for model in run()]
-        sound = [(geometry, model) for geometry, model in models if not geometry.fault]
-        largest = max(sound or models, key=lambda made: _size(made[0]), default=None)
-        if largest is None:
-            tried.append(Attempt(strategy, 0, ""))
+        sound = [made for made in models if not made[0].fault]
+        if not models:
+            tried.append(f"{strategy} 0")
             continue
-        geometry, model = largest
-        tried.append(Attempt(strategy, geometry.images, geometry.fault))
-        if sound and (best is None or _size(geometry) > best_size):
-            best, best_size = (model, len(sound), strategy), _size(geometry)
+        geometry, model = max(sound or models, key=lambda made: made[0].size)
+        tried.append(f"{strategy} {geometry.images}")
+        if not sound:
+            tried[-1] += f" ({geometry.fault})"
+            faulty.append(tried[-1])
+        elif best is None or geometry.size > best_size:
+            best, best_size = Mapped(model, len(sound), strategy, []), geometry.size
         if best_size[0] >= REGISTERED_SHARE * total:
             break
-    if best is None and (faults := [attempt for attempt in tried if attempt.fault]):
+    if best is None and faulty:
         raise UnplacedError(
-            f"structure from motion made no sound model of {total} images ("
-            f"{', '.join(map(str, faults))}): the photos need more overlap or more texture"
-            f"{_remedy(options)}"
+            f"structure from motion made no sound model of {total} images ({', '.join(faulty)}): "
+            f"the photos need more overlap or more texture{remedy}"
         )
     if best is None:
         raise UnplacedError(NO_PAIR)
@@ -141,12 +124,12 @@ def map_images(
             f"structure from motion placed only {best_size[0]} of {total} images: the "
             "photos need more overlap, more texture, or a focal length (init.focal_length, px)"
         )
-    return MappingResult(*best, tuple(tried))
-
-
-def _remedy(options: ColmapOptions) -> str:
-    """What else may place more images; "" if all pairs were matched."""
-    return "" if options.pairs == "exhaustive" else "; init.pairs=exhaustive may place more"
+    if len(tried) > 1:
+        best.warnings.append(
+            f"cameras come from the strategy {best.strategy!r}: COLMAP's defaults placed too few "
+            f"(images: {', '.join(tried)}){remedy}"
+        )
+    return best
 
 
 Models = Sequence[pycolmap.Reconstruction]
@@ -156,8 +139,7 @@ Models = Sequence[pycolmap.Reconstruction]
 class _Mapper:
     """COLMAP's mappers, applied to one database of ``total`` images."""
 
-    database: Path
-    images: Path
+    task: DatabaseTask
     output: Path
     options: ColmapOptions
     progress: Progress
@@ -165,22 +147,18 @@ class _Mapper:
 
     def strategies(self) -> Iterator[tuple[str, Callable[[], Models]]]:
         """The strategies of ``init.mapper`` in the order of trying: names and functions."""
-        mapper = self.options.mapper
-        if mapper in ("auto", "incremental"):
-            yield "incremental", lambda: self.incremental(self.database)
+        mapper, database = self.options.mapper, self.task.database
+        if mapper != "global":
+            yield "incremental", partial(self.incremental, database)
         if mapper == "auto":
-            yield (
-                f"incremental from {SMALL_ANGLE_DEG:g} degrees",
-                lambda: self.incremental(self.database, SMALL_ANGLE_DEG),
-            )
-        if mapper in ("auto", "global"):
+            small = partial(self.incremental, database, SMALL_ANGLE_DEG)
+            yield f"incremental from {SMALL_ANGLE_DEG:g} degrees", small
+        if mapper != "incremental":
             yield "global", self.global_mapping
-        if mapper == "auto" and colmap_database.cameras_without_prior(self.database):
+        if mapper == "auto" and colmap_database.cameras_without_prior(database):
             for factor in FOCAL_FACTORS:
-                yield (
-                    f"focal length {factor:g} x the longest side",
-                    partial(self.with_assumed_focal_lengths, factor),
-                )
+                assumed = partial(self.with_assumed_focal_lengths, factor)
+                yield f"focal length {factor:g} x the longest side", assumed
 
     def incremental(self, database: Path, initial_angle: float | None = None) -> Models:
         """Map image by image, from a pair under ``initial_angle`` degrees (None: COLMAP's)."""
@@ -199,26 +177,28 @@ class _Mapper:
 
     def global_mapping(self) -> Models:
         """Map all images together, with COLMAP's global mapper."""
-        options = pycolmap.GlobalPipelineOptions()
-        options.num_threads = self.options.mapper_threads
-        options.random_seed = self.options.seed
-        options.min_model_size = self.options.min_model_size
-        adjustment = options.mapper.bundle_adjustment
-        adjustment.refine_focal_length = self.options.intrinsics == "estimate"
-        adjustment.refine_extra_params = self.options.intrinsics == "estimate"
-        return self._run(partial(pycolmap.global_mapping, self.database), options)
+        refine = self.options.intrinsics == "estimate"
+        adjustment = {"refine_focal_length": refine, "refine_extra_params": refine}
+        options = pycolmap.GlobalPipelineOptions(
+            {
+                "num_threads": self.options.mapper_threads,
+                "random_seed": self.options.seed,
+                "min_model_size": self.options.min_model_size,
+                "mapper": {"bundle_adjustment": adjustment},
+            }
+        )
+        return self._run(partial(pycolmap.global_mapping, self.task.database), options)
 
     def with_assumed_focal_lengths(self, factor: float) -> Models:
         """Map image by image, with unknown focal lengths of ``factor`` times the longest side.
 
         The pairs are verified again under these focal lengths.
         """
-        copy = self.database.with_name(f"assumed-{factor:g}.db")
+        copy = self.task.database.with_name(f"assumed-{factor:g}.db")
         colmap_database.remove_database(copy)
-        shutil.copy(self.database, copy)
-        pairs = colmap_database.assume_focal_lengths(copy, factor)
-        options = matches.verification_options(self.options)
-        matches.verify_pairs(copy, pairs, options, self.progress)
+        shutil.copy(self.task.database, copy)
+        colmap_database.assume_focal_lengths(copy, factor)
+        matches.verify_pairs(copy, self.options, self.progress)
         return self.incremental(copy, SMALL_ANGLE_DEG)
 
     def _run(
@@ -226,19 +206,11 @@ class _Mapper:
     ) -> Models:
         self.progress("map", 0, self.total)
         pycolmap.set_random_seed(self.options.seed)
-        models = mapping(self.images, _empty(self.output), options=options)
+        shutil.rmtree(self.output, ignore_errors=True)
+        self.output.mkdir(parents=True)
+        models = mapping(self.task.images, self.output, options=options)
         self.progress("map", self.total, self.total)
         return list(models.values())
-
-
-def _empty(folder: Path) -> Path:
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
-    return folder
-
-
-def _size(geometry: Geometry) -> tuple[int, int]:
-    return geometry.images, geometry.points
 
 
 def measure_geometry(model: pycolmap.Reconstruction) -> Geometry:
@@ -273,21 +245,19 @@ def _widest_angle(rays: Array) -> float:
 
 
 def triangulate(
-    database: Path,
-    images: Path,
+    task: DatabaseTask,
     output: Path,
     reference: pycolmap.Reconstruction,
-    names: Collection[str],
     options: ColmapOptions,
     progress: Progress,
 ) -> pycolmap.Reconstruction:
-    """Triangulate the verified matches of the images ``names`` under the reference's fixed cameras.
+    """Triangulate the verified matches of the task's images under the reference's fixed cameras.
 
     The other images of the database are in the model with their cameras, but see no point.
     """
     progress("triangulate", 0, 1)
     posed, unused = pycolmap.Reconstruction(), []  # both with the ids of the database
-    with pycolmap.Database.open(database) as opened:
+    with pycolmap.Database.open(task.database) as opened:
         for camera in opened.read_all_cameras():
             posed.add_camera_with_trivial_rig(camera)
         for stored in opened.read_all_images():
@@ -295,7 +265,7 @@ def triangulate(
             image = pycolmap.Image(
                 name=stored.name, camera_id=stored.camera_id, image_id=stored.image_id
             )
-            if stored.name in names:
+            if stored.name in task.names:
                 posed.add_image_with_trivial_frame(image, pose)
             else:
                 unused.append((image, pose))
@@ -304,8 +274,8 @@ def triangulate(
     output.mkdir(parents=True, exist_ok=True)
     model = pycolmap.triangulate_points(
         posed,
-        database,
-        images,
+        task.database,
+        task.images,
         output,
         clear_points=True,
         options=pipeline_options(options),
@@ -329,16 +299,19 @@ def triangulate(
 
 def pipeline_options(options: ColmapOptions) -> pycolmap.IncrementalPipelineOptions:
     """The options of COLMAP's incremental mapper, which its triangulator reads too."""
-    pipeline = pycolmap.IncrementalPipelineOptions()
-    pipeline.num_threads = pipeline.mapper.num_threads = options.mapper_threads
-    pipeline.triangulation.ignore_two_view_tracks = not options.two_view_tracks
-    for part in (pipeline, pipeline.mapper, pipeline.triangulation):
-        part.random_seed = options.seed
-    # mapping must not stop at a first model of a few images (see map_images)
-    pipeline.multiple_models = True
-    pipeline.min_model_size = options.min_model_size
     refine = options.intrinsics == "estimate"
-    pipeline.ba_refine_focal_length = pipeline.ba_refine_extra_params = refine
-    mapper = pipeline.mapper
-    mapper.abs_pose_refine_focal_length = mapper.abs_pose_refine_extra_params = refine
-    return pipeline
+    seed, threads = {"random_seed": options.seed}, {"num_threads": options.mapper_threads}
+    poses = {"abs_pose_refine_focal_length": refine, "abs_pose_refine_extra_params": refine}
+    return pycolmap.IncrementalPipelineOptions(
+        {
+            **seed,
+            **threads,
+            "mapper": {**seed, **threads, **poses},
+            "triangulation": {**seed, "ignore_two_view_tracks": not options.two_view_tracks},
+            # mapping must not stop at a first model of a few images (see map_images)
+            "multiple_models": True,
+            "min_model_size": options.min_model_size,
+            "ba_refine_focal_length": refine,
+            "ba_refine_extra_params": refine,
+        }
+    )

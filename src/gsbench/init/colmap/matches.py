@@ -16,16 +16,16 @@ from __future__ import annotations
 import math
 import shutil
 import sqlite3
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
-from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
+from typing import NamedTuple
 
 import pycolmap
 
-from gsbench.init.colmap.database import image_ids, image_ids_as_names, rename_images, write_pairs
+from gsbench.init.colmap.database import DatabaseTask, image_ids, writable
 from gsbench.init.options import ColmapOptions, SiftOptions
 from gsbench.logs import Progress
 from gsbench.system.isolate import run_with_progress
@@ -33,22 +33,19 @@ from gsbench.system.isolate import run_with_progress
 MAX_BLOCK = 16  # images on each side of a part; with more, progress would be reported too rarely
 PARTS_PER_PROCESS = 6  # enough that processes end at about the same time
 FEATURE_TABLES = ("keypoints", "descriptors")
+DROP_FEATURES = ";".join(f"DELETE FROM {table}" for table in FEATURE_TABLES)
 MATCH_TABLES = ("matches", "two_view_geometries")
 
 IdPair = tuple[int, int]
 
 
-@dataclass(frozen=True)
-class MatchingJob:
+class MatchingJob(NamedTuple):
     """Inputs of a matching process: ``parts``, lists of pairs of ids, to match into ``result``.
 
-    ``features`` is the database with keypoints and descriptors. ``template`` is a copy without
-    them, whose images are named by their ids, because COLMAP splits the lines of its pair lists at
-    spaces.
+    ``features`` is the database with keypoints and descriptors. ``result`` is a copy without them.
     """
 
     features: Path
-    template: Path
     result: Path
     parts: list[list[IdPair]]
     sift: SiftOptions
@@ -58,10 +55,9 @@ def match_sift(
     database: Path,
     pairs: Sequence[tuple[str, str]],
     sift: SiftOptions,
-    processes: int,
     progress: Progress,
 ) -> None:
-    """Match ``pairs`` of image names and verify them.
+    """Match ``pairs`` of image names in ``num_threads`` processes, and verify them.
 
     The result does not depend on the number of processes or on the division into parts: a pair's
     matches depend on its descriptors alone, and its RANSAC starts from the seed.
@@ -69,14 +65,22 @@ def match_sift(
     folder = database.parent / "matching"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
-    ids = image_ids(database)
-    id_pairs = [(ids[first], ids[second]) for first, second in pairs]
-    parts = divide_pairs(id_pairs, _block_size(len(ids), processes))
-    _copy_without_features(database, folder / "empty.db")
-    jobs = [
-        MatchingJob(database, folder / "empty.db", folder / f"matches-{index}.db", share, sift)
-        for index, share in enumerate(distribute_parts(parts, processes))
-    ]
+    ids, processes = image_ids(database), sift.num_threads
+    parts = divide_pairs(
+        [(ids[first], ids[second]) for first, second in pairs], _block_size(len(ids), processes)
+    )
+    empty = folder / "empty.db"
+    shutil.copyfile(database, empty)
+    _run_sql(empty, DROP_FEATURES, "VACUUM")
+    with writable(empty) as opened:
+        for image in opened.read_all_images():
+            # COLMAP splits the lines of its pair lists at spaces, which names often contain
+            image.name = str(image.image_id)
+            opened.update_image(image)
+    jobs = []
+    for index, share in enumerate(distribute_parts(parts, processes)):
+        jobs.append(MatchingJob(database, folder / f"matches-{index}.db", share, sift))
+        shutil.copyfile(empty, jobs[-1].result)
     progress("match", 0, len(pairs))
     if len(jobs) == 1:
         match_parts(jobs[0], progress)
@@ -90,31 +94,29 @@ def match_sift(
 def match_parts(job: MatchingJob, progress: Progress) -> None:
     """Match and verify the parts in turn. Calls native code that can abort: run it isolated."""
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.WARNING)
-    options = pycolmap.FeatureMatchingOptions()
-    options.use_gpu = False
-    options.num_threads = 1  # see the module's docstring
-    options.guided_matching = job.sift.guided_matching
-    options.sift.max_ratio = job.sift.max_ratio
-    options.sift.cross_check = job.sift.cross_check
+    options = pycolmap.FeatureMatchingOptions(
+        {
+            "use_gpu": False,
+            "num_threads": 1,  # see the module's docstring
+            "guided_matching": job.sift.guided_matching,
+            "sift": {"max_ratio": job.sift.max_ratio, "cross_check": job.sift.cross_check},
+        }
+    )
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = job.result.with_suffix(".pairs.txt")
-    shutil.copyfile(job.template, job.result)
     done, total = 0, sum(map(len, job.parts))
-    part_database = job.result.with_suffix(".part.db")
     for part in job.parts:
-        shutil.copyfile(job.template, part_database)
-        images = sorted(set(chain.from_iterable(part)))
-        _insert(part_database, job.features, FEATURE_TABLES, images)
-        write_pairs(pairing.match_list_path, [(str(first), str(second)) for first, second in part])
+        _insert(job.result, job.features, FEATURE_TABLES, {*chain.from_iterable(part)})
+        lines = [f"{first} {second}\n" for first, second in part]
+        pairing.match_list_path.write_text("".join(lines))
         pycolmap.match_image_pairs(
-            part_database,
+            job.result,
             matching_options=options,
             pairing_options=pairing,
             verification_options=verification_options(job.sift),
             device=pycolmap.Device.cpu,
         )
-        _insert(job.result, part_database, MATCH_TABLES)
-        part_database.unlink()
+        _run_sql(job.result, DROP_FEATURES)
         done += len(part)
         progress("match", done, total)
 
@@ -169,18 +171,14 @@ def _match_in_processes(jobs: Sequence[MatchingJob], count: int, progress: Progr
         list(pool.map(run, range(len(jobs))))
 
 
-def _copy_without_features(database: Path, target: Path) -> None:
-    shutil.copyfile(database, target)
-    with closing(sqlite3.connect(target)) as connection:
-        with connection:
-            for table in FEATURE_TABLES:
-                connection.execute(f"DELETE FROM {table}")
-        connection.execute("VACUUM")
-    rename_images(target, {image_id: str(image_id) for image_id in image_ids(target).values()})
+def _run_sql(path: Path, *scripts: str) -> None:
+    with closing(sqlite3.connect(path)) as connection:
+        for script in scripts:
+            connection.executescript(script)
 
 
 def _insert(
-    target: Path, source: Path, tables: Sequence[str], images: Sequence[int] | None = None
+    target: Path, source: Path, tables: Sequence[str], images: Collection[int] | None = None
 ) -> None:
     """Copy the rows of ``tables`` from ``source`` to ``target``, of all images or of some ids."""
     condition = "" if images is None else f" WHERE image_id IN ({', '.join(map(str, images))})"
@@ -193,39 +191,23 @@ def _insert(
                 )
 
 
-# COLMAP reports no progress within a call, so the pairs are divided over several calls
-VERIFY_CALLS = 20
-MIN_PAIRS_PER_CALL = 50
-
-
 def verification_options(options: ColmapOptions) -> pycolmap.TwoViewGeometryOptions:
     """The options of COLMAP's geometric verification of a pair."""
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = options.seed
-    verification.min_num_inliers = options.min_inliers
-    verification.min_inlier_ratio = options.min_inlier_ratio
-    return verification
+    return pycolmap.TwoViewGeometryOptions(
+        {
+            "ransac": {"random_seed": options.seed},
+            "min_num_inliers": options.min_inliers,
+            "min_inlier_ratio": options.min_inlier_ratio,
+        }
+    )
 
 
-def verify_pairs(
-    path: Path,
-    pairs: Sequence[tuple[str, str]],
-    options: pycolmap.TwoViewGeometryOptions,
-    progress: Progress,
-) -> None:
-    """Run COLMAP's geometric verification on the stored matches of ``pairs``."""
-    list_file = path.with_suffix(".pairs.txt")
-    size = max(len(pairs) // VERIFY_CALLS, MIN_PAIRS_PER_CALL)
-    progress("verify", 0, len(pairs))
-    with image_ids_as_names(path) as new_names:
-        for start in range(0, len(pairs), size):
-            part = pairs[start : start + size]
-            write_pairs(
-                list_file, [(new_names[first], new_names[second]) for first, second in part]
-            )
-            pycolmap.verify_matches(path, list_file, options)
-            progress("verify", start + len(part), len(pairs))
-    list_file.unlink(missing_ok=True)
+def verify_pairs(path: Path, options: ColmapOptions, progress: Progress) -> None:
+    """Run COLMAP's geometric verification on all stored matches."""
+    progress("verify", 0, 1)
+    verification = verification_options(options)
+    pycolmap.geometric_verification(path, two_view_geometry_options=verification)
+    progress("verify", 1, 1)
 
 
 # COLMAP reports no progress within a call, so it is called for a few images at a time
@@ -234,39 +216,32 @@ IMAGES_PER_THREAD = 2  # least number in a call, so that all threads have work
 
 
 def extract_sift(
-    database: Path,
-    images: Path,
-    names: Sequence[str],
-    sift: SiftOptions,
-    threads: int,
-    progress: Progress,
-    masks: Path | None = None,
+    task: DatabaseTask, sift: SiftOptions, progress: Progress, masks: Path | None = None
 ) -> None:
-    """Detect and describe keypoints in the database's images ``names``.
+    """Detect and describe keypoints in the task's images.
 
     ``masks`` is a folder of masks, named as COLMAP expects. Black pixels get no keypoints.
     """
-    options = pycolmap.FeatureExtractionOptions()
-    options.use_gpu = False
-    options.num_threads = threads
-    options.max_image_size = sift.max_image_size
-    options.sift.max_num_features = sift.max_num_features
-    options.sift.peak_threshold = sift.peak_threshold
-    options.sift.edge_threshold = sift.edge_threshold
-    options.sift.first_octave = sift.first_octave
-    reading = pycolmap.ImageReaderOptions()
-    if masks is not None:
-        reading.mask_path = masks
-    progress("extract", 0, len(names))
-    batch_size = max(IMAGES_PER_CALL, IMAGES_PER_THREAD * threads)
-    for start in range(0, len(names), batch_size):
-        batch = list(names[start : start + batch_size])
+    names = ("max_num_features", "peak_threshold", "edge_threshold", "first_octave")
+    options = pycolmap.FeatureExtractionOptions(
+        {
+            "use_gpu": False,
+            "num_threads": sift.num_threads,
+            "max_image_size": sift.max_image_size,
+            "sift": {name: getattr(sift, name) for name in names},
+        }
+    )
+    reading = pycolmap.ImageReaderOptions({"mask_path": masks or ""})
+    progress("extract", 0, len(task.names))
+    batch_size = max(IMAGES_PER_CALL, IMAGES_PER_THREAD * sift.num_threads)
+    for start in range(0, len(task.names), batch_size):
+        batch = task.names[start : start + batch_size]
         pycolmap.extract_features(
-            database,
-            images,
+            task.database,
+            task.images,
             image_names=batch,
             reader_options=reading,
             extraction_options=options,
             device=pycolmap.Device.cpu,
         )
-        progress("extract", start + len(batch), len(names))
+        progress("extract", start + len(batch), len(task.names))

@@ -35,15 +35,14 @@ def common_poses(
     model: pycolmap.Reconstruction, reference: pycolmap.Reconstruction
 ) -> tuple[Array, Array, Array, Array]:
     """Centres [N, 3] and rotations [N, 3, 3] of model, then reference, for images posed in both."""
-    model_poses, reference_poses = poses_by_name(model), poses_by_name(reference)
-    names = sorted(model_poses.keys() & reference_poses.keys())
-
-    def stacked(poses: dict[str, tuple[Array, Array]]) -> tuple[Array, Array]:
-        # the shapes hold without a common image, too
-        centers = np.array([poses[name][0] for name in names]).reshape(-1, 3)
-        return centers, np.array([poses[name][1] for name in names]).reshape(-1, 3, 3)
-
-    return *stacked(model_poses), *stacked(reference_poses)
+    both = poses_by_name(model), poses_by_name(reference)
+    names = sorted(both[0].keys() & both[1].keys())
+    # the shapes hold without a common image, too
+    centers, rotations = (
+        [np.array([poses[name][part] for name in names]).reshape(shape) for poses in both]
+        for part, shape in enumerate([(-1, 3), (-1, 3, 3)])
+    )
+    return centers[0], rotations[0], centers[1], rotations[1]
 
 
 def keep_training_points(

@@ -1,4 +1,4 @@
-"""Local features of an image, the settings that they depend on, and a store of them on disk.
+"""Local features of an image, and a store of them and of matches on disk.
 
 The store has one file for each image and each pair, so that an interrupted run continues from
 there. A file's name is a hash of everything that its content depends on: the image's bytes, the
@@ -9,18 +9,21 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any
+from typing import BinaryIO, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gsbench.errors import GsbenchError
 from gsbench.files import DAMAGE, atomic, file_sha256
+from gsbench.scene.types import Capture
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,60 +63,23 @@ class Features:
         return Features(*arrays, self.network_size, self.file_size)
 
 
-@dataclass(frozen=True, kw_only=True)
-class FeatureSettings:
-    """Names and settings of an extractor and a matcher, which ignore fields that are not theirs."""
-
-    extractor: str
-    matcher: str
-    max_image_size: int  # px, longest side for the network
-    max_keypoints: int
-    keypoint_threshold: float = 0.0
-    nms_radius: int = 0  # px
-    aliked_model: str = "n16"
-    filter_threshold: float = 0.0  # LightGlue only
-    max_ratio: float = 1.0  # mutual nearest neighbours only
-
-    @classmethod
-    def of(cls, options: object, **others: Any) -> FeatureSettings:
-        """The settings in attributes of ``options``, replaced or completed by ``others``."""
-        names = [entry.name for entry in fields(cls) if hasattr(options, entry.name)]
-        return cls(**({name: getattr(options, name) for name in names} | others))
-
-    def extraction(self) -> dict[str, object]:
-        """The settings that features depend on."""
-        names = ["extractor", "max_image_size", "max_keypoints", "keypoint_threshold", "nms_radius"]
-        if self.extractor == "aliked":
-            names.append("aliked_model")
-        return {name: getattr(self, name) for name in names}
-
-    def matching(self) -> dict[str, object]:
-        """The settings that matches depend on, in addition to the features."""
-        limit = "filter_threshold" if self.matcher == "lightglue" else "max_ratio"
-        return {name: getattr(self, name) for name in ("matcher", limit)}
-
-
 KEY_DIGITS = 24
 FORMAT_VERSION = 1  # to be raised when the same settings give different features
+Matches = NDArray[np.uint32]  # indices [M, 2] of keypoints in the first and the second image
 
 
 class FeatureStore:
     """Store of features and matches in ``folder``: ``features/<key>.npz``, ``matches/<key>.npy``.
 
-    ``extraction`` and ``matching`` are the settings (plain values) that features and matches depend
-    on. ``masks`` are mask files by image name.
+    ``extraction`` and ``matching`` are the settings (plain values) that features and matches of the
+    ``capture`` depend on.
     """
 
     def __init__(
-        self,
-        folder: Path,
-        images: Path,
-        extraction: Mapping[str, Any],
-        matching: Mapping[str, Any],
-        masks: Mapping[str, Path] = MappingProxyType({}),
+        self, folder: Path, capture: Capture, extraction: object, matching: object
     ) -> None:
-        self.folder, self.images, self.masks = folder, images, masks
-        self._extraction, self._matching = dict(extraction), dict(matching)
+        self.folder, self.capture = folder, capture
+        self._extraction, self._matching = extraction, matching
         for part in ("features", "matches"):
             (folder / part).mkdir(parents=True, exist_ok=True)
         self._image_key = cache(self._hash_image)
@@ -124,9 +90,7 @@ class FeatureStore:
 
     def matches_path(self, first: str, second: str) -> Path:
         """The matches file of a pair of images."""
-        key = _key(
-            [FORMAT_VERSION, self._image_key(first), self._image_key(second), self._matching]
-        )
+        key = _key([*map(self._image_key, (first, second)), self._matching])
         return self.folder / "matches" / f"{key}.npy"
 
     def read_features(self, name: str) -> Features | None:
@@ -139,59 +103,50 @@ class FeatureStore:
         except DAMAGE:
             return None  # the file is made again
 
-    def write_features(self, name: str, features: Features) -> None:
-        """Store the features of the image ``name``."""
-        with (
-            atomic(self.features_path(name), sync=False) as temporary,
-            temporary.open("wb") as file,
-        ):
-            np.savez(
-                file,
-                keypoints=features.keypoints,
-                descriptors=features.descriptors,
-                scores=features.scores,
-                sizes=np.array([*features.network_size, *features.file_size]),
-            )
-
-    def read_matches(self, first: str, second: str) -> NDArray[np.uint32] | None:
-        """The stored matches [M, 2] of a pair, or None if the file is missing or damaged."""
+    def read_matches(self, first: str, second: str) -> Matches | None:
+        """The stored matches of a pair, or None if the file is missing or damaged."""
         try:
             matches = np.load(self.matches_path(first, second), allow_pickle=False)
         except DAMAGE:
             return None
         return matches if matches.ndim == 2 and matches.shape[1] == 2 else None
 
-    def write_matches(self, first: str, second: str, matches: NDArray[np.uint32]) -> None:
-        """Store the matches [M, 2] of a pair."""
-        with (
-            atomic(self.matches_path(first, second), sync=False) as temporary,
-            temporary.open("wb") as file,
-        ):
+    def write_features(self, name: str, features: Features) -> None:
+        """Store the features of the image ``name``."""
+        sizes = np.array([*features.network_size, *features.file_size])
+        arrays = {key: getattr(features, key) for key in ("keypoints", "descriptors", "scores")}
+        with self._written(self.features_path(name)) as file:
+            np.savez(file, sizes=sizes, **arrays)
+
+    def write_matches(self, first: str, second: str, matches: Matches) -> None:
+        """Store the matches of a pair."""
+        with self._written(self.matches_path(first, second)) as file:
             np.save(file, matches)
 
-    def require_features(self, name: str) -> Features:
+    def features(self, name: str) -> Features:
         """The stored features; raises ``GsbenchError`` if they are missing."""
-        features = self.read_features(name)
-        if features is None:
-            raise GsbenchError(
-                f"the stored features of {name} are gone from {self.folder}: run again"
-            )
-        return features
+        return self._found(self.read_features(name), f"features of {name}")
 
-    def require_matches(self, first: str, second: str) -> NDArray[np.uint32]:
-        """The stored matches [M, 2] of a pair; raises ``GsbenchError`` if they are missing."""
-        matches = self.read_matches(first, second)
-        if matches is None:
-            raise GsbenchError(
-                f"the stored matches of {first} and {second} are gone from {self.folder}: run again"
-            )
-        return matches
+    def matches(self, first: str, second: str) -> Matches:
+        """The stored matches of a pair; raises ``GsbenchError`` if they are missing."""
+        return self._found(self.read_matches(first, second), f"matches of {first} and {second}")
+
+    def _found(self, stored: T | None, what: str) -> T:
+        if stored is None:
+            raise GsbenchError(f"the stored {what} are gone from {self.folder}: run again")
+        return stored
+
+    @contextmanager
+    def _written(self, path: Path) -> Iterator[BinaryIO]:
+        with atomic(path, sync=False) as temporary, temporary.open("wb") as file:
+            yield file
 
     def _hash_image(self, name: str) -> str:
-        content = hashlib.sha256((self.images / name).read_bytes()).hexdigest()
-        masks = [file_sha256(self.masks[name])] if name in self.masks else []
-        return _key([FORMAT_VERSION, content, self._extraction, *masks])
+        masks = self.capture.masks
+        own = [file_sha256(masks[name])] if name in masks else []
+        return _key([file_sha256(self.capture.images / name), self._extraction, *own])
 
 
-def _key(value: object) -> str:
-    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:KEY_DIGITS]
+def _key(values: list[object]) -> str:
+    text = json.dumps([FORMAT_VERSION, *values], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:KEY_DIGITS]

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from gsbench.errors import InputError
-from gsbench.init.networks.features import Features, FeatureSettings
+from gsbench.init.networks.features import Features, Matches
+from gsbench.init.networks.options import NetworkOptions
 from gsbench.scene.images import read_image, resize_image
 from gsbench.scene.options import downscaled_size
 from gsbench.system.install import install_command
@@ -26,19 +26,20 @@ LIGHTGLUE_DETECTOR_PREFIX = "keypoint_detector."
 # Finds features in an image [1, 3, H, W], RGB in [0, 1]: keypoints [K, 2] in px with the centre of
 # the first pixel at (0, 0), descriptors [K, D] and scores [K].
 Found = tuple[Tensor, Tensor, Tensor]
+Settings = Mapping[str, Any]  # `NetworkOptions.extraction`
 Extractor = Callable[[Tensor], Found]
 
 
 def extract_features(
-    path: Path, extractor: Extractor, settings: FeatureSettings, device: torch.device
+    path: Path, extractor: Extractor, settings: Settings, device: torch.device
 ) -> Features:
-    """Shrink an image to ``settings.max_image_size`` and find its strongest features.
+    """Shrink an image to the ``max_image_size`` of ``settings`` and find its strongest features.
 
     Raises ``InputError`` if the image cannot be read or the device runs out of memory.
     """
     pixels = read_image(path)  # [H, W, 3]
     height, width = pixels.shape[:2]
-    network_size = downscaled_size(width, height, max_size=settings.max_image_size)
+    network_size = downscaled_size(width, height, max_size=settings["max_image_size"])
     pixels = resize_image(pixels, *network_size)
     image = torch.from_numpy(pixels.astype(np.float32) / 255.0).permute(2, 0, 1)[None]
     try:
@@ -49,7 +50,7 @@ def extract_features(
         raise InputError(
             f"{path.name}: {device} ran out of memory at {size} px: {GPU_MEMORY_HINT}"
         ) from error
-    order = torch.sort(found[2], descending=True, stable=True).indices[: settings.max_keypoints]
+    order = torch.sort(found[2], descending=True, stable=True).indices[: settings["max_keypoints"]]
     keypoints, descriptors, scores = (part[order].numpy() for part in found)
     return Features(keypoints, descriptors, scores, network_size, (width, height))
 
@@ -76,7 +77,7 @@ def load_into(
     network.to(device).eval()
 
 
-def _superpoint(settings: FeatureSettings, weights: Path, device: torch.device) -> Extractor:
+def _superpoint(settings: Settings, weights: Path, device: torch.device) -> Extractor:
     try:
         from transformers import SuperPointConfig, SuperPointForKeypointDetection
     except ImportError as error:
@@ -87,8 +88,8 @@ def _superpoint(settings: FeatureSettings, weights: Path, device: torch.device) 
 
     network = SuperPointForKeypointDetection(
         SuperPointConfig(
-            keypoint_threshold=settings.keypoint_threshold,
-            nms_radius=settings.nms_radius,
+            keypoint_threshold=settings["keypoint_threshold"],
+            nms_radius=settings["nms_radius"],
             max_keypoints=-1,
             border_removal_distance=0,
         )
@@ -118,14 +119,14 @@ def _superpoint(settings: FeatureSettings, weights: Path, device: torch.device) 
     return extract
 
 
-def _aliked(settings: FeatureSettings, weights: Path, device: torch.device) -> Extractor:
+def _aliked(settings: Settings, weights: Path, device: torch.device) -> Extractor:
     from kornia.feature import ALIKED
 
     network = ALIKED(
-        f"aliked-{settings.aliked_model}",
-        max_num_keypoints=settings.max_keypoints,
-        detection_threshold=settings.keypoint_threshold,
-        nms_radius=settings.nms_radius,
+        f"aliked-{settings['aliked_model']}",
+        max_num_keypoints=settings["max_keypoints"],
+        detection_threshold=settings["keypoint_threshold"],
+        nms_radius=settings["nms_radius"],
     )
     load_into(network, load_state(weights), weights, device)
 
@@ -136,7 +137,7 @@ def _aliked(settings: FeatureSettings, weights: Path, device: torch.device) -> E
     return extract
 
 
-def _disk(settings: FeatureSettings, weights: Path, device: torch.device) -> Extractor:
+def _disk(settings: Settings, weights: Path, device: torch.device) -> Extractor:
     from kornia.feature import DISK
 
     network = DISK()
@@ -145,9 +146,9 @@ def _disk(settings: FeatureSettings, weights: Path, device: torch.device) -> Ext
     def extract(image: Tensor) -> Found:
         features = network(
             image,
-            n=settings.max_keypoints,
-            window_size=2 * settings.nms_radius + 1,
-            score_threshold=settings.keypoint_threshold,
+            n=settings["max_keypoints"],
+            window_size=2 * settings["nms_radius"] + 1,
+            score_threshold=settings["keypoint_threshold"],
             pad_if_not_divisible=True,
         )[0]
         return features.keypoints, features.descriptors, features.detection_scores
@@ -163,14 +164,13 @@ def _gray(image: Tensor) -> Tensor:
 
 # Each makes an extractor with its network on a device from the checked file of weights. They raise
 # ``MissingWeightsError`` if the file does not fit the network.
-EXTRACTORS: dict[str, Callable[[FeatureSettings, Path, torch.device], Extractor]] = {
+EXTRACTORS: dict[str, Callable[[Settings, Path, torch.device], Extractor]] = {
     "superpoint": _superpoint,
     "aliked": _aliked,
     "disk": _disk,
 }
 
 
-Matches = NDArray[np.uint32]  # indices [M, 2] of keypoints in the first and the second image
 Matcher = Callable[[Features, Features], Matches]
 
 
@@ -229,15 +229,16 @@ def lightglue_matcher(
     return match_features
 
 
-def build_matcher(settings: FeatureSettings, weights: Path | None, device: torch.device) -> Matcher:
-    """The matcher named in ``settings``; ``weights`` is LightGlue's checked file.
+def build_matcher(
+    options: NetworkOptions, weights: Sequence[Path], device: torch.device
+) -> Matcher:
+    """The matcher of ``options``; the last of the ``weights`` is LightGlue's checked file.
 
     Raises ``MissingWeightsError`` if the file does not fit the network.
     """
-    if settings.matcher == "mutual_nearest":
-        return mutual_nearest_matcher(settings.max_ratio, device)
-    assert weights is not None
-    return lightglue_matcher(settings.extractor, settings.filter_threshold, weights, device)
+    if options.matcher == "mutual_nearest":
+        return mutual_nearest_matcher(options.max_ratio, device)
+    return lightglue_matcher(options.extractor, options.filter_threshold, weights[-1], device)
 
 
 def match(matcher: Matcher, first: Features, second: Features) -> Matches:

@@ -20,7 +20,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from gsbench.densify.lineage import read_causes
 from gsbench.densify.volumetric import log_volume
-from gsbench.eval.evaluator import Evaluator, MetricContext, Psnr, quantize, summarize
+from gsbench.eval.evaluator import Evaluator, measure_psnr, quantize, summarize
 from gsbench.eval.facts import to_record
 from gsbench.eval.images import as_unit_range
 from gsbench.eval.protocol import Protocol
@@ -257,14 +257,12 @@ def one_color_psnr(scene: Scene, protocol: Protocol) -> float | None:
         count += int(counted.sum())
     color = as_unit_range(torch.from_numpy(np.rint(sums / count).astype(np.uint8)), torch.float32)
     # An `Evaluator` would also measure SSIM, which takes ten times as long.
-    psnr, values = Psnr(MetricContext(protocol, color.device)), []
+    psnr, values = measure_psnr(protocol), []
     for view in scene.test:
         truth = as_unit_range(torch.from_numpy(view.image), torch.float32)
         plain = color.expand_as(truth)
         mask = None if view.mask is None else torch.from_numpy(view.mask)
-        values.append(
-            psnr.measure(plain, truth) if mask is None else psnr.measure_masked(plain, truth, mask)
-        )
+        values.append(psnr(plain, truth, mask))
     return float(np.mean(values))
 
 

@@ -1,11 +1,14 @@
-"""Ray casting for the courtyard, compiled with numba; all functions are scalar and pure."""
+"""Ray casting for the courtyard, compiled with numba.
+
+All functions are pure. Points, directions and colours are tuples or arrays of three numbers.
+"""
 
 from math import exp, floor, inf, sqrt
 
 import numpy as np
 
 from gsbench.scene.courtyard.layout import BOX, SPHERE
-from gsbench.scene.courtyard.textures import clamp, ground, octaves2, shade_factors
+from gsbench.scene.courtyard.textures import blend, clamp, ground, octaves, shade_factors
 from gsbench.system.jit import inlined, kernel
 
 GROUND, SKY = -1, -2
@@ -21,13 +24,25 @@ _EPSILON = 1e-4  # m, how far a shadow ray starts above the surface
 
 
 @inlined
-def to_local(rotation, x, y, z):
-    """World to local direction: the transpose of ``rotation`` [3, 3] times (x, y, z)."""
-    return (
-        rotation[0, 0] * x + rotation[1, 0] * y + rotation[2, 0] * z,
-        rotation[0, 1] * x + rotation[1, 1] * y + rotation[2, 1] * z,
-        rotation[0, 2] * x + rotation[1, 2] * y + rotation[2, 2] * z,
-    )
+def dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@inlined
+def minus(a, b):
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+@inlined
+def ahead(origin, t, direction):
+    """The point at distance ``t`` along a ray."""
+    return origin[0] + t * direction[0], origin[1] + t * direction[1], origin[2] + t * direction[2]
+
+
+@inlined
+def to_local(rotation, v):
+    """World to local direction: the transpose of ``rotation`` [3, 3] times ``v``."""
+    return dot(rotation[:, 0], v), dot(rotation[:, 1], v), dot(rotation[:, 2], v)
 
 
 @inlined
@@ -37,21 +52,28 @@ def inverse(value):
 
 
 @inlined
-def enter_box(lx, ly, lz, hx, hy, hz, ox, oy, oz, ix, iy, iz):
-    """(entry, exit) of a ray with inverse direction i and the box from l to h.
+def inverses(v):
+    return inverse(v[0]), inverse(v[1]), inverse(v[2])
+
+
+@inlined
+def enter_box(low, high, origin, inverted):
+    """(entry, exit) of a ray, with the inverses of its direction, and a box.
 
     If the ray misses the box, entry > exit.
     """
     # Kay and Kajiya 1986: the ray is in the box where it is between all three pairs of planes.
-    ax, bx = (lx - ox) * ix, (hx - ox) * ix
-    ay, by = (ly - oy) * iy, (hy - oy) * iy
-    az, bz = (lz - oz) * iz, (hz - oz) * iz
-    return max(min(ax, bx), min(ay, by), min(az, bz)), min(max(ax, bx), max(ay, by), max(az, bz))
+    entry, exit_ = -inf, inf
+    for k in range(3):
+        a, b = (low[k] - origin[k]) * inverted[k], (high[k] - origin[k]) * inverted[k]
+        entry, exit_ = max(entry, min(a, b)), min(exit_, max(a, b))
+    return entry, exit_
 
 
 @inlined
-def hit_tube(outer, half, inner, ox, oy, oz, dx, dy, dz):
+def hit_tube(outer, half, inner, origin, direction):
     """The first distance > 0 of a ray to a capped cylinder, solid or bored; inf for a miss."""
+    (ox, oy, oz), (dx, dy, dz) = origin, direction
     best = inf
     # The mantles x^2 + y^2 = r^2: the roots of a t^2 + 2 b t + c. A ray along the axis has a = 0.
     a = dx * dx + dy * dy
@@ -76,62 +98,46 @@ def hit_tube(outer, half, inner, ox, oy, oz, dx, dy, dz):
 
 
 @inlined
-def hit_primitive(kind, size, ox, oy, oz, dx, dy, dz):
+def hit_primitive(kind, size, origin, direction):
     """The first distance > 0 along a local ray to the primitive, or inf if it misses."""
     if kind == BOX:
-        entry, exit_ = enter_box(
-            -size[0],
-            -size[1],
-            -size[2],
-            size[0],
-            size[1],
-            size[2],
-            ox,
-            oy,
-            oz,
-            inverse(dx),
-            inverse(dy),
-            inverse(dz),
-        )
+        low, high = (-size[0], -size[1], -size[2]), (size[0], size[1], size[2])
+        entry, exit_ = enter_box(low, high, origin, inverses(direction))
         return entry if 0.0 < entry <= exit_ else inf
     if kind == SPHERE:
         # |o + t d| = r with |d| = 1: t^2 + 2 b t + c = 0
-        b, c = ox * dx + oy * dy + oz * dz, ox * ox + oy * oy + oz * oz - size[0] * size[0]
+        b, c = dot(origin, direction), dot(origin, origin) - size[0] * size[0]
         root = b * b - c
         if root <= 0.0:
             return inf
         t = -b - sqrt(root)
         return t if t > 0.0 else inf
-    return hit_tube(size[0], size[1], size[2], ox, oy, oz, dx, dy, dz)
+    return hit_tube(size[0], size[1], size[2], origin, direction)
 
 
 @inlined
-def cast(layout, ox, oy, oz, dx, dy, dz, any_hit):
+def cast(layout, origin, direction, any_hit):
     """(distance, primitive) of the nearest hit; the primitive may be GROUND or SKY.
 
     With ``any_hit``, for shadow rays, the first primitive found ends the search, and the ground is
     ignored.
     """
     best, index = inf, SKY
-    ix, iy, iz = inverse(dx), inverse(dy), inverse(dz)
-    if dz < -1e-9 and not any_hit:
-        best, index = -oz / dz, GROUND
+    inverted = inverses(direction)
+    if direction[2] < -1e-9 and not any_hit:
+        best, index = -origin[2] / direction[2], GROUND
     for g in range(len(layout.group_low)):
-        low, high = layout.group_low[g], layout.group_high[g]
-        entry, exit_ = enter_box(
-            low[0], low[1], low[2], high[0], high[1], high[2], ox, oy, oz, ix, iy, iz
-        )
+        entry, exit_ = enter_box(layout.group_low[g], layout.group_high[g], origin, inverted)
         if entry > exit_ or exit_ < 0.0 or entry > best:
             continue
         for i in range(layout.group_start[g], layout.group_start[g + 1]):
-            center, size = layout.center[i], layout.size[i]
-            x, y, z = ox - center[0], oy - center[1], oz - center[2]
-            along = x * dx + y * dy + z * dz
-            if along * along < x * x + y * y + z * z - size[3] * size[3]:
+            size, rotation = layout.size[i], layout.rotation[i]
+            start = minus(origin, layout.center[i])
+            along = dot(start, direction)
+            if along * along < dot(start, start) - size[3] * size[3]:
                 continue  # misses the bounding sphere
-            lx, ly, lz = to_local(layout.rotation[i], x, y, z)
-            ux, uy, uz = to_local(layout.rotation[i], dx, dy, dz)
-            t = hit_primitive(layout.kind[i], size, lx, ly, lz, ux, uy, uz)
+            local = to_local(rotation, start), to_local(rotation, direction)
+            t = hit_primitive(layout.kind[i], size, local[0], local[1])
             if t < best:
                 best, index = t, i
                 if any_hit:
@@ -140,10 +146,11 @@ def cast(layout, ox, oy, oz, dx, dy, dz, any_hit):
 
 
 @inlined
-def signed_distance(kind, size, x, y, z):
+def signed_distance(kind, size, point):
     """Distance from a local point to the primitive's surface, negative inside."""
+    x, y, z = point
     if kind == SPHERE:
-        return sqrt(x * x + y * y + z * z) - size[0]
+        return sqrt(dot(point, point)) - size[0]
     if kind == BOX:
         qx, qy, qz = abs(x) - size[0], abs(y) - size[1], abs(z) - size[2]
     else:
@@ -156,26 +163,25 @@ def signed_distance(kind, size, x, y, z):
 
 
 @inlined
-def nearest_surface(layout, x, y, z, limit):
+def nearest_surface(layout, point, limit):
     """The smallest |distance| from a point to any surface or the ground, at most ``limit``."""
-    best = min(abs(z), limit)
+    best = min(abs(point[2]), limit)
     for g in range(len(layout.group_low)):
-        low, high = layout.group_low[g], layout.group_high[g]
-        qx, qy, qz = (
-            max(low[0] - x, 0.0, x - high[0]),
-            max(low[1] - y, 0.0, y - high[1]),
-            max(low[2] - z, 0.0, z - high[2]),
+        below, above = minus(layout.group_low[g], point), minus(point, layout.group_high[g])
+        away = (
+            max(below[0], 0.0, above[0]),
+            max(below[1], 0.0, above[1]),
+            max(below[2], 0.0, above[2]),
         )
         # no primitive in the group's box can be nearer than the box itself
-        if qx * qx + qy * qy + qz * qz >= best * best:
+        if dot(away, away) >= best * best:
             continue
         for i in range(layout.group_start[g], layout.group_start[g + 1]):
-            center, size = layout.center[i], layout.size[i]
-            rx, ry, rz = x - center[0], y - center[1], z - center[2]
-            if rx * rx + ry * ry + rz * rz >= (best + size[3]) ** 2:
+            size, offset = layout.size[i], minus(point, layout.center[i])
+            if dot(offset, offset) >= (best + size[3]) ** 2:
                 continue
-            lx, ly, lz = to_local(layout.rotation[i], rx, ry, rz)
-            best = min(best, abs(signed_distance(layout.kind[i], size, lx, ly, lz)))
+            local = to_local(layout.rotation[i], offset)
+            best = min(best, abs(signed_distance(layout.kind[i], size, local)))
     return best
 
 
@@ -191,37 +197,77 @@ def longer_first(a, b, size_a, size_b):
 
 
 @inlined
-def local_normal(kind, size, x, y, z):
-    """The outward normal (3 values) at a local surface point, and (u, v) in m along the face."""
+def local_normal(kind, size, point):
+    """The outward normal at a local surface point, and a pair of m along the face."""
+    x, y, z = point
     if kind == SPHERE:
         r = size[0]
-        return x / r, y / r, z / r, (x + y) * 0.8, z + 0.4 * (x - y)
+        return (x / r, y / r, z / r), ((x + y) * 0.8, z + 0.4 * (x - y))
     if kind == BOX:
         qx, qy, qz = abs(x) - size[0], abs(y) - size[1], abs(z) - size[2]
         if qx >= qy and qx >= qz:
-            u, v = longer_first(y, z, size[1], size[2])
-            return sign(x), 0.0, 0.0, u, v
+            return (sign(x), 0.0, 0.0), longer_first(y, z, size[1], size[2])
         if qy >= qz:
-            u, v = longer_first(x, z, size[0], size[2])
-            return 0.0, sign(y), 0.0, u, v
-        u, v = longer_first(x, y, size[0], size[1])
-        return 0.0, 0.0, sign(z), u, v
+            return (0.0, sign(y), 0.0), longer_first(x, z, size[0], size[2])
+        return (0.0, 0.0, sign(z)), longer_first(x, y, size[0], size[1])
     radius = sqrt(x * x + y * y)
     if abs(abs(z) - size[1]) < min(abs(radius - size[0]), abs(radius - size[2])):
-        return 0.0, 0.0, sign(z), x, y
+        return (0.0, 0.0, sign(z)), (x, y)
     side = 1.0 if abs(radius - size[0]) <= abs(radius - size[2]) else -1.0
-    return side * x / radius, side * y / radius, 0.0, np.arctan2(y, x) * size[0], z
+    return (side * x / radius, side * y / radius, 0.0), (np.arctan2(y, x) * size[0], z)
 
 
 @inlined
-def sky(dx, dy, dz, seed):
+def sky(direction, seed):
     """The colour of the sky in a direction: a gradient with faint clouds."""
-    up = clamp(dz, 0.0, 1.0)
+    up = clamp(direction[2], 0.0, 1.0)
     mist = exp(-5.0 * up)
     scale = 1.0 / (up + 0.18)
-    cloud = clamp(octaves2(dx * scale, dy * scale, 1.1, 5, 0.55, 0.02, seed + 301) * 0.9, 0.0, 1.0)
-    red, green, blue = 0.24 + 0.50 * mist, 0.42 + 0.42 * mist, 0.80 + 0.16 * mist
-    return red + cloud * (0.95 - red), green + cloud * (0.96 - green), blue + cloud * (0.98 - blue)
+    place = direction[0] * scale, direction[1] * scale, 0.0
+    cloud = clamp(octaves(place, 1.1, 5, 0.55, 0.02, seed + 301) * 0.9, 0.0, 1.0)
+    clear = 0.24 + 0.50 * mist, 0.42 + 0.42 * mist, 0.80 + 0.16 * mist
+    return blend(clear, cloud, (0.95, 0.96, 0.98))
+
+
+@inlined
+def shade(layout, origin, direction, pixel, seed):
+    """The linear colour that a camera ray sees; ``pixel`` is the angle of one subsample, in rad."""
+    t, i = cast(layout, origin, direction, False)
+    if i == SKY:
+        return sky(direction, seed)
+    point = ahead(origin, t, direction)
+    if i == GROUND:
+        normal = 0.0, 0.0, 1.0
+        color = ground(point, t * pixel / max(sqrt(-direction[2]), 0.15), seed)
+    else:
+        rotation, tint = layout.rotation[i], layout.tint[i]
+        local = to_local(rotation, minus(point, layout.center[i]))
+        facing, face = local_normal(layout.kind[i], layout.size[i], local)
+        normal = dot(rotation[0], facing), dot(rotation[1], facing), dot(rotation[2], facing)
+        footprint = t * pixel / max(sqrt(abs(dot(normal, direction))), 0.15)
+        light, warmth = shade_factors(
+            layout.material[i], local, face, footprint, seed + 1009 * (i + 1)
+        )
+        red, blue = 1.0 + 0.30 * warmth, 1.0 - 0.30 * warmth
+        color = tint[0] * light * red, tint[1] * light, tint[2] * light * blue
+    # Ambient occlusion: if there is less free space along the normal than the step, a surface is
+    # near.
+    occlusion = 1.0
+    for step in OCCLUSION_STEPS:
+        free = nearest_surface(layout, ahead(point, step, normal), step)
+        occlusion -= 0.38 * (1.0 - free / step)
+    sun = dot(normal, SUN)
+    if sun > 0.0:
+        # The ray starts a little above the surface, which would otherwise shade itself.
+        _, blocker = cast(layout, ahead(point, _EPSILON, normal), SUN, True)
+        sun = sun if blocker == SKY else 0.0
+    sun = max(sun, 0.0)
+    up = 0.5 + 0.5 * normal[2]
+    return (
+        color[0] * received(0, sun, occlusion, up),
+        color[1] * received(1, sun, occlusion, up),
+        color[2] * received(2, sun, occlusion, up),
+    )
 
 
 @inlined
@@ -229,53 +275,6 @@ def received(channel, sun, occlusion, up):
     """The light on a surface: sunlight, and ambient light from above (share ``up``) and below."""
     ambient = up * SKY_LIGHT[channel] + (1 - up) * BOUNCE_LIGHT[channel]
     return sun * SUN_LIGHT[channel] + occlusion * ambient
-
-
-@inlined
-def shade(layout, ox, oy, oz, dx, dy, dz, pixel, seed):
-    """The linear colour that a camera ray sees; ``pixel`` is the angle of one subsample, in rad."""
-    t, i = cast(layout, ox, oy, oz, dx, dy, dz, False)
-    if i == SKY:
-        return sky(dx, dy, dz, seed)
-    x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
-    if i == GROUND:
-        nx, ny, nz = 0.0, 0.0, 1.0
-        footprint = t * pixel / max(sqrt(-dz), 0.15)
-        red, green, blue = ground(x, y, footprint, seed)
-    else:
-        center, rotation, tint = layout.center[i], layout.rotation[i], layout.tint[i]
-        px, py, pz = to_local(rotation, x - center[0], y - center[1], z - center[2])
-        lx, ly, lz, u, v = local_normal(layout.kind[i], layout.size[i], px, py, pz)
-        nx = rotation[0, 0] * lx + rotation[0, 1] * ly + rotation[0, 2] * lz
-        ny = rotation[1, 0] * lx + rotation[1, 1] * ly + rotation[1, 2] * lz
-        nz = rotation[2, 0] * lx + rotation[2, 1] * ly + rotation[2, 2] * lz
-        facing = abs(nx * dx + ny * dy + nz * dz)
-        footprint = t * pixel / max(sqrt(facing), 0.15)
-        light, warmth = shade_factors(
-            layout.material[i], px, py, pz, u, v, footprint, seed + 1009 * (i + 1)
-        )
-        red = tint[0] * light * (1.0 + 0.30 * warmth)
-        green = tint[1] * light
-        blue = tint[2] * light * (1.0 - 0.30 * warmth)
-    # Ambient occlusion: if there is less free space along the normal than the step, a surface is
-    # near.
-    occlusion = 1.0
-    for step in OCCLUSION_STEPS:
-        free = nearest_surface(layout, x + step * nx, y + step * ny, z + step * nz, step)
-        occlusion -= 0.38 * (1.0 - free / step)
-    sun = nx * SUN[0] + ny * SUN[1] + nz * SUN[2]
-    if sun > 0.0:
-        # The ray starts a little above the surface, which would otherwise shade itself.
-        sx, sy, sz = x + _EPSILON * nx, y + _EPSILON * ny, z + _EPSILON * nz
-        _, blocker = cast(layout, sx, sy, sz, SUN[0], SUN[1], SUN[2], True)
-        sun = sun if blocker == SKY else 0.0
-    sun = max(sun, 0.0)
-    up = 0.5 + 0.5 * nz
-    return (
-        red * received(0, sun, occlusion, up),
-        green * received(1, sun, occlusion, up),
-        blue * received(2, sun, occlusion, up),
-    )
 
 
 @inlined
@@ -293,21 +292,18 @@ def encode(value):
 def render(layout, camera_rotation, origin, intrinsics, image, seed):
     """Render one view into ``image`` [H, W, 3] uint8; ``intrinsics`` is (fx, fy, cx, cy) in px."""
     fx, fy, cx, cy = intrinsics
-    ox, oy, oz = origin
     share = 1.0 / (SUBSAMPLES * SUBSAMPLES)
     pixel = 1.0 / (fx * SUBSAMPLES)
     for row in range(image.shape[0]):
         for column in range(image.shape[1]):
-            red, green, blue = 0.0, 0.0, 0.0
+            total = 0.0, 0.0, 0.0
             for sub in range(SUBSAMPLES * SUBSAMPLES):
                 across = (column + (sub % SUBSAMPLES + 0.5) / SUBSAMPLES - cx) / fx
                 down = (row + (sub // SUBSAMPLES + 0.5) / SUBSAMPLES - cy) / fy
                 scale = 1.0 / sqrt(across * across + down * down + 1.0)
-                dx, dy, dz = to_local(camera_rotation, across * scale, down * scale, scale)
-                r, g, b = shade(layout, ox, oy, oz, dx, dy, dz, pixel, seed)
-                red += share * min(r, 1.5)
-                green += share * min(g, 1.5)
-                blue += share * min(b, 1.5)
-            image[row, column, 0] = encode(red)
-            image[row, column, 1] = encode(green)
-            image[row, column, 2] = encode(blue)
+                direction = to_local(camera_rotation, (across * scale, down * scale, scale))
+                red, green, blue = shade(layout, origin, direction, pixel, seed)
+                seen = min(red, 1.5), min(green, 1.5), min(blue, 1.5)
+                total = ahead(total, share, seen)
+            for channel in range(3):
+                image[row, column, channel] = encode(total[channel])

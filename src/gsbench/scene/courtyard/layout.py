@@ -1,9 +1,9 @@
 """Objects of the courtyard: solid primitives with materials, in metres, z up, the lawn at z = 0."""
 
-from dataclasses import dataclass, field
-from itertools import pairwise
+from collections.abc import Iterable, Iterator
+from itertools import pairwise, product
 from math import cos, pi, radians, sin
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,232 +44,39 @@ class Layout(NamedTuple):
     group_high: NDArray[np.float64]  # [G, 3] m
 
 
-@dataclass
-class _Builder:
-    """Collects primitives in groups; positions are relative to the group's position and yaw."""
-
-    rng: np.random.Generator
-    rows: list[tuple[int, NDArray, NDArray, tuple, int, tuple]] = field(default_factory=list)
-    starts: list[int] = field(default_factory=list)
-    place: NDArray = field(default_factory=lambda: np.zeros(3))
-    turn: NDArray = field(default_factory=lambda: np.eye(3))
-
-    def group(self, x: float, y: float, yaw: float = 0.0) -> None:
-        self.starts.append(len(self.rows))
-        self.place, self.turn = np.array([x, y, 0.0]), _rotation(yaw=yaw)
-
-    def add(self, kind: int, at, size, material: int, tint, **angles: float) -> None:
-        center = self.place + self.turn @ np.array(at)
-        self.rows.append((kind, center, self.turn @ _rotation(**angles), size, material, tint))
-
-    def box(self, at, size, material, tint, **angles: float) -> None:
-        """Add a box with side lengths ``size``, not half extents."""
-        self.add(BOX, at, tuple(side / 2 for side in size), material, tint, **angles)
-
-    def sphere(self, at, radius: float, material: int, tint) -> None:
-        self.add(SPHERE, at, (radius, radius, radius), material, tint)
-
-    def tube(
-        self,
-        at,
-        radius: float,
-        height: float,
-        material: int,
-        tint,
-        inner: float = 0.0,
-        **angles: float,
-    ) -> None:
-        self.add(TUBE, at, (radius, height / 2, inner), material, tint, **angles)
-
-    def layout(self) -> Layout:
-        kind, center, rotation, size, material, tint = zip(*self.rows, strict=True)
-        sizes = [
-            (*sides, _bounding_radius(shape, sides))
-            for shape, sides in zip(kind, size, strict=True)
-        ]
-        starts = [*self.starts, len(self.rows)]
-        bounds = np.array([_bounds(*row[:4]) for row in self.rows])  # [S, 2, 3]
-        low = [bounds[a:b, 0].min(axis=0) for a, b in pairwise(starts)]
-        high = [bounds[a:b, 1].max(axis=0) for a, b in pairwise(starts)]
-        columns = (kind, center, rotation, sizes, material, tint, starts, low, high)
-        return Layout(*map(np.array, columns))
+# A solid: its kind, position, size, material, tint and rotation. A group: x, y, yaw in degrees, and
+# its solids, whose positions are relative to the group's.
+Solid = tuple[
+    int, tuple[float, ...], tuple[float, ...], int, tuple[float, ...], NDArray[np.float64]
+]
+Groups = Iterator[tuple[float, float, float, Iterable[Solid]]]
 
 
 def build_layout(seed: int) -> Layout:
     """Build the courtyard. The plan is fixed; the seed varies small objects and shrubs."""
-    build = _Builder(np.random.default_rng(seed))
-    # Objects near the cameras come first: a ray that hits one skips the groups behind it.
-    _well(build)
-    _crates(build)
-    _bench(build)
-    _pots(build)
-    _logs(build)
-    _sundial(build)
-    _shrubs(build)
-    _pergola(build)
-    _walls(build)
-    _house(build)
-    return build.layout()
+    rng, rows, starts = np.random.default_rng(seed), list[Any](), [0]
+    for part in PARTS:
+        for x, y, yaw, solids in part(rng):
+            turn = _rotation(yaw)
+            for kind, at, size, material, tint, rotation in solids:
+                center, reach = np.array([x, y, 0.0]) + turn @ at, _bounding_radius(kind, size)
+                # Half the sides of an upright box around the solid, widened by 1e-6 m.
+                half = np.array((size[0], *size[:2]) if kind == TUBE else size)
+                half = np.minimum(np.abs(turn @ rotation) @ half, reach) + 1e-6
+                bounds = center - half, center + half
+                row = kind, center, turn @ rotation, (*size, reach), material, tint, *bounds
+                rows.append(row)
+            starts.append(len(rows))
+    *columns, low, high = map(np.array, zip(*rows, strict=True))
+    groups = [slice(*ends) for ends in pairwise(starts)]
+    boxes = [low[own].min(axis=0) for own in groups], [high[own].max(axis=0) for own in groups]
+    return Layout(*columns, *map(np.array, (starts, *boxes)))
 
 
-def _house(build: _Builder) -> None:
-    build.group(0.0, WALL_DISTANCE + 0.3)
-    width, height = 2 * WALL_DISTANCE, HOUSE_HEIGHT
-    build.box((0, 0, height / 2), (width + 1.2, 0.6, height), PLASTER, _WHITEWASH)
-    build.box((0, -0.32, 0.22), (width, 0.12, 0.44), STONE, _GREY_STONE)
-    build.group(0.0, WALL_DISTANCE + 0.3)
-    build.box((0, 0.75, height + 0.55), (width + 1.6, 2.9, 0.12), TILES, _ROOF, roll=30)
-    build.box((0, -0.52, height - 0.14), (width + 1.4, 0.1, 0.12), WOOD, _DARK_OAK)
-    for x in (-5.0, -2.5, 2.5, 5.0):
-        build.group(x, WALL_DISTANCE)
-        _window(build)
-    build.group(0.0, WALL_DISTANCE)
-    build.box((0, -0.03, 1.12), (1.36, 0.1, 2.24), STONE, _SANDSTONE)
-    build.box((0, -0.07, 1.05), (1.04, 0.1, 2.1), WOOD, _DOOR)
-    build.sphere((0.4, -0.14, 1.0), 0.035, METAL, _IRON)
-    build.box((0, -0.35, 0.08), (1.6, 0.7, 0.16), STONE, _SANDSTONE)
-    build.box((0, -0.42, 2.5), (1.8, 0.95, 0.07), TILES, _ROOF, roll=22)
-
-
-def _window(build: _Builder) -> None:
-    build.box((0, -0.03, 1.75), (1.16, 0.1, 1.46), WOOD, _PALE_WOOD)
-    for x in (-0.27, 0.27):
-        for z in (1.42, 2.06):
-            build.box((x, -0.06, z), (0.46, 0.06, 0.54), GLASS, _GLASS)
-    for x in (-0.92, 0.92):
-        build.box((x, -0.035, 1.75), (0.62, 0.07, 1.46), PAINT, _SHUTTER)
-        for z in (1.3, 2.2):
-            build.box((x, -0.075, z), (0.6, 0.04, 0.09), PAINT, _SHUTTER)
-    build.box((0, -0.12, 0.95), (1.4, 0.28, 0.08), STONE, _SANDSTONE)
-    build.box((0, -0.2, 1.08), (1.1, 0.2, 0.18), CLAY, _TERRACOTTA)
-    for x in (-0.38, 0.0, 0.38):
-        build.sphere((x, -0.2, 1.22), 0.15, LEAVES, _PALE_LEAF)
-
-
-def _walls(build: _Builder) -> None:
-    length, height, middle = 2 * WALL_DISTANCE + 1.2, WALL_HEIGHT, WALL_DISTANCE + 0.25
-    for x, y, yaw in ((middle, 0.0, 90.0), (-middle, 0.0, 90.0), (0.0, -middle, 0.0)):
-        build.group(x, y, yaw)
-        build.box((0, 0, height / 2), (length, 0.5, height), STONE, _SANDSTONE)
-        build.box((0, 0, height + 0.06), (length, 0.66, 0.12), STONE, _GREY_STONE)
-    build.group(0.6, -WALL_DISTANCE)
-    build.box((0, 0.02, 1.15), (2.3, 0.16, 2.3), STONE, _GREY_STONE)
-    for x in (-0.48, 0.48):
-        build.box((x, 0.1, 1.05), (0.93, 0.1, 2.1), WOOD, _OAK)
-        for z in (0.5, 1.6):
-            build.box((x, 0.16, z), (0.86, 0.03, 0.1), METAL, _IRON)
-
-
-def _pergola(build: _Builder) -> None:
-    for y in (-4.2, -1.4, 1.4, 4.2):
-        build.group(-5.9, y)
-        build.box((0, 0, 0.14), (0.56, 0.56, 0.28), STONE, _GREY_STONE)
-        build.tube((0, 0, 1.27), 0.19, 1.98, STONE, _WHITEWASH)
-        build.box((0, 0, 2.32), (0.5, 0.5, 0.14), STONE, _GREY_STONE)
-        angle = build.rng.uniform(0, 2 * pi)
-        build.sphere((0.24 * cos(angle), 0.24 * sin(angle), 0.32), 0.25, LEAVES, _DEEP_LEAF)
-    build.group(-6.3, 0.0)
-    build.box((0.4, 0, 2.48), (0.2, 9.6, 0.2), WOOD, _DARK_OAK)
-    for y in np.linspace(-4.5, 4.5, 10):
-        build.box((0.1, float(y), 2.64), (2.3, 0.11, 0.14), WOOD, _OAK)
-
-
-def _shrubs(build: _Builder) -> None:
-    places = [(6.5, y) for y in (-5.8, -3.9, -1.6, 0.8, 3.2, 5.4)] + [
-        (x, -6.5) for x in (-5.6, -3.6, -1.8, 3.0, 5.0)
-    ]
-    for x, y in places:
-        build.group(x + build.rng.uniform(-0.15, 0.1), y + build.rng.uniform(-0.3, 0.3))
-        tint = (_LEAF, _DEEP_LEAF, _PALE_LEAF)[build.rng.integers(3)]
-        radius = build.rng.uniform(0.36, 0.58)
-        build.sphere((0, 0, 0.7 * radius), radius, LEAVES, tint)
-        for _ in range(4):
-            angle, small = build.rng.uniform(0, 2 * pi), radius * build.rng.uniform(0.5, 0.72)
-            height = radius * build.rng.uniform(0.5, 1.5)
-            at = (0.62 * radius * cos(angle), 0.62 * radius * sin(angle), height)
-            build.sphere(at, small, LEAVES, tint)
-
-
-def _well(build: _Builder) -> None:
-    build.group(0.0, 0.0, 20.0)
-    build.tube((0, 0, 0.36), WELL_RADIUS, 0.72, STONE, _GREY_STONE, inner=0.58)
-    build.tube((0, 0, 0.76), WELL_RADIUS + 0.06, 0.1, STONE, _SANDSTONE, inner=0.54)
-    build.tube((0, 0, 0.2), 0.58, 0.4, WATER, _WATER)
-    for x in (-0.7, 0.7):
-        build.box((x, 0, 1.4), (0.13, 0.13, 1.3), WOOD, _OAK)
-    build.box((0, 0, 1.98), (1.75, 0.12, 0.12), WOOD, _DARK_OAK)
-    build.tube((0, 0, 1.52), 0.09, 1.35, LOG, _PALE_WOOD, tilt=90)
-    build.box((0, -0.37, 2.1), (1.95, 0.98, 0.06), TILES, _ROOF, roll=38)
-    build.box((0, 0.37, 2.1), (1.95, 0.98, 0.06), TILES, _ROOF, roll=-38)
-    build.tube((0.15, -0.68, 0.95), 0.13, 0.28, WOOD, _PALE_WOOD, inner=0.11)
-    build.tube((0.15, -0.68, 0.87), 0.135, 0.03, METAL, _IRON, inner=0.11)
-
-
-def _crates(build: _Builder) -> None:
-    build.group(2.0, -1.25, 18.0 + build.rng.uniform(-6, 6))
-    _crate(build, (0, 0, 0), 0.72, 0.0, _PALE_WOOD)
-    _crate(build, (0.86, 0.12, 0), 0.56, 24.0, _OAK)
-    _crate(build, (0.04, -0.02, 0.72), 0.46, 31.0 + build.rng.uniform(-5, 5), _OAK)
-    build.group(1.35, -2.15)
-    build.tube((0, 0, 0.42), 0.31, 0.84, WOOD, _OAK)
-    for z in (0.12, 0.3, 0.55, 0.74):
-        build.tube((0, 0, z), 0.318, 0.05, METAL, _IRON)
-    build.group(1.15, 1.75)
-    build.sphere((0, 0, 0.26), 0.26, PAINT, (0.50, 0.06, 0.04))
-
-
-def _crate(
-    build: _Builder, at: tuple[float, float, float], side: float, yaw: float, tint: tuple
-) -> None:
-    x, y, z = at
-    build.box((x, y, z + side / 2), (side - 0.04, side - 0.04, side - 0.02), WOOD, tint, yaw=yaw)
-    turn, half, slat = _rotation(yaw=yaw), side / 2 - 0.035, 0.07
-    for dx in (-half, half):
-        for dy in (-half, half):
-            across, along, _ = turn @ np.array([dx, dy, 0.0])
-            post = (x + across, y + along, z + side / 2)
-            build.box(post, (slat, slat, side), WOOD, _DARK_OAK, yaw=yaw)
-
-
-def _bench(build: _Builder) -> None:
-    build.group(-1.95, 1.45, 55.0 + build.rng.uniform(-6, 6))
-    for y in (-0.16, 0.0, 0.16):
-        build.box((0, y, 0.46), (1.6, 0.16, 0.045), WOOD, _PALE_WOOD)
-    for z in (0.66, 0.84):
-        build.box((0, 0.27, z), (1.6, 0.04, 0.13), WOOD, _PALE_WOOD, roll=-8)
-    for x in (-0.68, 0.68):
-        build.box((x, -0.16, 0.22), (0.07, 0.07, 0.44), WOOD, _DARK_OAK)
-        build.box((x, 0.25, 0.46), (0.07, 0.07, 0.92), WOOD, _DARK_OAK, roll=-4)
-        build.box((x, 0.03, 0.40), (0.06, 0.46, 0.06), WOOD, _DARK_OAK)
-
-
-def _pots(build: _Builder) -> None:
-    for x, y, scale in ((-1.55, -1.75, 1.0), (-2.25, -1.15, 0.75), (-2.2, -2.15, 0.6)):
-        build.group(x, y)
-        build.tube((0, 0, 0.2 * scale), 0.24 * scale, 0.4 * scale, CLAY, _TERRACOTTA)
-        build.tube((0, 0, 0.4 * scale), 0.28 * scale, 0.07 * scale, CLAY, _TERRACOTTA)
-        tint = (_LEAF, _PALE_LEAF, _DEEP_LEAF)[build.rng.integers(3)]
-        build.sphere((0, 0, 0.66 * scale), 0.3 * scale, LEAVES, tint)
-        for _ in range(3):
-            angle, out = build.rng.uniform(0, 2 * pi), 0.18 * scale
-            at = (out * cos(angle), out * sin(angle), scale * build.rng.uniform(0.65, 0.95))
-            build.sphere(at, 0.19 * scale, LEAVES, tint)
-
-
-def _logs(build: _Builder) -> None:
-    build.group(-0.15, -2.55, -12.0 + build.rng.uniform(-5, 5))
-    for row, count in enumerate((4, 3, 2)):
-        for k in range(count):
-            at = (build.rng.uniform(-0.04, 0.04), (k - (count - 1) / 2) * 0.25, 0.125 + row * 0.215)
-            build.tube(at, build.rng.uniform(0.112, 0.124), 0.9, LOG, _OAK, tilt=90)
-
-
-def _sundial(build: _Builder) -> None:
-    build.group(2.45, 1.0, build.rng.uniform(0, 45))
-    build.box((0, 0, 0.09), (0.66, 0.66, 0.18), STONE, _GREY_STONE)
-    build.tube((0, 0, 0.58), 0.17, 0.8, STONE, _SANDSTONE)
-    build.box((0, 0, 1.02), (0.44, 0.44, 0.09), STONE, _GREY_STONE)
-    build.sphere((0, 0, 1.26), 0.2, STONE, _SANDSTONE)
+def _bounding_radius(kind: int, size: tuple[float, ...]) -> float:
+    if kind == SPHERE:
+        return size[0]
+    return float(np.linalg.norm(size if kind == BOX else size[:2]))
 
 
 def _rotation(yaw: float = 0.0, tilt: float = 0.0, roll: float = 0.0) -> NDArray[np.float64]:
@@ -281,14 +88,218 @@ def _rotation(yaw: float = 0.0, tilt: float = 0.0, roll: float = 0.0) -> NDArray
     return about_z @ about_y @ about_x
 
 
-def _bounds(kind: int, center: NDArray, rotation: NDArray, size: tuple) -> tuple[NDArray, NDArray]:
-    """The axis-aligned bounds (low [3], high [3]) of one primitive, widened by 1e-6 m."""
-    half = {BOX: size, SPHERE: size, TUBE: (size[0], size[0], size[1])}[kind]
-    reach = np.full(3, size[0]) if kind == SPHERE else np.abs(rotation) @ np.array(half)
-    return center - reach - 1e-6, center + reach + 1e-6
+def box(x, y, z, width, depth, height, material, tint, **angles: float) -> Solid:
+    """A box with these sides, not half extents."""
+    size = width / 2, depth / 2, height / 2
+    return BOX, (x, y, z), size, material, tint, _rotation(**angles)
 
 
-def _bounding_radius(kind: int, size: tuple) -> float:
-    if kind == SPHERE:
-        return size[0]
-    return float(np.linalg.norm(size if kind == BOX else size[:2]))
+def sphere(x, y, z, radius, material, tint) -> Solid:
+    return SPHERE, (x, y, z), (radius, radius, radius), material, tint, _rotation()
+
+
+def tube(x, y, z, radius, height, material, tint, inner=0.0, tilt=0.0) -> Solid:
+    """A cylinder, with a bore of the radius ``inner``."""
+    return TUBE, (x, y, z), (radius, height / 2, inner), material, tint, _rotation(tilt=tilt)
+
+
+def _house(_) -> Groups:
+    y, width, height = WALL_DISTANCE + 0.3, 2 * WALL_DISTANCE, HOUSE_HEIGHT
+    yield (
+        0,
+        y,
+        0,
+        [
+            box(0, 0, height / 2, width + 1.2, 0.6, height, PLASTER, _WHITEWASH),
+            box(0, -0.32, 0.22, width, 0.12, 0.44, STONE, _GREY_STONE),
+        ],
+    )
+    yield (
+        0,
+        y,
+        0,
+        [
+            box(0, 0.75, height + 0.55, width + 1.6, 2.9, 0.12, TILES, _ROOF, roll=30),
+            box(0, -0.52, height - 0.14, width + 1.4, 0.1, 0.12, WOOD, _DARK_OAK),
+        ],
+    )
+    for x in (-5.0, -2.5, 2.5, 5.0):
+        yield x, WALL_DISTANCE, 0, _window()
+    yield (
+        0,
+        WALL_DISTANCE,
+        0,
+        [
+            box(0, -0.03, 1.12, 1.36, 0.1, 2.24, STONE, _SANDSTONE),
+            box(0, -0.07, 1.05, 1.04, 0.1, 2.1, WOOD, _DOOR),
+            sphere(0.4, -0.14, 1.0, 0.035, METAL, _IRON),
+            box(0, -0.35, 0.08, 1.6, 0.7, 0.16, STONE, _SANDSTONE),
+            box(0, -0.42, 2.5, 1.8, 0.95, 0.07, TILES, _ROOF, roll=22),
+        ],
+    )
+
+
+def _window() -> Iterator[Solid]:
+    yield box(0, -0.03, 1.75, 1.16, 0.1, 1.46, WOOD, _PALE_WOOD)
+    for x in (-0.27, 0.27):
+        for z in (1.42, 2.06):
+            yield box(x, -0.06, z, 0.46, 0.06, 0.54, GLASS, _GLASS)
+    for x in (-0.92, 0.92):
+        yield box(x, -0.035, 1.75, 0.62, 0.07, 1.46, PAINT, _SHUTTER)
+        for z in (1.3, 2.2):
+            yield box(x, -0.075, z, 0.6, 0.04, 0.09, PAINT, _SHUTTER)
+    yield box(0, -0.12, 0.95, 1.4, 0.28, 0.08, STONE, _SANDSTONE)
+    yield box(0, -0.2, 1.08, 1.1, 0.2, 0.18, CLAY, _TERRACOTTA)
+    for x in (-0.38, 0.0, 0.38):
+        yield sphere(x, -0.2, 1.22, 0.15, LEAVES, _PALE_LEAF)
+
+
+def _walls(_) -> Groups:
+    length, height, middle = 2 * WALL_DISTANCE + 1.2, WALL_HEIGHT, WALL_DISTANCE + 0.25
+    for x, y, yaw in ((middle, 0.0, 90.0), (-middle, 0.0, 90.0), (0.0, -middle, 0.0)):
+        yield (
+            x,
+            y,
+            yaw,
+            [
+                box(0, 0, height / 2, length, 0.5, height, STONE, _SANDSTONE),
+                box(0, 0, height + 0.06, length, 0.66, 0.12, STONE, _GREY_STONE),
+            ],
+        )
+    gate = [box(0, 0.02, 1.15, 2.3, 0.16, 2.3, STONE, _GREY_STONE)]
+    for x in (-0.48, 0.48):
+        gate.append(box(x, 0.1, 1.05, 0.93, 0.1, 2.1, WOOD, _OAK))
+        gate += [box(x, 0.16, z, 0.86, 0.03, 0.1, METAL, _IRON) for z in (0.5, 1.6)]
+    yield 0.6, -WALL_DISTANCE, 0, gate
+
+
+def _pergola(rng) -> Groups:
+    for y in (-4.2, -1.4, 1.4, 4.2):
+        angle = rng.uniform(0, 2 * pi)
+        yield (
+            -5.9,
+            y,
+            0,
+            [
+                box(0, 0, 0.14, 0.56, 0.56, 0.28, STONE, _GREY_STONE),
+                tube(0, 0, 1.27, 0.19, 1.98, STONE, _WHITEWASH),
+                box(0, 0, 2.32, 0.5, 0.5, 0.14, STONE, _GREY_STONE),
+                sphere(0.24 * cos(angle), 0.24 * sin(angle), 0.32, 0.25, LEAVES, _DEEP_LEAF),
+            ],
+        )
+    beam = box(0.4, 0, 2.48, 0.2, 9.6, 0.2, WOOD, _DARK_OAK)
+    rafters = [box(0.1, y, 2.64, 2.3, 0.11, 0.14, WOOD, _OAK) for y in np.linspace(-4.5, 4.5, 10)]
+    yield -6.3, 0, 0, [beam, *rafters]
+
+
+def _shrubs(rng) -> Groups:
+    places = [(6.5, y) for y in (-5.8, -3.9, -1.6, 0.8, 3.2, 5.4)]
+    for x, y in (*places, *((x, -6.5) for x in (-5.6, -3.6, -1.8, 3.0, 5.0))):
+        at = x + rng.uniform(-0.15, 0.1), y + rng.uniform(-0.3, 0.3)
+        tint = (_LEAF, _DEEP_LEAF, _PALE_LEAF)[rng.integers(3)]
+        radius = rng.uniform(0.36, 0.58)
+        solids = [sphere(0, 0, 0.7 * radius, radius, LEAVES, tint)]
+        for _ in range(4):
+            angle, small = rng.uniform(0, 2 * pi), radius * rng.uniform(0.5, 0.72)
+            beside = 0.62 * radius * cos(angle), 0.62 * radius * sin(angle)
+            solids.append(sphere(*beside, radius * rng.uniform(0.5, 1.5), small, LEAVES, tint))
+        yield *at, 0, solids
+
+
+def _well(_) -> Groups:
+    yield (
+        0,
+        0,
+        20,
+        [
+            tube(0, 0, 0.36, WELL_RADIUS, 0.72, STONE, _GREY_STONE, 0.58),
+            tube(0, 0, 0.76, WELL_RADIUS + 0.06, 0.1, STONE, _SANDSTONE, 0.54),
+            tube(0, 0, 0.2, 0.58, 0.4, WATER, _WATER),
+            *(box(x, 0, 1.4, 0.13, 0.13, 1.3, WOOD, _OAK) for x in (-0.7, 0.7)),
+            box(0, 0, 1.98, 1.75, 0.12, 0.12, WOOD, _DARK_OAK),
+            tube(0, 0, 1.52, 0.09, 1.35, LOG, _PALE_WOOD, tilt=90),
+            box(0, -0.37, 2.1, 1.95, 0.98, 0.06, TILES, _ROOF, roll=38),
+            box(0, 0.37, 2.1, 1.95, 0.98, 0.06, TILES, _ROOF, roll=-38),
+            tube(0.15, -0.68, 0.95, 0.13, 0.28, WOOD, _PALE_WOOD, 0.11),
+            tube(0.15, -0.68, 0.87, 0.135, 0.03, METAL, _IRON, 0.11),
+        ],
+    )
+
+
+def _crates(rng) -> Groups:
+    yield (
+        2.0,
+        -1.25,
+        18.0 + rng.uniform(-6, 6),
+        [
+            *_crate(0, 0, 0, 0.72, 0.0, _PALE_WOOD),
+            *_crate(0.86, 0.12, 0, 0.56, 24.0, _OAK),
+            *_crate(0.04, -0.02, 0.72, 0.46, 31.0 + rng.uniform(-5, 5), _OAK),
+        ],
+    )
+    hoops = (tube(0, 0, z, 0.318, 0.05, METAL, _IRON) for z in (0.12, 0.3, 0.55, 0.74))
+    yield 1.35, -2.15, 0, [tube(0, 0, 0.42, 0.31, 0.84, WOOD, _OAK), *hoops]
+    yield 1.15, 1.75, 0, [sphere(0, 0, 0.26, 0.26, PAINT, (0.50, 0.06, 0.04))]
+
+
+def _crate(x, y, z, side, yaw, tint) -> Iterator[Solid]:
+    middle, board = z + side / 2, side - 0.04
+    yield box(x, y, middle, board, board, side - 0.02, WOOD, tint, yaw=yaw)
+    turn, half = _rotation(yaw), side / 2 - 0.035
+    for corner in product((-half, half), repeat=2):
+        across, along = turn[:2, :2] @ corner
+        yield box(x + across, y + along, middle, 0.07, 0.07, side, WOOD, _DARK_OAK, yaw=yaw)
+
+
+def _bench(rng) -> Groups:
+    seat = [box(0, y, 0.46, 1.6, 0.16, 0.045, WOOD, _PALE_WOOD) for y in (-0.16, 0.0, 0.16)]
+    seat += [box(0, 0.27, z, 1.6, 0.04, 0.13, WOOD, _PALE_WOOD, roll=-8) for z in (0.66, 0.84)]
+    for x in (-0.68, 0.68):
+        seat += [
+            box(x, -0.16, 0.22, 0.07, 0.07, 0.44, WOOD, _DARK_OAK),
+            box(x, 0.25, 0.46, 0.07, 0.07, 0.92, WOOD, _DARK_OAK, roll=-4),
+            box(x, 0.03, 0.40, 0.06, 0.46, 0.06, WOOD, _DARK_OAK),
+        ]
+    yield -1.95, 1.45, 55.0 + rng.uniform(-6, 6), seat
+
+
+def _pots(rng) -> Groups:
+    for x, y, scale in ((-1.55, -1.75, 1.0), (-2.25, -1.15, 0.75), (-2.2, -2.15, 0.6)):
+        tint = (_LEAF, _PALE_LEAF, _DEEP_LEAF)[rng.integers(3)]
+        solids = [
+            tube(0, 0, 0.2 * scale, 0.24 * scale, 0.4 * scale, CLAY, _TERRACOTTA),
+            tube(0, 0, 0.4 * scale, 0.28 * scale, 0.07 * scale, CLAY, _TERRACOTTA),
+            sphere(0, 0, 0.66 * scale, 0.3 * scale, LEAVES, tint),
+        ]
+        for _ in range(3):
+            angle, out = rng.uniform(0, 2 * pi), 0.18 * scale
+            at = out * cos(angle), out * sin(angle), scale * rng.uniform(0.65, 0.95)
+            solids.append(sphere(*at, 0.19 * scale, LEAVES, tint))
+        yield x, y, 0, solids
+
+
+def _logs(rng) -> Groups:
+    yaw, logs = -12.0 + rng.uniform(-5, 5), []
+    for row, count in enumerate((4, 3, 2)):
+        for k in range(count):
+            at = rng.uniform(-0.04, 0.04), (k - (count - 1) / 2) * 0.25, 0.125 + row * 0.215
+            logs.append(tube(*at, rng.uniform(0.112, 0.124), 0.9, LOG, _OAK, tilt=90))
+    yield -0.15, -2.55, yaw, logs
+
+
+def _sundial(rng) -> Groups:
+    yield (
+        2.45,
+        1.0,
+        rng.uniform(0, 45),
+        [
+            box(0, 0, 0.09, 0.66, 0.66, 0.18, STONE, _GREY_STONE),
+            tube(0, 0, 0.58, 0.17, 0.8, STONE, _SANDSTONE),
+            box(0, 0, 1.02, 0.44, 0.44, 0.09, STONE, _GREY_STONE),
+            sphere(0, 0, 1.26, 0.2, STONE, _SANDSTONE),
+        ],
+    )
+
+
+# Objects near the cameras come first: a ray that hits one skips the groups behind it.
+PARTS = (_well, _crates, _bench, _pots, _logs, _sundial, _shrubs, _pergola, _walls, _house)

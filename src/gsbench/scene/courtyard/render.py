@@ -12,11 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from gsbench.errors import InputError
 from gsbench.logs import Progress, no_progress
 from gsbench.scene.courtyard.kernels import render
 from gsbench.scene.courtyard.layout import Layout, build_layout
-from gsbench.scene.rules import MIN_IMAGES, MIN_SIZE
 from gsbench.scene.types import Camera
 from gsbench.system.resources import in_threads
 
@@ -39,7 +37,7 @@ def render_courtyard(
     """Write the capture: ``images/*.png`` and the exact COLMAP model ``sparse/0`` without points.
 
     ``width`` and ``height`` are in px. The same arguments give the same bytes. ``progress`` counts
-    views. Raises `InputError` for fewer than 3 views or images below 16 px.
+    views.
     """
     # This module loads pycolmap, which is slow and needed only here.
     from gsbench.scene.colmap import write_model
@@ -61,15 +59,8 @@ def render_courtyard(
 def courtyard_cameras(views: int, width: int, height: int) -> dict[str, Camera]:
     """The cameras by file name, on a wavy ring around the courtyard's centre.
 
-    Steps are 7.5 degrees, or less for more than 48 views, which fill the ring. Raises InputError as
-    `render_courtyard` does.
+    Steps are 7.5 degrees, or less for more than 48 views, which fill the ring.
     """
-    if views < MIN_IMAGES:
-        raise InputError(f"scene.views must be at least {MIN_IMAGES}, got {views}")
-    if min(width, height) < MIN_SIZE:
-        raise InputError(
-            f"scene.width and scene.height must be at least {MIN_SIZE} px, got {width}x{height}"
-        )
     step = min(MAX_STEP, 2 * pi / views)
     angles = [index * step - 0.5 * pi for index in range(views)]
     return {f"{k:04d}.png": ring_camera(angle, width, height) for k, angle in enumerate(angles)}

@@ -34,26 +34,31 @@ def random_cell(x, y, z, seed):
 
 
 @inlined
-def noise2(x, y, seed):
+def smooth(t):
+    """Perlin 2002: 6 t^5 - 15 t^4 + 10 t^3 has no slope and no curvature at 0 and 1."""
+    return t * t * t * (t * (6 * t - 15) + 10)
+
+
+@inlined
+def plane_noise(x, y, seed):
     """Value noise over the plane with unit cells, in [-1, 1]."""
-    fx, fy = floor(x), floor(y)
-    ix, iy = int(fx), int(fy)
-    u, v = x - fx, y - fy
-    # Perlin 2002: 6 t^5 - 15 t^4 + 10 t^3 has no slope and no curvature at lattice points
-    u, v = u * u * u * (u * (6 * u - 15) + 10), v * v * v * (v * (6 * v - 15) + 10)
+    ix, iy = floor(x), floor(y)
+    u, v = smooth(x - ix), smooth(y - iy)
     low = random_cell(ix, iy, 0, seed) * (1 - u) + random_cell(ix + 1, iy, 0, seed) * u
     high = random_cell(ix, iy + 1, 0, seed) * (1 - u) + random_cell(ix + 1, iy + 1, 0, seed) * u
     return 2 * (low * (1 - v) + high * v) - 1
 
 
 @inlined
-def noise3(x, y, z, seed):
-    """Value noise in space with unit cells, in [-1, 1]."""
-    fz = floor(z)
-    iz = int(fz)
-    w = z - fz
-    w = w * w * w * (w * (6 * w - 15) + 10)
-    return noise2(x, y, seed + 7919 * iz) * (1 - w) + noise2(x, y, seed + 7919 * (iz + 1)) * w
+def noise(point, cell, seed):
+    """Value noise in space with cells of ``cell`` m, in [-1, 1]."""
+    x, y, z = point[0] / cell, point[1] / cell, point[2] / cell
+    layer = floor(z)
+    w = smooth(z - layer)
+    near = plane_noise(x, y, seed + 7919 * layer)
+    if w == 0.0:  # also for all patterns over the plane
+        return near
+    return near * (1 - w) + plane_noise(x, y, seed + 7919 * (layer + 1)) * w
 
 
 @inlined
@@ -63,28 +68,14 @@ def visible(cell, footprint):
 
 
 @inlined
-def octaves2(x, y, cell, count, gain, footprint, seed):
-    """Noise octaves over the plane, about [-1, 1]; cells of ``cell`` m, halved for each octave."""
-    total, amplitude = 0.0, 1.0
-    for k in range(count):
-        weight = visible(cell, footprint)
-        if weight == 0.0:
-            break
-        total += weight * amplitude * noise2(x / cell, y / cell, seed + k)
-        amplitude *= gain
-        cell *= 0.5
-    return total
-
-
-@inlined
-def octaves3(x, y, z, cell, count, gain, footprint, seed):
+def octaves(point, cell, count, gain, footprint, seed):
     """Noise octaves in space, about [-1, 1]; cells of ``cell`` m, halved for each octave."""
     total, amplitude = 0.0, 1.0
     for k in range(count):
         weight = visible(cell, footprint)
         if weight == 0.0:
             break
-        total += weight * amplitude * noise3(x / cell, y / cell, z / cell, seed + k)
+        total += weight * amplitude * noise(point, cell, seed + k)
         amplitude *= gain
         cell *= 0.5
     return total
@@ -127,9 +118,21 @@ def clamp(value, low, high):
 
 
 @inlined
-def ground(x, y, footprint, seed):
-    """Colour of the ground at (x, y) m: lawn, a gravel path, and bare soil along the walls."""
-    wobble = 0.10 * octaves2(x, y, 0.7, 4, 0.6, footprint, seed + 11)
+def blend(color, share, other):
+    """``color`` with a ``share`` of the ``other`` colour."""
+    return (
+        color[0] + share * (other[0] - color[0]),
+        color[1] + share * (other[1] - color[1]),
+        color[2] + share * (other[2] - color[2]),
+    )
+
+
+@inlined
+def ground(point, footprint, seed):
+    """Colour of the ground at a place in m: lawn, a gravel path, and bare soil along the walls."""
+    x, y, _ = point
+    flat = x, y, 0.0
+    wobble = 0.10 * octaves(flat, 0.7, 4, 0.6, footprint, seed + 11)
     radius = sqrt(x * x + y * y)
     to_door = max(abs(x + 0.12 * y * (y - 7.2) / 7.2) - 0.55, -y)
     to_gate = max(abs(x - 0.6 * (y / 7.2) ** 2 + 0.9 * y * (y + 7.2) / 14.0 * 0.5) - 0.5, y)
@@ -138,62 +141,61 @@ def ground(x, y, footprint, seed):
     edge = max(0.03, footprint)
 
     # The grass is faint on purpose, so that feature detectors find little in the lawn.
-    patch = octaves2(x, y, 1.9, 3, 0.55, footprint, seed + 21)
-    blades = octaves2(x * 1.5, y, 0.14, 4, 0.85, 0.8 * footprint, seed + 31)
-    tuft = noise2(x / 0.33, y / 0.33, seed + 41)
+    patch = octaves(flat, 1.9, 3, 0.55, footprint, seed + 21)
+    blades = octaves((x * 1.5, y, 0.0), 0.14, 4, 0.85, 0.8 * footprint, seed + 31)
+    tuft = noise(flat, 0.33, seed + 41)
     light = 1.0 + 0.10 * patch + 0.13 * blades + 0.06 * tuft
     dry = clamp(0.35 + 0.30 * patch + 0.12 * tuft, 0.0, 1.0)
-    red = light * (0.092 + 0.062 * dry)
-    green = light * (0.135 + 0.020 * dry)
-    blue = light * (0.036 + 0.014 * dry)
-
+    color = (
+        light * (0.092 + 0.062 * dry),
+        light * (0.135 + 0.020 * dry),
+        light * (0.036 + 0.014 * dry),
+    )
     inside = clamp(0.5 - path / edge, 0.0, 1.0)
     if inside > 0.0:
         _, border, shade = pebbles(x, y, 0.055, seed + 51)
         sharp = visible(0.055, footprint)
         gap = clamp(1.0 - 4.0 * border, 0.0, 1.0)
         stone = 0.27 + sharp * (0.26 * (shade - 0.5) - 0.15 * gap + 0.05)
-        stone *= 1.0 + 0.10 * octaves2(x, y, 0.9, 4, 0.7, footprint, seed + 61)
+        stone *= 1.0 + 0.10 * octaves(flat, 0.9, 4, 0.7, footprint, seed + 61)
         warm = 0.06 * sharp * (2.0 * random_cell(int(shade * 4096.0), 5, 0, seed) - 1.0)
-        red += inside * (stone * (1.06 + warm) - red)
-        green += inside * (stone * 0.97 - green)
-        blue += inside * (stone * (0.83 - warm) - blue)
+        gravel = stone * (1.06 + warm), stone * 0.97, stone * (0.83 - warm)
+        color = blend(color, inside, gravel)
     bare = clamp(0.5 - soil / edge, 0.0, 1.0) * (1.0 - inside)
     if bare > 0.0:
-        earth = 1.0 + 0.45 * octaves2(x, y, 0.16, 4, 0.7, footprint, seed + 71)
-        red += bare * (earth * 0.115 - red)
-        green += bare * (earth * 0.075 - green)
-        blue += bare * (earth * 0.045 - blue)
-    return red, green, blue
+        earth = 1.0 + 0.45 * octaves(flat, 0.16, 4, 0.7, footprint, seed + 71)
+        color = blend(color, bare, (earth * 0.115, earth * 0.075, earth * 0.045))
+    return color
 
 
 @inlined
-def shade_factors(material, px, py, pz, u, v, footprint, seed):
-    """(lightness, warmth) of a material at a local point in m; (u, v) are m along the face.
+def shade_factors(material, point, face, footprint, seed):
+    """(lightness, warmth) of a material at a local point in m, and a place on its ``face`` in m.
 
     Lightness is a factor of the tint; warmth above 0 makes it redder, below 0 bluer.
     """
+    (px, py, pz), (u, v) = point, face
     light, warmth = 1.0, 0.0
     if material == STONE:
         row = floor(v / 0.24)
-        shift = u + 0.27 * row + 0.1 * random_cell(int(row), 3, 0, seed)
+        shift = u + 0.27 * row + 0.1 * random_cell(row, 3, 0, seed)
         column = floor(shift / 0.46)
-        block = random_cell(int(column), int(row), 9, seed) - 0.5
+        block = random_cell(column, row, 9, seed) - 0.5
         mortar = max(groove(shift, 0.46, 0.016, footprint), groove(v, 0.24, 0.016, footprint))
-        grain = octaves3(px, py, pz, 0.13, 4, 0.75, footprint, seed + 101)
+        grain = octaves(point, 0.13, 4, 0.75, footprint, seed + 101)
         light = (1.0 + 0.42 * block + 0.22 * grain) * (1.0 - 0.45 * mortar)
-        warmth = 0.5 * (random_cell(int(column), int(row), 10, seed) - 0.5)
+        warmth = 0.5 * (random_cell(column, row, 10, seed) - 0.5)
     elif material == PLASTER:
-        stain = octaves3(px, py, pz, 1.3, 3, 0.6, footprint, seed + 111)
-        grain = octaves3(px, py, pz, 0.11, 4, 0.8, footprint, seed + 121)
+        stain = octaves(point, 1.3, 3, 0.6, footprint, seed + 111)
+        grain = octaves(point, 0.11, 4, 0.8, footprint, seed + 121)
         damp = clamp(1.0 - (v + 1.95) / 0.9, 0.0, 1.0)
         light = 1.0 + 0.07 * stain + 0.07 * grain - 0.22 * damp * (0.6 + 0.5 * stain)
         warmth = 0.10 * stain
     elif material in (WOOD, PAINT):
         plank = floor(v / 0.16 + 0.5)
-        tone = random_cell(int(plank), 4, 0, seed) - 0.5
-        fibre = octaves3(u * 0.12, v, px + py + pz, 0.035, 3, 0.8, 0.7 * footprint, seed + 131)
-        knots = octaves3(u, v * 2.5, pz, 0.3, 3, 0.6, footprint, seed + 141)
+        tone = random_cell(plank, 4, 0, seed) - 0.5
+        fibre = octaves((u * 0.12, v, px + py + pz), 0.035, 3, 0.8, 0.7 * footprint, seed + 131)
+        knots = octaves((u, v * 2.5, pz), 0.3, 3, 0.6, footprint, seed + 141)
         strength, depth = (1.0, 0.55) if material == WOOD else (0.25, 0.0)
         light = 1.0 + strength * (0.30 * tone + 0.24 * fibre + 0.20 * knots)
         light *= 1.0 - depth * groove(v + 0.08, 0.16, 0.008, footprint)
@@ -201,37 +203,37 @@ def shade_factors(material, px, py, pz, u, v, footprint, seed):
     elif material == TILES:
         row = floor(v / 0.2)
         shift = u + 0.09 * (row - 2.0 * floor(row / 2.0))
-        tile = random_cell(floor(shift / 0.18), int(row), 6, seed) - 0.5
+        tile = random_cell(floor(shift / 0.18), row, 6, seed) - 0.5
         ridge = (v / 0.2 - row) if footprint < 0.2 else 0.5
-        moss = clamp(octaves3(px, py, pz, 0.5, 4, 0.7, footprint, seed + 151) - 0.25, 0.0, 1.0)
+        moss = clamp(octaves(point, 0.5, 4, 0.7, footprint, seed + 151) - 0.25, 0.0, 1.0)
         light = (1.0 + 0.55 * tile * visible(0.18, footprint)) * (0.72 + 0.5 * ridge)
         light *= 1.0 - 0.5 * groove(shift, 0.18, 0.012, footprint)
         warmth = 0.4 * tile - 1.1 * moss
     elif material == LEAVES:
         _, border, leaf = pebbles(u + 0.31 * pz, v + 0.23 * px, 0.032, seed + 161)
         sharp = visible(0.032, footprint)
-        clump = octaves3(px, py, pz, 0.22, 3, 0.7, footprint, seed + 171)
+        clump = octaves(point, 0.22, 3, 0.7, footprint, seed + 171)
         gap = clamp(1.0 - 5.0 * border, 0.0, 1.0)
         light = 0.9 + sharp * (0.9 * (leaf - 0.5) - 0.40 * gap) + 0.40 * clump
         warmth = 0.5 * sharp * (leaf - 0.5) + 0.2 * clump
     elif material == CLAY:
-        light = 1.0 + 0.22 * octaves3(px, py, pz, 0.12, 4, 0.75, footprint, seed + 181)
+        light = 1.0 + 0.22 * octaves(point, 0.12, 4, 0.75, footprint, seed + 181)
         light *= 1.0 - 0.2 * groove(v, 0.1, 0.008, footprint)
-        warmth = 0.3 * noise3(px / 0.15, py / 0.15, pz / 0.15, seed + 182)
+        warmth = 0.3 * noise(point, 0.15, seed + 182)
     elif material in (WATER, GLASS):
-        ripple = octaves3(px, py, pz, 0.4, 2, 0.5, footprint, seed + 191)
+        ripple = octaves(point, 0.4, 2, 0.5, footprint, seed + 191)
         light = 1.0 + 0.35 * ripple + 0.5 * clamp(v, -0.3, 0.3)
     elif material == METAL:
-        rust = octaves3(px, py, pz, 0.1, 4, 0.8, footprint, seed + 201)
+        rust = octaves(point, 0.1, 4, 0.8, footprint, seed + 201)
         light = 1.0 + 0.4 * rust
         warmth = 0.8 * clamp(rust, 0.0, 1.0)
     elif material == LOG:
         radius = sqrt(px * px + py * py)
-        bark = octaves3(px * 2.0, py * 2.0, pz * 0.35, 0.06, 3, 0.8, footprint, seed + 211)
+        bark = octaves((px * 2.0, py * 2.0, pz * 0.35), 0.06, 3, 0.8, footprint, seed + 211)
         light = 0.8 + 0.55 * bark
         if u * u + v * v < 0.1 and abs(abs(pz) - 0.45) < 1e-4:  # the sawn ends show rings
-            bent = radius + 0.01 * noise2(px / 0.03, py / 0.03, seed)
+            bent = radius + 0.01 * noise((px, py, 0.0), 0.03, seed)
             rings = groove(bent, 0.02, 0.005, footprint)
-            light = 2.2 - 0.9 * rings + 0.25 * noise2(px / 0.04, py / 0.04, seed + 5)
+            light = 2.2 - 0.9 * rings + 0.25 * noise((px, py, 0.0), 0.04, seed + 5)
         warmth = 0.25 * bark
     return max(light, 0.08), warmth
