@@ -73,7 +73,7 @@ def test_a_copy_has_a_name_and_a_checksum_of_its_own(tmp_path):
     write(tmp_path / "below/b.pth", b"copy")
     assert find_weights(named, tmp_path) == tmp_path / "below/b.pth"
     write(tmp_path / "below/b.pth", b"other")
-    with pytest.raises(MissingWeightsError, match="with the file from b.pth, from there"):
+    with pytest.raises(MissingWeightsError, match=r"with the file from b\.pth, from there"):
         find_weights(named, tmp_path)
 
 
