@@ -11,7 +11,6 @@ of NeRF (Mildenhall et al. 2020).
 from __future__ import annotations
 
 import logging
-from collections import Counter
 from collections.abc import Collection
 from dataclasses import fields, replace
 from functools import cached_property
@@ -30,7 +29,7 @@ from gsbench.parsing import (
     text_of,
 )
 from gsbench.scene.images import list_images
-from gsbench.scene.names import IMAGE_SUFFIXES, match, stem_of
+from gsbench.scene.names import IMAGE_SUFFIXES, match
 from gsbench.scene.options import Backdrop, require_enough
 from gsbench.scene.record import Photograph, PointsFile, RawCapture, Role
 from gsbench.scene.rules import Finding
@@ -120,7 +119,7 @@ def read_transforms(
         len(rows),
         folder,
         f"with a file and a camera in {first.name}{lacking}",
-        find.remedy(all_missing),
+        "set scene.images to the folder of the photographs" if all_missing else "",
     )
     if "" in files:
         roles = _named_split(files[""], records[""], rows, find)
@@ -208,19 +207,6 @@ class _FileFinder:
             return match([relative.as_posix()], self._files).get(relative.as_posix())
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
-
-    def remedy(self, missing: Collection[str]) -> str:
-        """Advice, if one folder has files with the last parts of the ``missing`` names; else ""."""
-        wanted = {stem_of(PurePosixPath(name).name).casefold() for name in missing}
-        folders = Counter(
-            file.rpartition("/")[0]
-            for file in (self._files if wanted else ())
-            if stem_of(PurePosixPath(file).name).casefold() in wanted
-        )
-        if not folders:
-            return ""
-        folder, count = folders.most_common(1)[0]
-        return f"{folder or '.'} has {count} of the names: set scene.images={folder or '.'}"
 
 
 def _named_split(
