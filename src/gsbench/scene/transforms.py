@@ -28,6 +28,7 @@ from gsbench.parsing import (
     resolved,
     text_of,
 )
+from gsbench.scene.colmap_files import require_subfolder
 from gsbench.scene.images import list_images
 from gsbench.scene.names import IMAGE_SUFFIXES, match
 from gsbench.scene.options import Backdrop, require_enough
@@ -83,6 +84,8 @@ def read_transforms(
     the files name, as nerfstudio replaces ``images`` by ``images_4``: ``images_4/a.png`` is read
     for ``images/a.png``.
     """
+    if image_folder is not None:
+        require_subfolder(folder, image_folder, "scene.images")
     files = find_files(folder)
     records = {split: _read_record(path, backdrop) for split, path in files.items()}
     find = _FileFinder(folder, image_folder)
@@ -109,7 +112,7 @@ def read_transforms(
                 *pose_of(path, frame, applied),
                 mask=_beside(path, frame.mask_path),
                 depth=_beside(path, frame.depth_file_path),
-                role=ROLES[split],
+                role=ROLES[split] if len(files) > 1 else "",
             )
         all_missing += missing
         points = _points(path, record, applied, points)
@@ -124,8 +127,6 @@ def read_transforms(
     if "" in files:
         roles = _named_split(files[""], records[""], rows, find)
         rows = {name: replace(row, role=roles.get(name, row.role)) for name, row in rows.items()}
-    elif len(files) == 1:
-        rows = {name: replace(row, role="") for name, row in rows.items()}
     read_from = (*files.values(), *(() if points is None else (points.path,)))
     ordered = tuple(rows[name] for name in sorted(rows))
     noted = {
