@@ -106,9 +106,9 @@ def pixels_of_view(picture: Pixels, lens: CameraModel, view: Camera, source: Pat
     middles = [np.arange(side, dtype=np.float64) + 0.5 for side in (view.width, view.height)]
     pixels = grid(*middles)  # [H W, 2]
     rays = rays_through(pixels, view.fx, view.fy, view.cx, view.cy)
-    size = lens.width, lens.height
-    places: Pixels = as_colmap(lens).img_from_cam(rays) / size  # [H W, 2], in 0..1
-    inside: Pixels = ((places >= 0) & (places < 1)).all(axis=1)  # False for a ray without a place
+    seen: Any = as_colmap(lens).img_from_cam(rays)  # [H W, 2] px
+    places = seen / (lens.width, lens.height)  # in 0..1
+    inside = ((places >= 0) & (places < 1)).all(axis=1)  # False for a ray without a place
     across, down = (np.where(inside[:, None], places, 0) * picture.shape[1::-1]).astype(int).T
     chosen = picture[down, across]
     chosen[~inside] = 0
