@@ -119,7 +119,7 @@ def not_tried(refused):
 
 def results(home):
     book = read_ledger(home)
-    return {idea: book.result(idea) for idea in book.begun}
+    return {idea: book.result(idea) for idea in book.questions}
 
 
 def seeds_of(home):
@@ -457,7 +457,7 @@ def test_names_of_ledgers_and_ideas_are_not_given_twice(home, trainings, refused
     for size in (0.02, 0.04):
         attempt(f"{SPLIT}={size}", "--as", "mine")
     attempt(f"{SPLIT}=0.05", "--as", "baseline")
-    assert read_ledger(home).begun == ["mine", "mine-2", "baseline-3"]
+    assert [*read_ledger(home).questions] == ["mine", "mine-2", "baseline-3"]
     assert "'store' cannot be the name" in refused("ledger show store")
     folder = home.parent / "used/courtyard/random-adc/12345678-seed0"
     write_results(folder, composed(NEW[6:])[0].values | {"name": "used"})
@@ -496,7 +496,7 @@ def test_the_simulated_rule_decides_as_the_ledger_does(trainings, monkeypatch, t
     kept, tests = np.array([0]), np.array([0])
     book = read_ledger(home)
     assert 1 < len(book.tests) < len(draws)
-    for (shared, new), idea in zip(draws, book.begun, strict=True):
+    for (shared, new), idea in zip(draws, book.questions, strict=True):
         one = ledger_rates.Attempt(shared[None], new[None], kept, tests, least=0.5)
         decided = ledger_rates.in_tests(one)
         seeds = (decided.tested if decided.test[0] else decided.seeds)[0]
