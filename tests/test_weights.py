@@ -1,12 +1,8 @@
 """Weights files: search, download, and refusal of wrong files."""
 
-import contextlib
 import hashlib
 import logging
-import os
 import pickle
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -172,27 +168,6 @@ def test_a_download_logs_its_progress(server, empty_caches, caplog):
         "weights: net.pth 1048576/2500000 1.05 MB of 2.5 MB",
         "weights: net.pth 2500000/2500000 2.5 MB of 2.5 MB",
     ]
-
-
-def test_download_shows_a_bar_on_a_terminal(server):
-    pty = pytest.importorskip("pty", reason="needs terminals as Unix has them")
-    code = (
-        "from gsbench.weights import WeightsFile, find_weights\n"
-        f"find_weights(WeightsFile(('net.pth',), {served(server, b'g' * 2_500_000)!r}, None, "
-        "'example.org'))"
-    )
-    ours, theirs = pty.openpty()
-    environment = dict(os.environ) | {"TERM": "xterm", "COLUMNS": "100"}
-    with subprocess.Popen([sys.executable, "-c", code], stderr=theirs, env=environment):
-        os.close(theirs)
-        shown = b""
-        with contextlib.suppress(OSError):  # Linux: the other end is closed
-            while piece := os.read(ours, 1 << 16):
-                shown += piece
-    os.close(ours)
-    assert b"weights: net.pth" in shown
-    assert b"2.5 MB of 2.5 MB" in shown
-    assert "━".encode() in shown
 
 
 @pytest.mark.parametrize(

@@ -23,6 +23,7 @@ from gsbench.words import readable_bytes
 
 if TYPE_CHECKING:
     from torch import Tensor
+    from torch.nn import Module
 
 log = logging.getLogger(__name__)
 
@@ -155,6 +156,29 @@ def load_state(path: Path, entry: str | None = None) -> dict[str, Tensor]:
     if not all(isinstance(value, torch.Tensor) for value in state.values()):
         raise _unreadable(path, "it holds something other than tensors")
     return dict(state)
+
+
+def load_into(network: Module, state: Mapping[str, Tensor], source: object) -> Module:
+    """Load all parameters in ``state`` into ``network``, for evaluation; buffers may be missing.
+
+    Raises ``MissingWeightsError`` that names the ``source`` if it is for another network.
+    """
+    try:
+        missing, unexpected = network.load_state_dict(dict(state), strict=False)
+    except RuntimeError as error:
+        raise MissingWeightsError(
+            f"weights file {source} has tensors of other shapes than the network: replace it"
+        ) from error
+    # Buffers are constants that a network makes itself, and published checkpoints often lack them.
+    learned = {name for name, _ in network.named_parameters()}
+    missing = sorted(learned.intersection(missing))
+    if missing or unexpected:
+        example = (missing or unexpected)[0]
+        raise MissingWeightsError(
+            f"weights file {source} is for another network ({len(missing)} tensors missing, "
+            f"{len(unexpected)} foreign, for example {example}): replace it"
+        )
+    return network.requires_grad_(False).eval()
 
 
 def hub_cache() -> Path:

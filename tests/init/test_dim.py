@@ -173,7 +173,7 @@ def test_lightglue_reads_the_published_names(untrained_weights, tmp_path, monkey
 
     def note(network, *rest):
         networks.append(network)
-        load_into(network, *rest)
+        return load_into(network, *rest)
 
     monkeypatch.setattr(models, "load_into", note)
     matcher_of(tmp_path / "published.pth")

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from gsbench.analysis.notes import Note
 from gsbench.analysis.quantities import COSTS, NO_DIRECTION
-from gsbench.analysis.questions import FIRST_LOOK, LeastEffect, plan_looks, read_least
+from gsbench.analysis.questions import FIRST_LOOK, plan_looks, read_least
 from gsbench.analysis.results import Arm, TrialResult
 from gsbench.analysis.sentences import in_words, reason, with_notes
 from gsbench.analysis.statistics import REFUTED, SUPPORTED, TOO_SMALL
@@ -64,8 +64,8 @@ def declare_gate(
     return Question(
         metric=metric,
         sign=sign,
-        least=size.size,
-        relative=size.relative,
+        least=size[0],
+        relative=size[1],
         baseline=Arm("", BASELINE),
         idea=Arm("", NEW),
         digests=dict.fromkeys(names, (BASELINE, NEW)),
@@ -79,7 +79,7 @@ def declare_gate(
 
 def asked_difference(
     metric: str, least: str | None, values: Mapping[str, Any]
-) -> tuple[Literal[-1, 1], LeastEffect]:
+) -> tuple[Literal[-1, 1], tuple[float, bool]]:
     """The direction of ``metric`` (1: more is better) and the least difference that matters.
 
     ``least`` is text such as ``0.1`` or ``10%``; None takes the metric's usual least difference.
@@ -103,8 +103,8 @@ def asked_difference(
             f"{metric} has no usual least difference that matters: give --least, such as 0.1 or 10%"
         )
     size = read_least(str(usual) if least is None else least, "--least")
-    if metric in COSTS and not size.relative:
-        raise InputError(f"--least of {metric} must be a part, such as 10%, got {size}")
+    if metric in COSTS and not size[1]:
+        raise InputError(f"--least of {metric} must be a part, such as 10%, got {size[0]:g}")
     return (1 if sign > 0 else -1), size
 
 

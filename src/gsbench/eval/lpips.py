@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gsbench.errors import InputError
-from gsbench.weights import MissingWeightsError, WeightsFile, find_weights, load_state
+from gsbench.weights import MissingWeightsError, WeightsFile, find_weights, load_into, load_state
 
 # The networks' input normalisation, per channel: (x - SHIFT) / SCALE for x in [-1, 1].
 SHIFT = (-0.030, -0.088, -0.188)
@@ -157,8 +157,11 @@ class Lpips:
         self.net, self.device = net, torch.device(device)
         self.backbone = BACKBONES[net]
         stack, widths = self.backbone.build()
-        load_features(stack, features, f"lpips {net}")
-        self._layers = stack.requires_grad_(False).eval().to(device)
+        # published files also have a classifier
+        own = {key.removeprefix("features."): value.float() for key, value in features.items()}
+        own = {key: value for key, value in own.items() if key in stack.state_dict()}
+        load_into(stack, own, f"of lpips {net}")
+        self._layers = stack.to(device)
         self._heads = []  # [C] each
         for index, channels in enumerate(widths):
             weight = heads.get(f"lin{index}.model.1.weight")
@@ -263,19 +266,3 @@ def _feature_distance(
         per_channel = (a - b).square().sum(dim=(1, 2))  # [C]
         total = total + (per_channel * head).sum()
     return total / (first.shape[2] * first.shape[3])
-
-
-def load_features(stack: nn.Sequential, state: Mapping[str, Tensor], who: str) -> None:
-    """Load published weights into a backbone.
-
-    Raises InputError naming ``who`` if they are for another network.
-    """
-    expected = stack.state_dict().keys()
-    renamed = {key.removeprefix("features."): value for key, value in state.items()}
-    missing = [key for key in expected if key not in renamed]
-    if missing:
-        raise InputError(
-            f"the weights of {who} lack {missing[0]!r} and {len(missing) - 1} more: not that "
-            "network"
-        )
-    stack.load_state_dict({key: renamed[key].float() for key in expected})

@@ -16,7 +16,6 @@ from gsbench.analysis.quantities import COSTS, TEXTURED, askable_names
 from gsbench.analysis.questions import (
     FIRST_LOOK,
     Asked,
-    LeastEffect,
     NamedQuestion,
     announce,
     ask,
@@ -157,7 +156,7 @@ def asked_of(trials: Sequence[Trial], rows: Sequence[Planned]) -> Asked | None:
 
 def _named(
     values: Mapping[str, Any], metric: str, rows: Sequence[Planned]
-) -> tuple[tuple[NamedQuestion, int, LeastEffect | None], ...]:
+) -> tuple[tuple[NamedQuestion, int, tuple[float | None, bool]], ...]:
     """The questions that the experiment's file names; raises InputError for a wrong one."""
     found = []
     for number, entry in enumerate(values.get("questions") or (), 1):
@@ -175,8 +174,8 @@ def _named(
         sign = DIRECTIONS.get(named.direction, facts.direction if facts else -1)
         usual = facts.worthwhile if facts else None
         least = usual if named.least is None else named.least
-        effect = None if least is None else read_least(least, f"{where}.least")
-        if effect is None and named.direction == "same":
+        effect = (None, False) if least is None else read_least(least, f"{where}.least")
+        if effect[0] is None and named.direction == "same":
             raise InputError(f"{where}.least is needed: a difference below which both are the same")
         found.append((named, sign, effect))
     return tuple(found)

@@ -94,8 +94,8 @@ def new(options: argparse.Namespace, home: Path) -> int:
     opened = Ledger(
         metric=metric,
         sign=sign,
-        least=least.size,
-        relative=least.relative,
+        least=least[0],
+        relative=least[1],
         ideas=options.ideas,
         rate=options.fdr,
         seeds=_seeds(trials),

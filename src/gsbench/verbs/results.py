@@ -36,7 +36,7 @@ from gsbench.analysis.results import (
     load_experiment,
 )
 from gsbench.analysis.table_formats import FORMATS, csv_of
-from gsbench.analysis.tables import DEFAULT_ROWS, build_table, format_cell, with_agreement
+from gsbench.analysis.tables import DEFAULT_ROWS, build_table, format_cell
 from gsbench.errors import InputError
 from gsbench.files import own_output, writable_output, write_text
 from gsbench.runs.experiments import list_experiments
@@ -147,7 +147,7 @@ def _tables(
     else:
         tables = paper_tables(experiment, layout, trials, metrics, comparison)
     suffix, writer = FORMATS[options.format]
-    named = dict(zip(("", "-difference"), with_agreement(tables), strict=False))
+    named = dict(zip(("", "-difference"), tables, strict=False))
     if options.paper is not None:
         named[f"-{options.paper}"] = published_table(with_variants(trials), options.paper)
     return {f"{end}.{suffix}": writer(table) for end, table in named.items()}
@@ -164,7 +164,7 @@ def _fairness_sheets(comparison: "Comparison", format_name: str) -> dict[str, st
     sheets = {}
     for first, second in comparison.pairs:
         end = f"-{FAIRNESS}-{_as_file(second)}-{_as_file(first)}.{suffix}"
-        sheets[end] = writer(fairness_table(comparison.trials, first, second, experiment.older))
+        sheets[end] = writer(fairness_table(comparison.trials, first, second))
     return sheets
 
 
