@@ -422,13 +422,6 @@ def test_an_archived_ledger_names_no_folder_and_no_server(home, trainings, tmp_p
     assert "tracking=none" not in shared.ideas["baseline"].words
 
 
-def test_show_prints_all_for_programs(home, said):
-    attempt(f"{SPLIT}=0.02")
-    shown = json.loads(said("ledger show night --json"))
-    assert [one["result"] for one in shown["ideas"]] == ["kept"]
-    assert (shown["tried"], shown["planned"], shown["kept"]) == (1, 40, ["adc"])
-
-
 def test_show_prints_the_rule_and_a_line_for_each_idea(home, said):
     attempt(f"{SPLIT}=0.02", "--as", "good")
     attempt(f"{SPLIT}=0.04", "--as", "bad")
@@ -441,6 +434,17 @@ def test_show_prints_the_rule_and_a_line_for_each_idea(home, said):
     )
     assert bad.startswith("2. bad against baseline: dropped: looks worse; psnr −")
     assert bad.endswith("; 2 seeds of all ideas")
+    shown = json.loads(said("ledger show night --json"))
+    assert [one["result"] for one in shown["ideas"]] == ["kept", "dropped"]
+    assert (shown["tried"], shown["planned"], shown["kept"]) == (2, 40, ["good"])
+
+
+def test_an_undecided_idea_says_so_once(home, trainings, said):
+    trainings.noise = 5.0
+    assert attempt(f"{SPLIT}=0.05") == 3
+    line = said("ledger show night").splitlines()[-1]
+    assert line.startswith("1. adc against baseline: undecided; psnr ")
+    assert line.count("undecided") == 1
 
 
 def test_ideas_with_other_code_are_not_superseded(home, tmp_path, said):
