@@ -11,7 +11,7 @@ from PIL import Image
 
 from gsbench.scene.colmap import read_model, read_reference
 from gsbench.scene.colmap_files import missing_model
-from gsbench.scene.hold_out import select_images, split_names
+from gsbench.scene.hold_out import select_images
 from gsbench.scene.images import list_images
 from gsbench.scene.names import match, match_anywhere
 from gsbench.scene.options import SceneConfig, SplitRule
@@ -244,16 +244,6 @@ def test_lists_choose_the_training_and_test_views(make_scene, train, test, train
     capture = read_colmap("toy", root, split=rule)
     assert capture.train_names == tuple(f"{k:02d}.png" for k in trained_on)
     assert capture.test_names == tuple(f"{k:02d}.png" for k in tested_on)
-
-
-def test_a_split_without_views_is_refused():
-    names = [str(k) for k in range(5)]
-    for options, said in (
-        ({"test": names}, "no training view"),
-        ({"test": []}, "no test view"),
-    ):
-        with refusal(said):
-            split_names(names, **options)
 
 
 def test_fingerprint_depends_on_content_not_on_place(make_scene, tmp_path):
