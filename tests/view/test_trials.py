@@ -14,7 +14,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 from torch.testing import assert_close
 
-from gsbench.analysis.trial_settings import Configurations
+from gsbench.analysis.trial_result import Configurations
 from gsbench.normalization import Normalization
 from gsbench.raster import create_rasterizer
 from gsbench.scene.types import Camera, View

@@ -24,8 +24,7 @@ from typing import Any, Literal
 
 from gsbench.analysis.addresses import ArmName
 from gsbench.analysis.statistics import ALPHA, MIN_SCENES, sign_test_needs
-from gsbench.analysis.trial_result import Trained
-from gsbench.analysis.trial_settings import canonical
+from gsbench.analysis.trial_result import Trained, canonical
 from gsbench.errors import InputError
 from gsbench.runs.commands import Digest, History, Place, Question, code_in
 from gsbench.runs.config_hash import is_ignored, is_of_scene
