@@ -27,7 +27,7 @@ STATE = {"a.weight": torch.arange(6.0).reshape(2, 3), "a.bias": torch.zeros(2)}
 
 def spec(content=None, url=None, digits=64, name="net.pth"):
     sha256 = None if content is None else hashlib.sha256(content).hexdigest()[:digits]
-    return WeightsFile((name, f"other/{name}"), url, sha256, "example.org")
+    return WeightsFile((name, f"other/{name}"), url, sha256, "" if url else "example.org")
 
 
 @pytest.fixture(autouse=True)
@@ -65,6 +65,16 @@ def test_every_name_counts_and_the_first_right_file_is_taken(tmp_path):
     assert find_all_weights(two, tmp_path) == [
         tmp_path / name for name in ("other/net.pth", "a/net.pth", "other/net.pth")
     ]
+
+
+def test_a_copy_has_a_name_and_a_checksum_of_its_own(tmp_path):
+    digest = hashlib.sha256(b"copy").hexdigest()
+    named = WeightsFile(("net.pth",), None, "0" * 64, "b.pth, from there", (("b.pth", digest),))
+    write(tmp_path / "below/b.pth", b"copy")
+    assert find_weights(named, tmp_path) == tmp_path / "below/b.pth"
+    write(tmp_path / "below/b.pth", b"other")
+    with pytest.raises(MissingWeightsError, match=r"with the file from b\.pth, from there"):
+        find_weights(named, tmp_path)
 
 
 def test_only_the_cache_is_not_searched_below(empty_caches, monkeypatch):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -42,13 +42,19 @@ class WeightsFile:
 
     ``names`` are the accepted file names, of which a download gets the first. ``sha256`` is the
     checksum in hexadecimal, complete or its first digits, or None if none is published; then only
-    the shapes are checked. ``source`` says where a file without an address comes from.
+    the shapes are checked. ``copies`` are names and checksums of files with the same tensors.
+    ``source`` says where a copy, or a file without an address, comes from.
     """
 
     names: tuple[str, ...]
     url: str | None
     sha256: str | None = None
     source: str = ""
+    copies: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def origin(self) -> str:
+        return " or ".join(filter(None, (self.url, self.source)))
 
 
 def find_weights(spec: WeightsFile, folder: Path | None = None, download: bool = True) -> Path:
@@ -85,7 +91,7 @@ def find_all_weights(
     still_missing = [spec for spec in missing if paths[spec] is None]
     if still_missing:
         names = ", ".join(spec.names[0] for spec in still_missing)
-        sources = ", ".join(spec.url or spec.source for spec in still_missing)
+        sources = ", ".join(spec.origin for spec in still_missing)
         places = ", ".join(map(str, folders))
         raise MissingWeightsError(
             f"weights not found: {names} (looked in {places}; {reasons[0]}): get them from "
@@ -110,15 +116,16 @@ def _find_local(spec: WeightsFile, folders: Sequence[Path]) -> Path | None:
 
     Raises ``MissingWeightsError`` if all files found have a wrong checksum.
     """
-    fault = ""
-    for path in chain.from_iterable(_candidates(folder, spec.names) for folder in folders):
+    fault, known = "", dict.fromkeys(spec.names, spec.sha256) | dict(spec.copies)
+    for path, name in chain.from_iterable(_candidates(folder, known) for folder in folders):
         if not path.is_file():
             continue
-        if spec.sha256 is None or (sha256 := file_sha256(path)).startswith(spec.sha256):
+        wanted = known[name]
+        if wanted is None or (sha256 := file_sha256(path)).startswith(wanted):
             return path
         fault = fault or (
-            f"weights file {path} has sha256 {sha256[:16]}…, expected {spec.sha256[:16]}…: wrong "
-            f"or truncated; replace it with the file from {spec.url or spec.source}"
+            f"weights file {path} has sha256 {sha256[:16]}…, expected {wanted[:16]}…: wrong "
+            f"or truncated; replace it with the file from {spec.origin}"
         )
     if fault:
         raise MissingWeightsError(fault)
@@ -198,11 +205,11 @@ def _search_folders(folder: Path | None) -> list[Path]:
     return [*(place for place in places if place is not None), hub_cache()]
 
 
-def _candidates(folder: Path, names: tuple[str, ...]) -> Iterator[Path]:
-    yield from (folder / name for name in names)
+def _candidates(folder: Path, names: Iterable[str]) -> Iterator[tuple[Path, str]]:
+    """Paths that may be a file, with the name that each has."""
+    yield from ((folder / name, name) for name in names)
     if folder != hub_cache() and folder.is_dir():
-        for name in names:
-            yield from sorted(folder.rglob(name))
+        yield from ((path, name) for name in names for path in sorted(folder.rglob(name)))
 
 
 def _download(spec: WeightsFile, folder: Path) -> Path:

@@ -8,8 +8,8 @@ import torch
 import torch.nn.functional as F
 from PIL import Image
 
-from gsbench.eval.lpips import BACKBONES, Lpips, find_first_weights, load_lpips
-from gsbench.weights import MissingWeightsError, load_state
+from gsbench.eval.lpips import BACKBONES, Lpips, load_lpips
+from gsbench.weights import MissingWeightsError, find_weights, load_state
 from tests.helpers import refusal
 
 # ex_ref, ex_p0 and ex_p1 of richzhang/PerceptualSimilarity, with their licence
@@ -94,7 +94,7 @@ def test_squeeze_reproduces_the_published_value(shared):
 
 def trained(net, shared, folder):
     """The network with the convolutions in ``folder``."""
-    features = find_first_weights(BACKBONES[net].features, folder, download=False)
+    features = find_weights(BACKBONES[net].features, folder, download=False)
     heads = shared / "weights" / "lpips" / f"lpips_v0.1_{net}.pth"
     return Lpips(net, load_state(features), load_state(heads))
 

@@ -313,15 +313,3 @@ def test_a_truncated_photo_is_named_and_leaves_no_cache(make_scene, tmp_path):
     with refusal(r"03\.png: the image is damaged"):
         load_scene(capture, capture.model, Store(tmp_path / "cache"), downscale=2)
     assert not list((tmp_path / "cache").glob("views/[!.]*"))
-
-
-@pytest.mark.shared
-def test_real_photos_of_a_distorted_camera_are_undistorted_and_keep_their_poses(shared, tmp_path):
-    capture = read_colmap("herz", shared / "data/herz_jesus_p25", max_images=4)
-    scene = load_scene(capture, capture.model, Store(tmp_path), max_size=300)
-    assert {max(view.camera.width, view.camera.height) for view in scene.train} == {300}
-    model = pycolmap.Reconstruction(capture.model)
-    view = scene.train[0]
-    assert_allclose(
-        view.camera.center, model.find_image_with_name(view.name).projection_center(), atol=1e-9
-    )

@@ -384,12 +384,12 @@ def test_scene_images_replaces_the_folder_that_the_file_names(tmp_path, keep):
         capture_of(folder, tmp_path / "made", images="nowhere")
 
 
-def test_an_error_says_which_folder_has_the_named_files(tmp_path):
+def test_an_error_says_that_another_folder_may_have_the_named_files(tmp_path):
     folder = reduced(write(tmp_path / "in"))
     shutil.rmtree(folder / "images")
     with refusal(
         r"0 images with a file and a camera in transforms.json, while ./images/0.png, .* have no "
-        r"file, but at least 3 are needed: images_2 has 6 of the names: set scene.images=images_2"
+        r"file, but at least 3 are needed: set scene.images to the folder of the photographs"
     ):
         capture_of(folder, tmp_path / "made")
 
@@ -524,11 +524,6 @@ def test_a_byte_order_mark_of_utf8_is_skipped_and_other_encodings_are_named(tmp_
     text = file.read_text()
     file.write_text(text, encoding="utf-8-sig")
     assert len(read_transforms(tmp_path).names) == 6
-    for encoding, said in (
-        ("utf-16", "json cannot be read: it is UTF-16 or UTF-32: save it as UTF-8"),
-        ("utf-32", "json cannot be read: it is UTF-16 or UTF-32: save it as UTF-8"),
-        ("cp1252", r"line 1 is not UTF-8 .*: save it as UTF-8"),
-    ):
-        file.write_text(text.replace("images/3", "Küche/3"), encoding=encoding)
-        with refusal(said):
-            read_transforms(tmp_path)
+    file.write_text(text.replace("images/3", "Küche/3"), encoding="cp1252")
+    with refusal(r"line 1 is not UTF-8 .*: save it as UTF-8"):
+        read_transforms(tmp_path)

@@ -40,7 +40,7 @@ from gsbench.runs.commands import (
     read_history,
 )
 from gsbench.runs.experiments import DEFAULT_METRIC, QUESTIONS, metric_and_question
-from gsbench.runs.layout import RESULTS, SEED, TUNING
+from gsbench.runs.layout import ASKED, RESULTS, SEED, TUNING
 from gsbench.runs.nested import flatten
 from gsbench.settings import check_values
 from gsbench.words import did_you_mean
@@ -200,6 +200,14 @@ def check_looks(trials: Sequence[Trial], rows: Sequence[Planned]) -> tuple[int, 
             f"{what} needs at least {FIRST_LOOK} seeds, as seed=0,1,2,3: the most it adds"
         )
     return first
+
+
+def forget_refused(trials: Sequence[Trial]) -> None:
+    """Remove the trials of a command of which all were refused, unless their training has begun."""
+    for home, own in group_by(trials, lambda trial: trial.files.home).items():
+        begun = (RESULTS, ASKED)
+        folders = {trial.folder for trial in own}
+        remove(home, [one for one in folders if not any((one / name).exists() for name in begun)])
 
 
 def remove(home: Path, folders: Iterable[Path]) -> None:

@@ -9,7 +9,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from gsbench.errors import InputError
-from gsbench.normalization import IDENTITY, Normalization
+from gsbench.normalization import Normalization
 from gsbench.scene.colmap_read import read_model as read_model
 from gsbench.scene.images import check_size, image_size
 from gsbench.scene.names import match_anywhere
@@ -41,20 +41,12 @@ def camera_centers(model: pycolmap.Reconstruction) -> Array:
     return np.array([image.projection_center() for image in posed], dtype=np.float64).reshape(-1, 3)
 
 
-def normalize_capture(capture: Capture, folder: Path) -> Capture:
-    """Move a capture to its advised normalisation, and write the moved model to ``folder``.
-
-    Returns the same capture if no normalisation is advised.
-    """
-    normalization = capture.advised_normalization
-    if normalization.is_identity or capture.model is None:
-        return capture
+def normalize_capture(capture: Capture, folder: Path) -> None:
+    """Move a capture's model to its advised normalisation, and write it to ``folder``."""
+    assert capture.model is not None
     model = read_model(capture.model)
-    normalize_model(model, normalization)
+    normalize_model(model, capture.advised_normalization)
     save_model(model, folder)
-    return replace(
-        capture, model=folder, normalization=normalization, advised_normalization=IDENTITY
-    )
 
 
 def save_model(model: pycolmap.Reconstruction, folder: Path) -> None:

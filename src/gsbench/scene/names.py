@@ -9,6 +9,7 @@ import unicodedata
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from os.path import commonprefix
 from pathlib import PurePosixPath
 
 from gsbench.errors import InputError
@@ -213,15 +214,11 @@ def _stripped(words: Words) -> Words:
     if len(words) < 2:
         return words
     texts = list(words.values())
-    start = len(_common_start(texts).rstrip("0123456789"))
-    end = len(_common_start([text[start:][::-1] for text in texts]).rstrip("0123456789"))
+    # Letters are compared, not parts of paths.
+    start = len(commonprefix(texts).rstrip("0123456789"))  # noqa: RUF071
+    ends = [text[start:][::-1] for text in texts]
+    end = len(commonprefix(ends).rstrip("0123456789"))  # noqa: RUF071
     return {name: text[start : len(text) - end] for name, text in words.items()}
-
-
-def _common_start(texts: Sequence[str]) -> str:
-    first, last = min(texts), max(texts)
-    different = (index for index, letter in enumerate(first) if last[index : index + 1] != letter)
-    return first[: next(different, len(first))]
 
 
 def _unpadded(words: Words) -> Words:

@@ -88,18 +88,11 @@ def read_photos(root: Path, options: SceneConfig) -> RawCapture:
     return RawCapture(folder, tuple(Photograph(name, folder / name) for name in names))
 
 
-def read_nerf(root: Path, options: SceneConfig) -> RawCapture:
-    """Read the photographs and cameras that ``transforms.json`` names."""
-    if options.images is not None:
-        require_subfolder(root, options.images, "scene.images")
-    return read_transforms(root, options.transparent, options.images)
-
-
 READERS: Mapping[str, Reader] = {
     "colmap": read_colmap,
     "courtyard": read_colmap,  # of the folder that gsbench has made
     "photos": read_photos,
-    "transforms": read_nerf,
+    "transforms": lambda root, options: read_transforms(root, options.transparent, options.images),
 }
 
 

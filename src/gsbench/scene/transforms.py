@@ -11,7 +11,6 @@ of NeRF (Mildenhall et al. 2020).
 from __future__ import annotations
 
 import logging
-from collections import Counter
 from collections.abc import Collection
 from dataclasses import fields, replace
 from functools import cached_property
@@ -29,8 +28,9 @@ from gsbench.parsing import (
     resolved,
     text_of,
 )
+from gsbench.scene.colmap_files import require_subfolder
 from gsbench.scene.images import list_images
-from gsbench.scene.names import IMAGE_SUFFIXES, match, stem_of
+from gsbench.scene.names import IMAGE_SUFFIXES, match
 from gsbench.scene.options import Backdrop, require_enough
 from gsbench.scene.record import Photograph, PointsFile, RawCapture, Role
 from gsbench.scene.rules import Finding
@@ -84,6 +84,8 @@ def read_transforms(
     the files name, as nerfstudio replaces ``images`` by ``images_4``: ``images_4/a.png`` is read
     for ``images/a.png``.
     """
+    if image_folder is not None:
+        require_subfolder(folder, image_folder, "scene.images")
     files = find_files(folder)
     records = {split: _read_record(path, backdrop) for split, path in files.items()}
     find = _FileFinder(folder, image_folder)
@@ -110,7 +112,7 @@ def read_transforms(
                 *pose_of(path, frame, applied),
                 mask=_beside(path, frame.mask_path),
                 depth=_beside(path, frame.depth_file_path),
-                role=ROLES[split],
+                role=ROLES[split] if len(files) > 1 else "",
             )
         all_missing += missing
         points = _points(path, record, applied, points)
@@ -120,13 +122,11 @@ def read_transforms(
         len(rows),
         folder,
         f"with a file and a camera in {first.name}{lacking}",
-        find.remedy(all_missing),
+        "set scene.images to the folder of the photographs" if all_missing else "",
     )
     if "" in files:
         roles = _named_split(files[""], records[""], rows, find)
         rows = {name: replace(row, role=roles.get(name, row.role)) for name, row in rows.items()}
-    elif len(files) == 1:
-        rows = {name: replace(row, role="") for name, row in rows.items()}
     read_from = (*files.values(), *(() if points is None else (points.path,)))
     ordered = tuple(rows[name] for name in sorted(rows))
     noted = {
@@ -208,19 +208,6 @@ class _FileFinder:
             return match([relative.as_posix()], self._files).get(relative.as_posix())
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
-
-    def remedy(self, missing: Collection[str]) -> str:
-        """Advice, if one folder has files with the last parts of the ``missing`` names; else ""."""
-        wanted = {stem_of(PurePosixPath(name).name).casefold() for name in missing}
-        folders = Counter(
-            file.rpartition("/")[0]
-            for file in (self._files if wanted else ())
-            if stem_of(PurePosixPath(file).name).casefold() in wanted
-        )
-        if not folders:
-            return ""
-        folder, count = folders.most_common(1)[0]
-        return f"{folder or '.'} has {count} of the names: set scene.images={folder or '.'}"
 
 
 def _named_split(

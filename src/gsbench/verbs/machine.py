@@ -237,17 +237,17 @@ def check_triton() -> Iterator[Finding]:
 
 def check_weights() -> Iterator[Finding]:
     """Findings about the weights of networks that are here; nothing is downloaded."""
-    from gsbench.eval.lpips import BACKBONES, find_first_weights
+    from gsbench.eval.lpips import BACKBONES
     from gsbench.init.networks.options import EXTRACTOR_WEIGHTS, LIGHTGLUE_WEIGHTS
-    from gsbench.weights import MissingWeightsError
+    from gsbench.weights import MissingWeightsError, find_weights
 
     wanted = {f"LPIPS {name}": backbone.features for name, backbone in BACKBONES.items()}
-    wanted |= {f"LPIPS {name} heads": (backbone.heads,) for name, backbone in BACKBONES.items()}
-    wanted |= {f"init=dim {name}": (spec,) for name, spec in EXTRACTOR_WEIGHTS.items()}
-    wanted |= {f"LightGlue for {name}": (spec,) for name, spec in LIGHTGLUE_WEIGHTS.items()}
-    for purpose, specs in wanted.items():
+    wanted |= {f"LPIPS {name} heads": backbone.heads for name, backbone in BACKBONES.items()}
+    wanted |= {f"init=dim {name}": spec for name, spec in EXTRACTOR_WEIGHTS.items()}
+    wanted |= {f"LightGlue for {name}": spec for name, spec in LIGHTGLUE_WEIGHTS.items()}
+    for purpose, spec in wanted.items():
         try:
-            text = str(find_first_weights(specs, None, download=False))
+            text = str(find_weights(spec, download=False))
             verdict: Verdict = "ok"
         except MissingWeightsError as error:
             verdict, text = "note", str(error)
