@@ -29,7 +29,6 @@ from gsbench.bench.measure import (
     UNUSED_FOLDER,
     WARM_UP_STEPS,
     constant_scene_options,
-    make_rasterizer,
 )
 from gsbench.bench.scenes import frontal_camera, trained_like_gaussians
 from gsbench.densify import ADC
@@ -37,6 +36,7 @@ from gsbench.external.exchange import write_training_views
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import write_ply
 from gsbench.init.base import PointCloud
+from gsbench.raster import create_rasterizer
 from gsbench.scene.types import Scene, View
 from gsbench.train.trainer import Trainer
 
@@ -107,7 +107,7 @@ class Ours:
         densifier = ADC(
             start=NEVER - 1, stop=NEVER, opacity_reset_interval=NEVER, max_gaussians=None
         )
-        rasterizer = make_rasterizer("cpu", torch.device("cpu"), 1)
+        rasterizer = create_rasterizer("cpu", torch.device("cpu"), 1)
         self.trainer = Trainer(
             Scene("bench", views, ()), gaussians, densifier, rasterizer, constant_scene_options(), 0
         )

@@ -209,7 +209,8 @@ def failing(finish: bool) -> Draw:
         baseline, arm = trials("adc", values[0]), trials("arm0", values[1] - bad)
         lost = [one for one, failed in zip(arm, bad.flat, strict=True) if failed and not finish]
         done = [*baseline, *(one for one in arm if one not in lost)]
-        verdict = judge(done, asked, [Unfinished.of(one) for one in lost])
+        missing = [Unfinished(one.path, one.digest, failed=True) for one in lost]
+        verdict = judge(done, asked, missing)
         return float(verdict.outcome == SUPPORTED)
 
     return draw

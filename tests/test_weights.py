@@ -1,12 +1,8 @@
 """Weights files: search, download, and refusal of wrong files."""
 
-import contextlib
 import hashlib
 import logging
-import os
 import pickle
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -31,7 +27,7 @@ STATE = {"a.weight": torch.arange(6.0).reshape(2, 3), "a.bias": torch.zeros(2)}
 
 def spec(content=None, url=None, digits=64, name="net.pth"):
     sha256 = None if content is None else hashlib.sha256(content).hexdigest()[:digits]
-    return WeightsFile((name, f"other/{name}"), url, sha256, "example.org")
+    return WeightsFile((name, f"other/{name}"), url, sha256, "" if url else "example.org")
 
 
 @pytest.fixture(autouse=True)
@@ -69,6 +65,16 @@ def test_every_name_counts_and_the_first_right_file_is_taken(tmp_path):
     assert find_all_weights(two, tmp_path) == [
         tmp_path / name for name in ("other/net.pth", "a/net.pth", "other/net.pth")
     ]
+
+
+def test_a_copy_has_a_name_and_a_checksum_of_its_own(tmp_path):
+    digest = hashlib.sha256(b"copy").hexdigest()
+    named = WeightsFile(("net.pth",), None, "0" * 64, "b.pth, from there", (("b.pth", digest),))
+    write(tmp_path / "below/b.pth", b"copy")
+    assert find_weights(named, tmp_path) == tmp_path / "below/b.pth"
+    write(tmp_path / "below/b.pth", b"other")
+    with pytest.raises(MissingWeightsError, match=r"with the file from b\.pth, from there"):
+        find_weights(named, tmp_path)
 
 
 def test_only_the_cache_is_not_searched_below(empty_caches, monkeypatch):
@@ -172,27 +178,6 @@ def test_a_download_logs_its_progress(server, empty_caches, caplog):
         "weights: net.pth 1048576/2500000 1.05 MB of 2.5 MB",
         "weights: net.pth 2500000/2500000 2.5 MB of 2.5 MB",
     ]
-
-
-def test_download_shows_a_bar_on_a_terminal(server):
-    pty = pytest.importorskip("pty", reason="needs terminals as Unix has them")
-    code = (
-        "from gsbench.weights import WeightsFile, find_weights\n"
-        f"find_weights(WeightsFile(('net.pth',), {served(server, b'g' * 2_500_000)!r}, None, "
-        "'example.org'))"
-    )
-    ours, theirs = pty.openpty()
-    environment = dict(os.environ) | {"TERM": "xterm", "COLUMNS": "100"}
-    with subprocess.Popen([sys.executable, "-c", code], stderr=theirs, env=environment):
-        os.close(theirs)
-        shown = b""
-        with contextlib.suppress(OSError):  # Linux: the other end is closed
-            while piece := os.read(ours, 1 << 16):
-                shown += piece
-    os.close(ours)
-    assert b"weights: net.pth" in shown
-    assert b"2.5 MB of 2.5 MB" in shown
-    assert "━".encode() in shown
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,6 +23,7 @@ from gsbench.words import readable_bytes
 
 if TYPE_CHECKING:
     from torch import Tensor
+    from torch.nn import Module
 
 log = logging.getLogger(__name__)
 
@@ -40,13 +42,19 @@ class WeightsFile:
 
     ``names`` are the accepted file names, of which a download gets the first. ``sha256`` is the
     checksum in hexadecimal, complete or its first digits, or None if none is published; then only
-    the shapes are checked. ``source`` says where a file without an address comes from.
+    the shapes are checked. ``copies`` are names and checksums of files with the same tensors.
+    ``source`` says where a copy, or a file without an address, comes from.
     """
 
     names: tuple[str, ...]
     url: str | None
     sha256: str | None = None
     source: str = ""
+    copies: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def origin(self) -> str:
+        return " or ".join(filter(None, (self.url, self.source)))
 
 
 def find_weights(spec: WeightsFile, folder: Path | None = None, download: bool = True) -> Path:
@@ -83,8 +91,8 @@ def find_all_weights(
     still_missing = [spec for spec in missing if paths[spec] is None]
     if still_missing:
         names = ", ".join(spec.names[0] for spec in still_missing)
-        sources = ", ".join(spec.url or spec.source for spec in still_missing)
-        places = ", ".join(str(place) for place, _ in folders)
+        sources = ", ".join(spec.origin for spec in still_missing)
+        places = ", ".join(map(str, folders))
         raise MissingWeightsError(
             f"weights not found: {names} (looked in {places}; {reasons[0]}): get them from "
             f"{sources}, put them into a folder and set {WEIGHTS_VARIABLE} to it"
@@ -98,33 +106,29 @@ def digests_of_unpinned(specs: Sequence[WeightsFile], folder: Path | None = None
     Such a file can be any file of the right shapes. Files in the torch hub cache were downloaded
     from the published address, so they are left out.
     """
-    users = [
-        (place, sub_folders)
-        for place, sub_folders in _search_folders(folder)
-        if place != hub_cache()
-    ]
+    users = _search_folders(folder)[:-1]
     paths = [_find_local(spec, users) for spec in specs if spec.sha256 is None]
     return [file_sha256(path) for path in paths if path is not None]
 
 
-def _find_local(spec: WeightsFile, folders: Sequence[tuple[Path, bool]]) -> Path | None:
+def _find_local(spec: WeightsFile, folders: Sequence[Path]) -> Path | None:
     """The first file with the right checksum; None if there is no file.
 
     Raises ``MissingWeightsError`` if all files found have a wrong checksum.
     """
-    faults = []
-    for folder, sub_folders in folders:
-        for path in _candidates(folder, spec.names, sub_folders):
-            if spec.sha256 is None or (sha256 := file_sha256(path)).startswith(spec.sha256):
-                return path
-            faults.append(
-                f"weights file {path} has sha256 {sha256[:16]}…, expected {spec.sha256[:16]}…"
-            )
-    if faults:
-        origin = spec.url or spec.source
-        raise MissingWeightsError(
-            f"{faults[0]}: wrong or truncated; replace it with the file from {origin}"
+    fault, known = "", dict.fromkeys(spec.names, spec.sha256) | dict(spec.copies)
+    for path, name in chain.from_iterable(_candidates(folder, known) for folder in folders):
+        if not path.is_file():
+            continue
+        wanted = known[name]
+        if wanted is None or (sha256 := file_sha256(path)).startswith(wanted):
+            return path
+        fault = fault or (
+            f"weights file {path} has sha256 {sha256[:16]}…, expected {wanted[:16]}…: wrong "
+            f"or truncated; replace it with the file from {spec.origin}"
         )
+    if fault:
+        raise MissingWeightsError(fault)
     return None
 
 
@@ -161,37 +165,51 @@ def load_state(path: Path, entry: str | None = None) -> dict[str, Tensor]:
     return dict(state)
 
 
+def load_into(network: Module, state: Mapping[str, Tensor], source: object) -> Module:
+    """Load all parameters in ``state`` into ``network``, for evaluation; buffers may be missing.
+
+    Raises ``MissingWeightsError`` that names the ``source`` if it is for another network.
+    """
+    try:
+        missing, unexpected = network.load_state_dict(dict(state), strict=False)
+    except RuntimeError as error:
+        raise MissingWeightsError(
+            f"weights file {source} has tensors of other shapes than the network: replace it"
+        ) from error
+    # Buffers are constants that a network makes itself, and published checkpoints often lack them.
+    learned = {name for name, _ in network.named_parameters()}
+    missing = sorted(learned.intersection(missing))
+    if missing or unexpected:
+        example = (missing or unexpected)[0]
+        raise MissingWeightsError(
+            f"weights file {source} is for another network ({len(missing)} tensors missing, "
+            f"{len(unexpected)} foreign, for example {example}): replace it"
+        )
+    return network.requires_grad_(False).eval()
+
+
 def hub_cache() -> Path:
     """The folder of torch.hub's checkpoints, below ``$TORCH_HOME``, else ``$XDG_CACHE_HOME``."""
     cache = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")) / "torch"
     return Path(os.environ.get("TORCH_HOME", cache)).expanduser() / "hub" / "checkpoints"
 
 
-def _search_folders(folder: Path | None) -> list[tuple[Path, bool]]:
-    """The folders to search, in order, each with whether its sub-folders are searched too."""
-    folders: list[tuple[Path, bool]] = []
-    if folder is not None:
-        if not folder.is_dir():
-            raise InputError(
-                f"weights folder {folder} does not exist: give a folder, or leave it empty"
-            )
-        folders.append((folder, True))
+def _search_folders(folder: Path | None) -> list[Path]:
+    """The folders to search, in order; all but the last, `hub_cache`, with their sub-folders."""
+    if folder is not None and not folder.is_dir():
+        raise InputError(
+            f"weights folder {folder} does not exist: give a folder, or leave it empty"
+        )
     configured = os.environ.get(WEIGHTS_VARIABLE)
-    if configured:
-        folders.append((Path(configured).expanduser(), True))
-    folders.append((hub_cache(), False))
-    return folders
+    places = folder, Path(configured).expanduser() if configured else None
+    return [*(place for place in places if place is not None), hub_cache()]
 
 
-def _candidates(folder: Path, names: tuple[str, ...], sub_folders: bool) -> list[Path]:
-    direct = [folder / name for name in names]
-    below = (
-        [path for name in names for path in sorted(folder.rglob(name))]
-        if sub_folders and folder.is_dir()
-        else []
-    )
-    files = [path for path in direct + below if path.is_file()]
-    return list(dict.fromkeys(files))
+def _candidates(folder: Path, names: Iterable[str]) -> Iterator[tuple[Path, str]]:
+    """Paths that may be a file, with the name that each has."""
+    yield from ((folder / name, name) for name in names)
+    if folder != hub_cache() and folder.is_dir():
+        yield from ((path, name) for name in names for path in sorted(folder.rglob(name)))
 
 
 def _download(spec: WeightsFile, folder: Path) -> Path:
@@ -205,18 +223,11 @@ def _download(spec: WeightsFile, folder: Path) -> Path:
     with atomic(target) as temporary, progress("weights") as report:
 
         def advance(done: int, total: int | None) -> None:
+            size = readable_bytes(total)
             if done:
-                report(
-                    target.name, done, total, f"{readable_bytes(done)} of {readable_bytes(total)}"
-                )
+                report(target.name, done, total, f"{readable_bytes(done)} of {size}")
             else:
-                log.info(
-                    "downloading %s (%s) from %s to %s",
-                    target.name,
-                    readable_bytes(total),
-                    spec.url,
-                    folder,
-                )
+                log.info("downloading %s (%s) from %s to %s", target.name, size, spec.url, folder)
 
         sha256 = downloads.download(spec.url, temporary, ONE_TRY, advance)
         if not sha256.startswith(spec.sha256 or ""):

@@ -7,7 +7,7 @@ import pytest
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.tables import build_table
 from gsbench.verbs.results import explain_cell
-from tests.analysis.helpers import loaded, page_of
+from tests.analysis.helpers import loaded
 from tests.trials import write_trial
 
 OLD, NEW = "1" * 64, "2" * 64
@@ -52,18 +52,6 @@ def test_the_newest_code_counts_and_one_line_names_all_earlier_versions(tmp_path
     assert (words in page, "Not in this report: 3 of" in page) == (True, True)
     write_trial(tmp_path, 0, "dddddddd", psnr=26.0, densify="other", _code=code())
     assert words not in explain_cell("exp:garden:psnr:other", tmp_path)
-
-
-def test_choices_by_earlier_code_are_counted(tmp_path):
-    write_trial(tmp_path, psnr=26.0, densify="none", _code=code())
-    for number, (version, views) in enumerate([(OLD, 5), ("3" * 64, 5), (NEW, 5), (NEW, 8)]):
-        made = MINE | {"densify.views": views}
-        finished_at(
-            write_trial(tmp_path, 0, f"{number:08}", made, psnr=27.0, _code=code(version)), number
-        )
-    page = page_of(tmp_path)
-    said = "4 choices of settings and code ran here. They differ in densify.views and code of mine,"
-    assert said in page
 
 
 def test_settings_that_were_last_trained_with_other_code_are_folded(tmp_path):

@@ -113,21 +113,6 @@ def test_trials_without_any_record_still_have_a_sheet(tmp_path, paths):
 # --- tuning
 
 
-def test_settings_that_vary_among_the_arms_are_listed_as_tuning(tmp_path):
-    arms = {
-        f"volumetric-{v}": densifier("volumetric", volume_threshold=v) for v in (0.01, 0.03, 0.1)
-    }
-    write_arms(tmp_path, {"adc": densifier("adc"), **arms, "absgrad": densifier("absgrad")})
-    notes = sheet(tmp_path, "volumetric-0.01").notes
-    two = tmp_path / "two"
-    write_arms(two, {"adc": densifier("adc"), **dict([*arms.items()][:2])})
-    said = "sfm-volumetric-0.01: {} choices of settings"
-    assert any(said.format(2) in note for note in sheet(two, "volumetric-0.01").notes)
-    (line,) = [note for note in notes if said.format(3) in note]
-    words = "They differ in densify.volume_threshold, and all were measured on the test views"
-    assert words in line
-
-
 def test_a_search_that_proposed_the_settings_is_named(tmp_path):
     write_arms(
         tmp_path,

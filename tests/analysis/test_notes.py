@@ -1,17 +1,14 @@
 """Notes below tables, word for word, for made-up trials with known numbers."""
 
-import html
 import itertools
 from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
 
-from gsbench.analysis.fairness import counts_notes, equal_counts_advice, limit_notes
+from gsbench.analysis.fairness import counts_notes, equal_counts_advice
 from gsbench.analysis.notes import Note, texts
-from gsbench.analysis.report.build import build_report
 from gsbench.analysis.table_notes import doubt_notes, held_out_notes, origin_notes, points_notes
-from gsbench.analysis.tables import build_table
 from gsbench.runs.experiments import Arm
 from gsbench.runs.trial_record import (
     FROM_MODEL,
@@ -21,7 +18,7 @@ from gsbench.runs.trial_record import (
 )
 from tests.analysis.helpers import ADC, VOLUMETRIC, loaded, page_of, table_of
 from tests.helpers import read_json, write
-from tests.trials import write_runs, write_trial
+from tests.trials import write_runs
 
 EQUAL = "To compare at equal ones: "
 
@@ -96,42 +93,6 @@ def test_arms_that_the_governor_did_not_make_equal_need_a_longer_training():
         assert advice(*others).startswith("give all arms densify.cap=governor")
 
 
-@pytest.mark.parametrize(
-    "budget, counts, events, said",
-    [
-        (("governor", 90_000), {"garden": (3000, 3800)}, {}, "ended with 3,800 at most"),
-        # a governor and a curve hold growth back on the way to a limit that is not reached
-        (("governor", 90_000), {"garden": (3000, 3800)}, {"blocked_by_cap": 9}, "3,800 at most"),
-        (("governor", 4000), {"garden": (3950, 3800)}, {}, "trials of sfm-volumetric ended with"),
-        (("governor", 4000), {"garden": (3950, 4010)}, {}, ""),
-        (
-            ("governor", 4000),
-            {"garden": (3950, 3990), "room": (40, 50)},
-            {},
-            "bind on room: trials",
-        ),
-        (("soft", 4000), {"garden": (3000, 3000)}, {"blocked_by_cap": 9}, ""),
-        (("soft", 4000), {"garden": (3000, 3000)}, {}, "3,000 at most"),
-        (("soft", 3_400_000), {"garden": (3000, 3000)}, {}, ""),  # the paper's, for all arms
-        (("hard", None), {"garden": (3000, 3000)}, {}, ""),
-    ],
-)
-def test_a_limit_that_no_arm_reaches_makes_no_counts_equal(tmp_path, budget, counts, events, said):
-    limit = {"cap": budget[0], "max_gaussians": budget[1]}
-    for scene, own in counts.items():
-        for densify, count in zip(("adc", "volumetric"), own, strict=True):
-            place = {"scene": scene, "densify": densify, "psnr": 20.0}
-            write_trial(tmp_path, **place, _num_gaussians=count, _budget=limit, _events=events)
-    experiment = loaded(tmp_path)
-    notes = texts(limit_notes(experiment.trials, [(ADC, VOLUMETRIC)]))
-    assert limit_notes(experiment.trials, []) == []
-    assert len(notes) == bool(said)
-    for note in notes:
-        assert said in note
-        assert note in build_table(experiment).notes
-        assert html.escape(note) in build_report(experiment)
-
-
 @pytest.mark.parametrize("rounds, warns", [(0, True), (1, True), (4, True), (5, False)])
 def test_a_table_warns_of_too_few_rounds(tmp_path, rounds, warns):
     (trial,) = trials_of(tmp_path, scenes=["garden"], densifiers=("adc",), seeds=(0,))
@@ -189,24 +150,6 @@ def test_the_views_behind_initial_points_are_stated_once_per_initialiser(tmp_pat
     observed = [with_record(trial, init_report={"mean_track_length": 3.1}) for trial in made]
     assert Note.of("points of all", init="random", choice="all") in points_notes(observed)
     assert points_notes([trial for trial in made if trial.init == "random"]) == []
-
-
-@pytest.mark.parametrize(
-    "folders, downscales, noted",
-    [
-        (("images", "images_4"), (4, 1), True),
-        (("images", "images"), (4, 1), False),
-        (("images", "images_4"), (1, 1), False),
-    ],
-)
-def test_pictures_of_two_filters_are_noted(tmp_path, folders, downscales, noted):
-    paths = write_runs(tmp_path, seeds=(0,), scenes=("garden",))
-    for path, images, downscale in zip(paths, folders, downscales, strict=True):
-        config = read_json(path / "config.yaml")
-        config["scene"] |= {"images": images, "downscale": downscale}
-        write(path / "config.yaml", config)
-    notes = doubt_notes(loaded(tmp_path).trials)
-    assert notes == [Note.of("filters")] * noted
 
 
 def test_results_that_are_worth_little_or_may_surprise_are_noted_once(tmp_path):

@@ -32,7 +32,7 @@ from gsbench.analysis.table_formats import (
     to_latex,
     to_markdown,
 )
-from gsbench.analysis.tables import build_table, with_agreement
+from gsbench.analysis.tables import build_table
 from gsbench.words import printable
 from tests.analysis.helpers import page_of, rows_of, table_of, trials_of
 from tests.helpers import refusal
@@ -452,26 +452,6 @@ def test_counts_from_a_thousand_and_times_from_ten_minutes_have_the_larger_unit(
     fixed, values = read("gaussians_millions train_minutes peak_memory_mb")
     assert [one.format(1.26) for one in fixed] == ["1.26", "1.3", "1"]
     assert values == pytest.approx([gaussians / 1e6, seconds / 60, 900])
-
-
-@pytest.mark.parametrize(
-    "metrics, said",
-    [
-        (("psnr", "lpips_vgg_raw"), "was 0.52 for PSNR in one study"),
-        (("ssim", "psnr"), "was 0.52 for PSNR, 0.37 for SSIM in one study"),
-        (("flip",), ""),
-    ],
-)
-def test_the_first_table_says_how_weakly_its_metrics_agree_with_people(
-    make_experiment, metrics, said
-):
-    """Values of arXiv 2511.06830, table 3, SROCC of the main set."""
-    table = build_table(make_experiment(), metrics=metrics)
-    first, second = with_agreement([table, table])
-    notes = [note for note in first.notes if "agree with people" in note]
-    assert len(notes) == bool(said)
-    assert said in "".join(notes)
-    assert second == table
 
 
 @pytest.mark.parametrize(

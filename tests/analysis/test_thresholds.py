@@ -60,8 +60,7 @@ def test_p_is_the_level_whose_threshold_is_the_size():
 
 def test_the_table_is_complete():
     own = table()
-    shape = tuple(len(one) for one in (own.scenes, own.seeds, own.levels, own.knots))
-    assert own.f.shape == shape
-    assert own.f.min() >= 0
-    assert own.f.max() <= 1
-    assert not own.f[..., 0].any()
+    assert own["f"].shape == tuple(len(own[one]) for one in ("scenes", "seeds", "levels", "knots"))
+    assert own["f"].min() >= 0
+    assert own["f"].max() <= 1
+    assert not own["f"][..., 0].any()

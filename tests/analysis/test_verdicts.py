@@ -228,7 +228,7 @@ def test_single_scenes_have_95_percent_intervals_whatever_the_level(asked):
         for name in ("adc", "volumetric")
     ]
     expected = stats.ttest_1samp(np.subtract(values[1], values[0]), 0).confidence_interval(0.95)
-    assert (scenes[1].interval.low, scenes[1].interval.high) == pytest.approx(expected)
+    assert (scenes[1][3].low, scenes[1][3].high) == pytest.approx(expected)
 
 
 # ---- looks

@@ -1,6 +1,7 @@
 """From a command line to trials and an exit code, with stand-ins for trials."""
 
 import logging
+from shlex import split
 
 import pytest
 from omegaconf import OmegaConf
@@ -11,9 +12,11 @@ from gsbench.app.sweep import check_sweep_settings
 from gsbench.config.compose import Trial
 from gsbench.errors import GsbenchError, InputError
 from gsbench.launch.outcomes import Outcome
+from gsbench.launch.record import record
+from gsbench.runs.commands import read_history
 from gsbench.runs.trial_folder import TrialFolder
 from tests.app.stand_ins import trial
-from tests.helpers import refusal
+from tests.helpers import refusal, write
 
 
 @pytest.mark.parametrize(
@@ -145,3 +148,33 @@ def test_a_dry_run_shows_as_many_log_lines_as_the_run_would(runs, monkeypatch):
     command.compose_trials(["hydra.verbose=true"])
     command.compose_trials(["hydra.verbose=[gsbench.scene]", "seed=0,1"], multirun=True)
     assert asked == [True, ["gsbench.scene"]]
+
+
+def test_nothing_stays_of_a_command_of_which_all_trials_were_refused(runs, monkeypatch):
+    """A trial whose training began in an earlier command stays."""
+    good = set()
+
+    def run(trials, asks=True):
+        record(trials, asks=False)
+        for one in trials:
+            write(one.folder / "failed.json", {})
+        return [
+            Outcome(one.folder, "failed", "no", one.values["seed"] not in good) for one in trials
+        ]
+
+    def stay():
+        found = {path.parent for path in runs.glob("x/*/*/*/failed.json")}
+        assert found == set(read_history(runs / "x").planned)
+        return sorted(found)
+
+    monkeypatch.setattr(command, "run_batch", run)
+    words = split("-m init=random tracking=none name=x seed=0,1")
+    assert command.launch(words) == 2
+    assert stay() == []
+    good.add(1)
+    assert command.launch(words) == 1
+    first, _ = stay()
+    good.clear()
+    write(first / "asked.json", {})
+    assert command.launch(words) == 2
+    assert stay() == [first]

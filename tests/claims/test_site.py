@@ -75,7 +75,7 @@ def test_a_table_of_many_metrics_is_split_into_one_for_each(tmp_path):
     [
         ("A b!", set(), "a-b"),
         ("exp", {"exp"}, "exp-2"),
-        ("exp", {"exp", "exp-2"}, "exp-3"),
+        ("exp", {"exp", "exp-2"}, "exp-2-2"),
         ("…", set(), "experiment"),
     ],
 )

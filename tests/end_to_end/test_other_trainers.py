@@ -177,7 +177,9 @@ def test_a_trial_of_another_program_has_a_full_record(home):
     assert model["iterations"] == 40
     assert model["seconds"]["train"] > 0.1
     assert 20 < model["peak_memory_mb"] < 4000  # an interpreter with numpy
-    viewed = load_viewed(find_trial("three:garden:cloud:0", home / "runs"), torch.device("cpu"))
+    viewed = load_viewed(
+        find_trial("three:garden:cloud:0", home / "runs"), None, torch.device("cpu")
+    )
     assert (len(viewed.gaussians), len(viewed.views)) == (2000, 2)
     assert (trial(home, "cloud") / "figures/ellipsoids.png").is_file()
     assert (trial(home, "painter") / "trainer.log").is_file()

@@ -16,7 +16,7 @@ from numpy.testing import assert_array_equal
 from PIL import Image
 
 from gsbench.raster import create_rasterizer
-from gsbench.view.trials import Layers, TrialPainter, find_trial, load_viewed
+from gsbench.view.trials import find_trial, load_viewed
 from tests.conftest import ROOT
 from tests.end_to_end.conftest import FINISHED, FINISHED_SWEEP, SMALL
 from tests.helpers import read_json, write
@@ -82,12 +82,15 @@ def test_a_sweep_leaves_complete_trials(finished_runs):
 @pytest.mark.slow
 def test_the_viewer_draws_a_test_view_as_the_evaluation_did(finished_runs):
     cpu = torch.device("cpu")
+    rasterizer = create_rasterizer("cpu", cpu)
     for trial in trials_of(finished_runs).values():
-        viewed = load_viewed(find_trial(str(trial), finished_runs), cpu)
+        viewed = load_viewed(find_trial(str(trial), finished_runs), rasterizer, cpu)
         assert [view.name for view in viewed.views] == ["0000.png", "0008.png"]
         for view in viewed.views:
-            drawn = TrialPainter(viewed, create_rasterizer("cpu", cpu)).draw(view.camera, Layers())
-            for folder, picture in (("renders", drawn), ("ground_truth", view.image)):
+            for folder, picture in (
+                ("renders", viewed.draw(view.camera)),
+                ("ground_truth", view.image),
+            ):
                 assert_array_equal(Image.open(trial / folder / view.name), picture)
 
 

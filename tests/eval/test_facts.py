@@ -12,10 +12,8 @@ import torch
 from gsbench.eval.evaluator import MEASURES, Evaluator
 from gsbench.eval.facts import (
     FPS,
-    GAIN,
     METRICS,
     facts_of,
-    find_metric,
     from_record,
     further_keys,
     known_keys,
@@ -32,18 +30,6 @@ IMAGE = np.random.default_rng(0).integers(0, 256, (24, 30, 3), dtype=np.uint8)
 def test_facts_and_protocols_load_no_torch():
     code = "import sys, gsbench.eval.facts, gsbench.eval.protocol; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
-
-
-@pytest.mark.parametrize("facts", METRICS, ids=lambda facts: facts.key)
-def test_every_metric_is_described(facts):
-    if facts is GAIN:  # it describes the capture and does not say which arm is better
-        assert (facts.direction, facts.worthwhile, facts.lowest) == (0, None, None)
-        return
-    assert facts.direction in (-1, 1)
-    assert facts.worthwhile is not None
-    assert facts.words
-    assert facts.lowest is not None
-    assert find_metric(facts.key) is facts
 
 
 def test_the_evaluator_has_exactly_the_metrics_of_the_table():
@@ -111,14 +97,6 @@ def test_wrong_attributes_of_a_users_metric_are_refused(name, value):
     metric = type("Mine", (Brightness,), {name: value})()
     with refusal(rf"Mine\.{name} must be "):
         facts_of("mine", metric)
-
-
-@pytest.mark.parametrize(
-    "name, value",
-    [("direction", 0), ("decimals", 0), ("decimals", 12), ("unit", ""), ("worthwhile", 1e-9)],
-)
-def test_allowed_attributes_of_a_users_metric_are_accepted(name, value):
-    assert getattr(facts_of("mine", type("Mine", (Brightness,), {name: value})()), name) == value
 
 
 def test_a_metric_without_attributes_has_no_direction():

@@ -8,8 +8,8 @@ import torch
 import torch.nn.functional as F
 from PIL import Image
 
-from gsbench.eval.lpips import BACKBONES, Lpips, find_first_weights, load_lpips
-from gsbench.weights import MissingWeightsError, load_state
+from gsbench.eval.lpips import BACKBONES, Lpips, load_lpips
+from gsbench.weights import MissingWeightsError, find_weights, load_state
 from tests.helpers import refusal
 
 # ex_ref, ex_p0 and ex_p1 of richzhang/PerceptualSimilarity, with their licence
@@ -94,7 +94,7 @@ def test_squeeze_reproduces_the_published_value(shared):
 
 def trained(net, shared, folder):
     """The network with the convolutions in ``folder``."""
-    features = find_first_weights(BACKBONES[net].features, folder, download=False)
+    features = find_weights(BACKBONES[net].features, folder, download=False)
     heads = shared / "weights" / "lpips" / f"lpips_v0.1_{net}.pth"
     return Lpips(net, load_state(features), load_state(heads))
 
@@ -136,15 +136,6 @@ def test_missing_weights_name_every_file_that_would_do_and_its_source(tmp_path, 
         assert said in str(caught.value)
 
 
-@pytest.mark.shared
-@pytest.mark.parametrize("net", ["vgg", "alex", "squeeze"])
-def test_the_published_heads_fit_the_taps(shared, net):
-    features, _ = random_weights(net)
-    heads = load_state(shared / "weights" / "lpips" / f"lpips_v0.1_{net}.pth")
-    network = Lpips(net, features, heads)
-    assert float(network(torch.rand(1, 3, 40, 40), torch.rand(1, 3, 40, 40))) > 0
-
-
 @pytest.mark.parametrize("net, taps", [("vgg", vgg_taps), ("alex", alex_taps)])
 def test_networks_match_an_independent_version(net, taps):
     features, heads = random_weights(net)
@@ -169,7 +160,7 @@ def test_keys_may_lack_the_features_prefix_or_include_a_classifier():
 def test_weights_of_another_network_are_refused():
     alex, alex_heads = random_weights("alex")
     vgg, vgg_heads = random_weights("vgg")
-    with refusal("not that network"):
+    with refusal("of lpips vgg is for another network|of lpips vgg has tensors of other shapes"):
         Lpips("vgg", alex, vgg_heads)
     with refusal("heads"):
         Lpips("vgg", vgg, alex_heads)

@@ -32,11 +32,6 @@ def test_psnr_is_one_value_per_image_over_all_channels():
     )
 
 
-def test_psnr_of_identical_images_is_infinite():
-    image = torch.rand(4, 5, 3)
-    assert float(psnr(image, image)) == math.inf
-
-
 @pytest.mark.parametrize("seed", [0, 1, 2])
 @pytest.mark.parametrize("padding, beyond", [("valid", 0), ("zero", 5)])
 def test_ssim_matches_scikit_image(seed, padding, beyond):
@@ -61,7 +56,7 @@ def test_a_batch_gives_the_values_of_its_images():
 @pytest.mark.parametrize(
     "shape, other", [((4, 5, 3), (4, 6, 3)), ((3, 4, 5), (3, 4, 5)), ((2, 1, 4, 5), (2, 1, 4, 5))]
 )
-def test_wrong_shapes_are_refused(shape, other):
+def test_wrong_shapes_and_types_are_refused(shape, other):
     for metric in (
         psnr,
         ssim,
@@ -72,13 +67,7 @@ def test_wrong_shapes_are_refused(shape, other):
         words = "image" if shape == other else f"{shape} and {other}"
         with pytest.raises(ValueError, match=re.escape(words)):
             metric(torch.zeros(shape), torch.zeros(other))
-
-
-def test_integer_images_are_refused():
     with pytest.raises(ValueError, match="floating point"):
-        psnr(torch.zeros(12, 12, 3, dtype=torch.uint8), torch.zeros(12, 12, 3, dtype=torch.uint8))
-
-
-def test_ssim_valid_refuses_images_below_the_window():
+        psnr(*torch.zeros(2, 12, 12, 3, dtype=torch.uint8))
     with pytest.raises(ValueError, match="11 px"):
-        ssim(torch.zeros(10, 30, 3), torch.zeros(10, 30, 3), "valid")
+        ssim(*torch.zeros(2, 10, 30, 3), "valid")

@@ -115,9 +115,16 @@ def test_a_render_with_nan_is_refused():
         Evaluator(PAPER, lpips=[]).evaluate_view(render, np.zeros((16, 16, 3), dtype=np.uint8))
 
 
-def test_an_unknown_lpips_variant_is_refused():
-    with refusal("vgg_raw, vgg, alex, squeeze"):
-        Evaluator(PAPER, lpips=["vgg16"])
+@pytest.mark.parametrize(
+    "choice, known",
+    [
+        ({"lpips": ["vgg16"]}, "vgg_raw, vgg, alex, squeeze"),
+        ({"more": ["psnr"]}, "ms_ssim, iw_ssim"),
+    ],
+)
+def test_unknown_metrics_are_refused(choice, known):
+    with refusal(f"choose among {known}"):
+        Evaluator(PAPER, **choice)
 
 
 def test_means_leave_out_metrics_that_a_view_lacks():

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from gsbench.eval.evaluator import Evaluator, summarize
-from gsbench.eval.facts import find_metric
 from gsbench.eval.options import EvalConfig
 from gsbench.eval.protocol import STANDARD
 from gsbench.eval.regions import depths_of_points, regions_by_distance
@@ -32,10 +31,7 @@ def test_a_pixel_has_the_depth_of_the_point_that_is_projected_nearest():
         for column in range(12):
             nearest = min(shown, key=lambda s: (s[0] - column - 0.5) ** 2 + (s[1] - row - 0.5) ** 2)
             assert depths[row, column] == pytest.approx(nearest[2])
-
-
-def test_a_view_without_a_point_has_no_depth():
-    assert not depths_of_points(np.array([[0.0, 0.0, -5.0]]), camera()).any()
+    assert not depths_of_points(np.array([[0.0, 0.0, -5.0]]), camera()).any()  # behind it
 
 
 def test_regions_are_terciles_over_all_test_views():
@@ -70,11 +66,6 @@ def test_the_mean_in_a_region_is_over_the_views_that_show_it():
     views = {"a": {"psnr": 20.0, "psnr@far": 10.0}, "b": {"psnr": 30.0}}
     assert summarize(views, {}) == {"psnr": 25.0, "psnr@far": 10.0}
     assert summarize(views, {"psnr": "weights"}) == {}
-
-
-def test_a_metric_in_a_region_has_the_facts_of_the_metric():
-    facts, plain = find_metric("psnr@far"), find_metric("psnr")
-    assert (facts.name, facts.direction) == ("PSNR far (dB)", plain.direction)
 
 
 @pytest.mark.parametrize(

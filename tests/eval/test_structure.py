@@ -13,7 +13,6 @@ from gsbench.eval.facts import METRICS, further_keys
 from gsbench.eval.metric import UnavailableError
 from gsbench.eval.protocol import PAPER
 from gsbench.eval.structure import STRUCTURAL, load_structural
-from tests.helpers import refusal
 
 # The values of an implementation after the authors' papers, without piq, in the order of STRUCTURAL.
 # For MS-SSIM of odd sides piq differs by 0.0041: it pads at the start, the authors at the end.
@@ -100,8 +99,3 @@ def test_further_metrics_that_are_not_requested_leave_no_trace():
     evaluator, image = Evaluator(PAPER, lpips=[], flip=False), np.zeros((9, 9, 3), np.uint8)
     assert set(STRUCTURAL) < set(further_keys())
     assert not {*evaluator.unavailable, *evaluator.evaluate_view(image, image)} & {*further_keys()}
-
-
-def test_an_unknown_metric_is_refused():
-    with refusal("choose among ms_ssim, iw_ssim, fsim, gmsd"):
-        Evaluator(PAPER, more=["psnr"])

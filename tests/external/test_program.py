@@ -1,32 +1,27 @@
 """Another program as a trainer: its command, its input folders, and its process."""
 
-import subprocess
 import sys
-from types import SimpleNamespace
 
 import numpy as np
-import psutil
 import pycolmap
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
 from gsbench.errors import TrainingError
-from gsbench.external import program
 from gsbench.external.exchange import (
     collect_model,
     collect_renders,
     write_test_cameras,
     write_training_views,
 )
-from gsbench.external.program import ProgramResult, resident_memory_mb, run_program, watch
+from gsbench.external.program import run_program
 from gsbench.external.settings import External, fill_placeholders, split_command
 from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.init.base import PointCloud
 from gsbench.normalization import IDENTITY, Normalization
 from gsbench.runs.config_hash import config_hash
 from gsbench.scene.types import Camera, View
-from gsbench.system.isolate import CrashError
 from tests.config.test_schema import composed
 from tests.gaussians.helpers import differences, random_gaussians
 from tests.helpers import read_json, refusal
@@ -193,84 +188,6 @@ def test_a_command_must_contain_data_and_its_result_tells_model_from_renders():
     assert not External(command=["a", "{data}"], result="x/*.png", version="1").leaves_model
 
 
-@pytest.mark.parametrize(
-    "ends, limit, code, pauses",
-    [
-        (0.1, None, 5, [0.02, 0.04, 0.08]),
-        (1e9, 1.5, None, [0.02, 0.04, 0.08, 0.16, 0.32, 0.5, 0.5]),
-    ],
-)
-def test_a_program_is_watched_to_its_end_or_limit(ends, limit, code, pauses, tmp_path, monkeypatch):
-    clock, done, looks = [100.0], [], iter([10.0, 30.0, 20.0] + 9 * [1.0])
-
-    def wait(pause=None):
-        done.append(pause)
-        if pause is not None:
-            clock[0] += pause
-            if clock[0] < 100 + ends:
-                raise subprocess.TimeoutExpired("x", pause)
-        return 5
-
-    def start(command, cwd, env, stdin):
-        assert (command, cwd, env, stdin) == (["x"], tmp_path, {"A": "b"}, subprocess.DEVNULL)
-        return SimpleNamespace(pid=7, wait=wait, kill=lambda: done.append("kill"))
-
-    monkeypatch.setattr(program.subprocess, "Popen", start)
-    monkeypatch.setattr(program.time, "monotonic", lambda: clock[0])
-    monkeypatch.setattr(program, "resident_memory_mb", lambda pid: next(looks))
-    monkeypatch.setattr(program, "peak_child_mb", lambda: 25.0)
-    found = watch(["x"], tmp_path, {"A": "b"}, limit)
-    assert found == ProgramResult(code, pytest.approx(sum(pauses)), 30.0)
-    assert done == [*map(pytest.approx, pauses), *(["kill", None] if code is None else [])]
-
-
-def test_the_memory_of_a_program_is_the_sum_over_its_processes(monkeypatch):
-    def process(size, *children):
-        def memory():
-            if size is None:
-                raise psutil.NoSuchProcess(1)
-            return SimpleNamespace(rss=size << 20)
-
-        return SimpleNamespace(memory_info=memory, children=lambda recursive: list(children))
-
-    found = {1: process(3, process(2), process(None), process(4)), 2: process(None, process(8))}
-    monkeypatch.setattr(psutil, "Process", found.__getitem__)
-    assert (resident_memory_mb(1), resident_memory_mb(2)) == (9, 8)
-    monkeypatch.undo()
-    assert resident_memory_mb(2**22 + 1) == 0  # no process has this number
-
-
-@pytest.mark.parametrize(
-    "ended, said",
-    [
-        (ProgramResult(0, 1.0, 2.0), ""),
-        (ProgramResult(3, 1.0, 2.0), r"train ended early \(exit code 3\); its last lines: oh; log"),
-        (ProgramResult(-9, 1.0, 2.0), r"train crashed \(SIGKILL, perhaps out of memory\); .*: oh"),
-        (ProgramResult(None, 1.0, 2.0), r"train still ran after 60 s .*: oh; log: "),
-        (CrashError("train crashed"), "train crashed; log: "),
-    ],
-)
-def test_a_program_that_fails_is_reported_with_its_log(ended, said, tmp_path, monkeypatch):
-    log = tmp_path / "log"
-    log.write_text("oh\n")
-
-    def isolated(*words, **named):
-        assert words == (watch, ["/bin/train", "x"], tmp_path, {"A": "b"}, 60.0)
-        assert named == {"what": "train", "log": log}
-        if isinstance(ended, Exception):
-            raise ended
-        return ended
-
-    monkeypatch.setattr(program, "run_isolated", isolated)
-    call = ("/bin/train", "x"), log, tmp_path, {"A": "b"}, 60.0
-    if not said:
-        assert run_program(*call) is ended
-    else:
-        with pytest.raises(TrainingError, match=said) as caught:
-            run_program(*call)
-        assert str(caught.value).endswith(f"log: {log}")
-
-
 def run(tmp_path, code, limit=None):
     environment = {"PATH": "/usr/bin:/bin", "MINE": "here"}
     command = [sys.executable, "-c", code]
@@ -281,6 +198,24 @@ def test_a_program_runs_in_its_folder_with_its_environment(tmp_path):
     run(tmp_path, "import os; open('mark', 'w').write(os.environ['MINE']); print('said')")
     assert (tmp_path / "mark").read_text() == "here"
     assert "said" in (tmp_path / "log").read_text()
+
+
+@pytest.mark.parametrize(
+    "code, limit, said",
+    [
+        ("sys.exit(3)", None, r"ended early \(exit code 3\); its last lines: oh; log: "),
+        ("os.kill(os.getpid(), 9)", None, r"crashed \(SIGKILL, perhaps out of memory\); .*: oh"),
+        (
+            "time.sleep(60)",
+            1.0,
+            r"still ran after 1 s \(densify.time_limit_minutes\); .*: oh; log: ",
+        ),
+    ],
+)
+def test_a_program_that_fails_is_reported_with_its_log(code, limit, said, tmp_path):
+    with pytest.raises(TrainingError, match=said) as caught:
+        run(tmp_path, f"import os, sys, time; print('oh', flush=True); {code}", limit)
+    assert str(caught.value).endswith(f"log: {tmp_path / 'log'}")
 
 
 def test_memory_of_child_processes_counts(tmp_path):

@@ -14,7 +14,6 @@ from gsbench.init.colmap.database import (
     DatabaseTask,
     create_database,
     database_counts,
-    image_ids,
     unknown_camera_groups,
     write_features,
 )
@@ -33,19 +32,15 @@ def new_database(path, capture):
     return DatabaseTask(path, capture.images, names, list(itertools.combinations(names, 2)))
 
 
-def rewritten(own, path, capture, options):
-    """Write the features and matches of one database to another, as if they were foreign.
-
-    Returns the matches of all pairs.
-    """
+def rewritten(own, path, capture):
+    """Write the features and matches of one database to another, as if they were foreign."""
     task = new_database(path, capture)
     with pycolmap.Database.open(own) as database:
         ids = {image.name: image.image_id for image in database.read_all_images()}
         keypoints = {name: database.read_keypoints(ids[name])[:, :2] for name in task.names}
         matches = {(a, b): database.read_matches(ids[a], ids[b]) for a, b in task.pairs}
     write_features(path, keypoints, matches)
-    verify_pairs(path, options, no_progress)
-    return matches
+    verify_pairs(path, Sfm(), no_progress)
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +55,7 @@ def own_path(bare_photos, tmp_path_factory):
 
 def test_sift_through_the_external_path_gives_the_same_model(own_path, bare_photos, tmp_path):
     own, external = own_path, tmp_path / "external.db"
-    rewritten(own, external, bare_photos, Sfm())
+    rewritten(own, external, bare_photos)
     assert database_counts(external) == database_counts(own)
 
     first, second = (
@@ -114,33 +109,3 @@ def test_keypoints_are_scaled_separately_in_x_and_y():
         file_size=(400, 201),
     )
     assert_allclose(features.colmap_keypoints, [[2.0, 2.01], [398.0, 198.99]], rtol=1e-6)
-
-
-def test_a_pair_must_keep_a_share_of_its_matches(own_path, bare_photos, tmp_path):
-    """Pairs below the ratio are dropped, and others are kept.
-
-    COLMAP applies the ratio to each geometry that it tries (essential, fundamental, homography).
-    So a kept pair may have another geometry than without the ratio, and other inliers. If the
-    geometry is the same, so are the inliers.
-    """
-    geometries = {}
-    for ratio in (0.0, 0.8):
-        path = tmp_path / f"{ratio}.db"
-        matches = rewritten(own_path, path, bare_photos, Sfm(min_inlier_ratio=ratio))
-        ids = image_ids(path)
-        with pycolmap.Database.open(path) as database:
-            geometries[ratio] = {
-                (a, b): database.read_two_view_geometry(ids[a], ids[b]) for a, b in matches
-            }
-    verified, kept = (
-        {pair for pair, geometry in found.items() if len(geometry.inlier_matches)}
-        for found in geometries.values()
-    )
-    assert set() < kept < verified
-    for pair in kept:
-        free, asked = geometries[0.0][pair], geometries[0.8][pair]
-        assert len(asked.inlier_matches) >= 0.8 * len(matches[pair])
-        if asked.config == free.config:
-            assert_array_equal(asked.inlier_matches, free.inlier_matches)
-    for pair in verified - kept:
-        assert len(geometries[0.0][pair].inlier_matches) < 0.8 * len(matches[pair])

@@ -1,6 +1,5 @@
 """Clouds of points from files of all formats, against the written arrays and pycolmap."""
 
-import codecs
 import re
 from dataclasses import replace
 
@@ -32,13 +31,6 @@ def write(path, properties, values, text, order):
     return path
 
 
-SUFFIXES = pytest.mark.parametrize("suffix", [".xyz", ".csv"])
-
-
-def between(suffix):
-    return "," if suffix == ".csv" else " "
-
-
 @pytest.mark.parametrize("text", [False, True])
 @pytest.mark.parametrize("order", ["<", ">"])
 @pytest.mark.parametrize(
@@ -61,28 +53,6 @@ def test_ply_properties_may_have_any_order_and_type(tmp_path, text, order, names
     points, colors = read_points(write(tmp_path / "cloud.ply", properties, values, text, order))
     assert_allclose(points, XYZ, rtol=1e-6)
     assert_array_equal(colors, RGB)
-
-
-@SUFFIXES
-@pytest.mark.parametrize("colored", [False, True])
-def test_a_table_has_coordinates_with_or_without_colours(tmp_path, suffix, colored):
-    table = np.concatenate([XYZ, RGB], axis=1) if colored else XYZ
-    path = tmp_path / f"cloud{suffix}"
-    np.savetxt(path, table, fmt="%.17g", delimiter=between(suffix))
-    points, colors = read_points(path)
-    assert_array_equal(points, XYZ)
-    assert_array_equal(colors, RGB if colored else None)
-
-
-@SUFFIXES
-def test_a_table_may_have_a_byte_order_mark_and_line_ends_of_windows(tmp_path, suffix):
-    path = tmp_path / f"cloud{suffix}"
-    np.savetxt(path, XYZ, fmt="%.17g", delimiter=between(suffix), newline="\r\n")
-    path.write_bytes(codecs.BOM_UTF8 + path.read_bytes())
-    assert_array_equal(read_points(path)[0], XYZ)
-    path.write_text("1 2 3\n", encoding="utf-16")
-    with refusal("UTF-16 or UTF-32: save it as UTF-8"):
-        read_points(path)
 
 
 def rows(*columns, between=" "):
@@ -109,6 +79,8 @@ WITH_FIELDS = rows(XYZ, RGB, INTENSITY, ALPHA, between=",")
         ("a.txt", f"//X Y Z Rf Gf Bf\n{rows(XYZ, RGB / 255)}", True),
         ("a.asc", f"# a scan\n# x y z\n{rows(XYZ)}", False),
         ("a.xyz", rows(XYZ, between="\t"), False),
+        ("a.xyz", rows(XYZ, RGB), True),
+        ("a.csv", "\ufeff" + rows(XYZ, between=",").replace("\n", "\r\n"), False),
         ("a.csv", f"n,pos_x,pos_y,pos_z,Color R,Color G,Color B\n{COUNTED}", True),
         ("a.csv", f"x,y,z,r,g,b,Scalar field,Cloud index\n{WITH_FIELDS}", True),
         ("a.csv", '"x","y","z"\n' + re.sub(r"[^,\n]+", r'"\g<0>"', rows(XYZ, between=",")), False),
@@ -117,7 +89,7 @@ WITH_FIELDS = rows(XYZ, RGB, INTENSITY, ALPHA, between=",")
     ],
 )
 def test_tables_of_scanners_and_other_programs_are_read(tmp_path, name, text, colored):
-    (tmp_path / name).write_text(text)
+    (tmp_path / name).write_bytes(text.encode())
     points, colors = read_points(tmp_path / name)
     assert_array_equal(points, XYZ)
     assert_array_equal(colors, RGB if colored else None)
@@ -252,6 +224,7 @@ PLYS = [
         ("a.xyz", lambda path: save(path, XYZ[:, :2]), "it has 2 columns without names: wanted"),
         ("a.xyz", lambda path: save(path, np.where(XYZ > 1.9, np.nan, XYZ)), "not finite numbers"),
         ("a.xyz", lambda path: path.write_text("1 2 x\n"), "not a readable file of points"),
+        ("a.xyz", lambda path: path.write_text("1 2 3", "utf-16"), "UTF-16 or UTF-32: save it as"),
         ("a.xyz", lambda path: save(path, XYZ + 1e6), "no point is in view of a training camera"),
     ],
 )

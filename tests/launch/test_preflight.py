@@ -174,29 +174,3 @@ def test_weights_are_searched_once_for_equal_options(monkeypatch):
         assert dry_run.unavailable_now({"flip": flip}) == ["lpips_vgg"]
     assert [options.flip for options in asked] == [False, True]
     dry_run._unavailable_now.cache_clear()
-
-
-def test_nothing_stays_of_trials_of_which_all_were_refused(tmp_path, called, monkeypatch):
-    runs, bad = tmp_path / "runs", {1, 2}
-
-    def refuse(trials, mirror):
-        for one in trials:
-            one.folder.mkdir(parents=True, exist_ok=True)
-        seeds = [one.values["seed"] for one in trials]
-        return [
-            Outcome(one.folder, "failed", "no", seed in bad)
-            for one, seed in zip(trials, seeds, strict=True)
-        ]
-
-    monkeypatch.setattr(batch, "run_serial", refuse)
-    monkeypatch.setattr(batch, "_why_not_done", lambda trial: True)
-    one, two, three = (trial(runs, seed) for seed in (1, 2, 3))
-    run_batch([one, two])
-    assert not any(one.folder.exists() for one in (one, two))
-    assert not read_history(runs / "x").planned
-    two.folder.mkdir(parents=True)  # of an earlier command, whose trial began
-    run_batch([one, two])
-    assert two.folder.exists() > one.folder.exists()
-    run_batch([one, three])
-    assert one.folder.exists()
-    assert set(read_history(runs / "x").planned) == {one.folder, two.folder, three.folder}

@@ -15,11 +15,9 @@ from gsbench.analysis.comparison import compare
 from gsbench.analysis.results import load_experiment
 from gsbench.cli import run
 from gsbench.config.compose import compose_one
-from gsbench.renders import truth as truths
 from gsbench.renders.imported import Destination, Measured, check_destination, find_destination
 from gsbench.renders.measure import _lines
 from gsbench.renders.truth import ReferenceImages, find_reference_images
-from gsbench.runs.keys import STAGES
 from gsbench.scene.names import Matching
 from tests.helpers import read_json, refusal, write
 from tests.trials import write_runs
@@ -178,54 +176,20 @@ def test_photographs_are_found_by_trial_folder_and_address(trial, runs, tmp_path
     assert "no record of the size or hash of its test views" in refused(*address)
 
 
-@pytest.mark.parametrize(
-    "kind, word, times", [("colmap", "x=1", 2), ("photos", "x=1", 1), ("colmap", "init=sfm", 1)]
-)
-def test_photographs_of_a_scene_are_its_test_views_at_the_size_of_a_trial(
-    kind, word, times, monkeypatch, tmp_path
-):
+@pytest.mark.parametrize("words, count", [((), 100), (("init=random", "init.count=7"), 7)])
+def test_photographs_of_a_scene_are_its_test_views_as_a_trial_sees_them(words, count, tmp_path):
     """With the fastest initialiser if the scene has cameras, unless one is chosen."""
-    composed = []
-    built = []
-
-    def compose(words):
-        composed.append(words)
-        return SimpleNamespace(values={"scene": {"kind": kind}, "runs": str(tmp_path)})
-
-    def get(step):
-        built.append(tmp_path / step.stage.name)
-        return SimpleNamespace(path=built[-1])
-
-    def view(name, width, height):
-        return SimpleNamespace(name=name, camera=SimpleNamespace(width=width, height=height))
-
-    scene = SimpleNamespace(
-        train=[view("c.png", 32, 20)], test=[view("b.JPG", 30, 24), view("a.png", 32, 24)]
+    size = ["scene.views=9", "scene.width=64", "scene.height=48", f"runs={tmp_path}"]
+    truth = find_reference_images("courtyard", [*size, *words], tmp_path)
+    assert list(truth.photographs) == ["0000.png", "0008.png"]
+    assert {Image.open(path).size for path in truth.photographs.values()} == {(64, 48)}
+    assert (truth.what, truth.scene, truth.init) == (
+        "the test views of courtyard",
+        "courtyard",
+        None,
     )
-    trial = SimpleNamespace(
-        steps=lambda: [SimpleNamespace(stage=stage) for stage in STAGES],
-        views=SimpleNamespace(scene=scene),
-        capture=SimpleNamespace(fingerprint="f" * 64),
-    )
-    for name, stand_in in {
-        "compose_one": compose,
-        "Parts": lambda config: config,
-        "Store": lambda root: SimpleNamespace(get=get),
-        "TrialSteps": lambda config, store: SimpleNamespace(
-            **vars(trial), parts=SimpleNamespace(values=config), store=store
-        ),
-    }.items():
-        monkeypatch.setattr(truths, name, stand_in)
-    place = tmp_path / "ground_truth"
-    write(place / "masks" / "a.png", b"")
-    truth = find_reference_images("garden", [word], tmp_path)
-    asked = ["scene=garden", word]
-    assert composed == [asked, ["init=random", "init.count=100", *asked]][:times]
-    assert built == [tmp_path / name for name in ("scene", "init", "ground_truth")]
-    assert truth.photographs == {"b.JPG": place / "b.png", "a.png": place / "a.png"}
-    assert (truth.what, truth.scene, truth.init) == ("the test views of garden", "garden", None)
-    assert (truth.resolution, truth.data) == ((32, 24), "f" * 64)
-    assert truth.masks == {"a.png": place / "masks" / "a.png"}
+    assert (truth.resolution, len(truth.data), truth.masks) == ((64, 48), 64, {})
+    assert truth.config["init"]["count"] == count
 
 
 def test_the_initialiser_of_an_arm_is_that_of_the_experiments_own_trials(tmp_path):

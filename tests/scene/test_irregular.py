@@ -14,9 +14,10 @@ from gsbench.init.point_files import read_points
 from gsbench.scene.colmap import read_model
 from gsbench.scene.images import (
     IMAGE_SUFFIXES,
+    Lens,
     check_picture_names,
-    exif_orientation,
     image_size,
+    lens_of,
     list_images,
     read_image,
 )
@@ -65,7 +66,7 @@ def odd_files(folder, suffix):
 READERS = [
     (".png", read_image),
     (".jpg", image_size),
-    (".tif", exif_orientation),
+    (".tif", lens_of),
     (".png", lambda path: fingerprint(path.parent, [path.name])),
     (".ply", read_ply),
     (".ply", check_ply),
@@ -169,7 +170,7 @@ def test_the_formats_of_photographs_are_read_whatever_their_name(form, tmp_path)
 )
 def test_damaged_exif_data_count_as_none(exif, tmp_path):
     Image.new("RGB", (16, 12)).save(tmp_path / "a.jpg", exif=exif)
-    assert exif_orientation(tmp_path / "a.jpg") == 1
+    assert lens_of(tmp_path / "a.jpg") == Lens()
     assert read_image(tmp_path / "a.jpg").shape == (12, 16, 3)
 
 

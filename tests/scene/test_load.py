@@ -12,7 +12,7 @@ from PIL import Image
 from gsbench.logs import no_progress
 from gsbench.runs.store import Store
 from gsbench.scene.colmap import plain_camera, read_model
-from gsbench.scene.load import INTRINSICS, Downscaling, ImageToPrepare, load_scene, prepare_all
+from gsbench.scene.load import INTRINSICS, ImageToPrepare, load_scene, prepare_all
 from gsbench.scene.options import SplitRule
 from gsbench.scene.rules import inspect
 from gsbench.scene.types import CameraModel
@@ -21,7 +21,6 @@ from tests.helpers import read_json, refusal
 from tests.scene.captures import read_colmap
 
 WIDTH, HEIGHT = 200, 150
-UNCHANGED = Downscaling(1, None, "lanczos")
 # Parameters beyond the focal length of 150 px and the centre, where small ones do not fit.
 OWN_EXTRA = {"FOV": [0.3], "EUCM": [0.5, 1.1], "SIMPLE_DIVISION": [-0.1], "DIVISION": [-0.1]}
 PLAIN = {"INVALID", "PINHOLE", "SIMPLE_PINHOLE", "EQUIRECTANGULAR"}
@@ -171,18 +170,18 @@ def test_panoramas_are_refused(tmp_path):
     with refusal("EQUIRECTANGULAR"):
         undistort(np.zeros((HEIGHT, WIDTH, 3), dtype=np.uint8), camera)
     Image.new("RGB", (WIDTH, HEIGHT)).save(tmp_path / "a.png")
-    image = ImageToPrepare(tmp_path / "a.png", camera, tmp_path / "b.png", UNCHANGED)
+    image = ImageToPrepare(tmp_path / "a.png", camera, tmp_path / "b.png")
     with refusal("EQUIRECTANGULAR"):  # raised in the isolated process, too
         prepare_all([image], no_progress)
 
 
 def test_images_are_prepared_sixteen_at_a_time_in_their_order(tmp_path):
-    images, told, halved = [], [], Downscaling(2, None, "area")
+    images, told = [], []
     for width in range(20, 56):
         source, target = tmp_path / f"{width}.png", tmp_path / "made" / f"{width}.png"
         Image.new("RGB", (width, 10)).save(source)
         camera = CameraModel("PINHOLE", width, 10, (5.0, 6.0, width / 2, 4.0))
-        images.append(ImageToPrepare(source, camera, target, halved))
+        images.append(ImageToPrepare(source, camera, target, downscale=2, resample="area"))
     cameras = prepare_all(images, lambda *state: told.append(state))
     assert told == [("views", done, 36) for done in (16, 32, 36)]
     for image, camera in zip(images, cameras, strict=True):
@@ -314,15 +313,3 @@ def test_a_truncated_photo_is_named_and_leaves_no_cache(make_scene, tmp_path):
     with refusal(r"03\.png: the image is damaged"):
         load_scene(capture, capture.model, Store(tmp_path / "cache"), downscale=2)
     assert not list((tmp_path / "cache").glob("views/[!.]*"))
-
-
-@pytest.mark.shared
-def test_real_photos_of_a_distorted_camera_are_undistorted_and_keep_their_poses(shared, tmp_path):
-    capture = read_colmap("herz", shared / "data/herz_jesus_p25", max_images=4)
-    scene = load_scene(capture, capture.model, Store(tmp_path), max_size=300)
-    assert {max(view.camera.width, view.camera.height) for view in scene.train} == {300}
-    model = pycolmap.Reconstruction(capture.model)
-    view = scene.train[0]
-    assert_allclose(
-        view.camera.center, model.find_image_with_name(view.name).projection_center(), atol=1e-9
-    )

@@ -131,16 +131,6 @@ def test_a_file_that_is_no_mask_is_refused_in_one_line(tmp_path, pixels, said):
     assert str(caught.value).startswith(f"{path}: ")
 
 
-def test_a_damaged_mask_is_refused(tmp_path):
-    path = save(tmp_path / "m.png", noise(64, 64) // 128 * 255)
-    path.write_bytes(path.read_bytes()[:-60])
-    with refusal(r"m\.png: the mask is damaged"):
-        read_mask(path)
-    path.write_text("white")
-    with refusal(r"m\.png: not a readable image"):
-        read_mask(path)
-
-
 @settings(max_examples=60, deadline=None)
 @given(st.integers(1, 23), st.integers(1, 23), st.integers(0, 2**32 - 1))
 def test_filled_pixels_depend_only_on_counted_pixels(height, width, seed):

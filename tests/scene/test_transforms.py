@@ -266,7 +266,7 @@ def test_the_file_is_read_once_and_changes_the_fingerprint(tmp_path, monkeypatch
 
 MIRRORED = [[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 1, 0]]
 NO_FOCAL = "no focal length"
-HIGHER = "k4, k5 and k6 are read of OPENCV_FISHEYE and FULL_OPENCV alone"
+HIGHER = "must be 0 with OPENCV; .* only OPENCV_FISHEYE has k4, and FULL_OPENCV has k4, k5"
 OUTSIDE, ODD_SIZE = "lies outside the folder", "w and h must be whole numbers"
 LISTED = {"train_filenames": ["images/1.png"]}
 WRONG_KEYS = [
@@ -275,7 +275,7 @@ WRONG_KEYS = [
     ({"applied_scale": 0}, "applied_scale must be positive"),
     ({"camera_model": "EQUIRECTANGULAR"}, "camera_model EQUIRECTANGULAR is not known here"),
     *(({key: 0.1}, HIGHER) for key in ("k4", "k5", "k6")),
-    ({"is_fisheye": True, "p1": 0.1}, "OPENCV_FISHEYE has k1 to k4 alone"),
+    ({"is_fisheye": True, "p1": 0.1}, "p1 must be 0 with OPENCV_FISHEYE"),
     ({"fl_x": None, "fl_y": None}, NO_FOCAL),
     ({"fl_y": None, "y_fov": 180}, NO_FOCAL),
     ({"fl_y": 0}, NO_FOCAL),
@@ -384,12 +384,12 @@ def test_scene_images_replaces_the_folder_that_the_file_names(tmp_path, keep):
         capture_of(folder, tmp_path / "made", images="nowhere")
 
 
-def test_an_error_says_which_folder_has_the_named_files(tmp_path):
+def test_an_error_says_that_another_folder_may_have_the_named_files(tmp_path):
     folder = reduced(write(tmp_path / "in"))
     shutil.rmtree(folder / "images")
     with refusal(
         r"0 images with a file and a camera in transforms.json, while ./images/0.png, .* have no "
-        r"file, but at least 3 are needed: images_2 has 6 of the names: set scene.images=images_2"
+        r"file, but at least 3 are needed: set scene.images to the folder of the photographs"
     ):
         capture_of(folder, tmp_path / "made")
 
@@ -524,11 +524,6 @@ def test_a_byte_order_mark_of_utf8_is_skipped_and_other_encodings_are_named(tmp_
     text = file.read_text()
     file.write_text(text, encoding="utf-8-sig")
     assert len(read_transforms(tmp_path).names) == 6
-    for encoding, said in (
-        ("utf-16", "json cannot be read: it is UTF-16 or UTF-32: save it as UTF-8"),
-        ("utf-32", "json cannot be read: it is UTF-16 or UTF-32: save it as UTF-8"),
-        ("cp1252", r"line 1 is not UTF-8 .*: save it as UTF-8"),
-    ):
-        file.write_text(text.replace("images/3", "Küche/3"), encoding=encoding)
-        with refusal(said):
-            read_transforms(tmp_path)
+    file.write_text(text.replace("images/3", "Küche/3"), encoding="cp1252")
+    with refusal(r"line 1 is not UTF-8 .*: save it as UTF-8"):
+        read_transforms(tmp_path)

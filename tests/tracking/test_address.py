@@ -102,7 +102,7 @@ def journal_naming(other, pages):
     return head.ljust(512, b"\0") + end + magic
 
 
-@pytest.mark.parametrize("command", [["sync", "theirs"], ["ui", "--no-browser"]])
+@pytest.mark.parametrize("command", [["sync", "theirs"], ["ui"]])
 def test_a_journal_of_a_database_deletes_no_file(command, tmp_path, monkeypatch, capfd):
     runs, private = tmp_path / "runs", write(tmp_path / "private", "secret")
     ended_trial(runs, name="theirs")
@@ -133,7 +133,7 @@ def test_no_link_to_a_database_is_opened_by_ui(name, tmp_path, monkeypatch, refu
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
     monkeypatch.delenv(VARIABLE, raising=False)
     monkeypatch.setattr("gsbench.verbs.servers.subprocess.Popen", None)
-    assert "not a regular file" in refused("ui", "--no-browser")
+    assert "not a regular file" in refused("ui")
     assert private.read_text() == "secret"
 
 

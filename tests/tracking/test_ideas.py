@@ -197,7 +197,7 @@ def test_a_browser_shows_a_row_for_each_idea(tmp_path, monkeypatch):
     monkeypatch.setattr(
         servers.subprocess, "Popen", lambda *a, **k: started.append(popen(*a, **k)) or started[-1]
     )
-    words = split(f"swept --port {port} --no-browser")
+    words = split(f"swept --port {port}")
     thread = threading.Thread(target=servers.ui, args=(words, runs))
     # signals need the main thread
     monkeypatch.setattr(servers, "stop_on_signals", lambda: threading.Lock())

@@ -205,23 +205,18 @@ def test_bench_times_what_the_words_name(monkeypatch, capsys):
     row = {"raster": "cpu", "size": "16x32", "count": 7, "step_ms": 1.234, "step_ratio": 0.5}
     row |= {"peak_mb": None} | dict.fromkeys(machine.NOT_SHOWN, 0)
 
-    def run_bench(*given, **named):
-        asked.append((*given, named))
+    def run_bench(*given):
+        asked.extend(given)
         return [row]
 
     monkeypatch.setattr("gsbench.bench.measure.run_bench", run_bench)
     words = split("--raster cpu,reference --size 16x32,32x16 --count 7,8")
     assert machine.bench([*words, "--no-memory", "--repeats", "3"]) == 0
-    *lists, named = asked[0]
-    assert lists == [["cpu", "reference"], [(16, 32), (32, 16)], [7, 8]]
-    assert named == {
-        "ply": None,
-        "repeats": 3,
-        "threads": None,
-        "memory": False,
-        "scene": "trained",
-        "kernels": False,
-    }
+    rasters, settings, *others = asked
+    assert (rasters, others) == (["cpu", "reference"], [3, False, False])
+    assert [(one.scene, one.size, one.count, one.ply) for one in settings] == [
+        ("trained", size, count, None) for size in ("16x32", "32x16") for count in (7, 8)
+    ]
     header, line = capsys.readouterr().out.splitlines()
     assert header.split() == split("raster size count step_ms step_ratio")
     assert line.split() == split("cpu 16x32 7 1.2 0.50")

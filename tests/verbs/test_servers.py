@@ -86,57 +86,37 @@ def test_ui_serves_on_this_machine_only(monkeypatch):
 
 @pytest.fixture
 def served(runs, monkeypatch):
-    """The servers that ``ui`` would start, and the pages that it would open."""
+    """The servers that ``ui`` would start."""
     served = []
-
-    class Thread:
-        def __init__(self, target, args, daemon):
-            self.args, self.daemon = args, daemon
-
-        def start(self):  # the server answers at once
-            server, lines, page = self.args
-            print(lines)
-            served.extend([(server, page, self.daemon)] * bool(page))
-
     write(runs / "mlflow.db", b"")
     monkeypatch.setattr(servers, "show_ideas", lambda home, uri: f"{len(home.name)}")
     monkeypatch.setattr(servers, "serve", lambda uri, port: served.append((uri, port)) or 0)
-    monkeypatch.setattr(servers.threading, "Thread", Thread)
-    monkeypatch.setattr(servers, "_has_screen", lambda: True)
     monkeypatch.setattr(servers, "_serves", lambda *_: False)
-    monkeypatch.setattr(
-        servers, "sys", SimpleNamespace(stdout=SimpleNamespace(isatty=lambda: True))
-    )
     return served
 
 
 LOCAL = "http://127.0.0.1:5000"
 
 
-def test_the_dashboard_opens_at_the_only_experiment(runs, served, said):
+def test_the_dashboard_shows_the_only_experiment_or_the_one_named(runs, served, said):
     uri = f"sqlite:///{runs / 'mlflow.db'}"
-    assert said("ui").split() == ["dashboard", LOCAL]
-    assert served == [(LOCAL, LOCAL, True), (uri, 5000)]
+    assert said("ui").splitlines()[0].split() == ["dashboard", LOCAL]
+    assert served == [(uri, 5000)]
     for name in ("ab", "cde"):
         make_home(runs / name)
-        words = said("ui --port 81").split()
-    assert words == ["dashboard", "http://127.0.0.1:81"]  # one of two was not chosen
+    first, *_ = said("ui --port 81").splitlines()
+    assert first.split() == ["dashboard", "http://127.0.0.1:81"]  # one of two was not chosen
     served.clear()
-    pages = said("ui cde --no-browser").split()
-    assert pages[0] == "ideas"
-    assert pages[1] == f"{LOCAL}/#/experiments/3/runs"
-    assert pages[2] == "bars"
+    pages = said("ui cde").split()
+    assert pages[:3] == ["ideas", f"{LOCAL}/#/experiments/3/runs", "bars"]
     assert served == [(uri, 5000)]
 
 
 def test_no_second_server_is_started(runs, served, said, monkeypatch):
     make_home(runs / "ab")
-    address = "https://tracker.example"
-    page = said("ui --uri", address).split()[1]
-    assert served == [(address, page, False)]
-    served.clear()
+    assert "https://tracker.example" in said("ui --uri https://tracker.example")
     monkeypatch.setattr(servers, "_serves", lambda server, name, page: name == "ab")
-    said("ui --no-browser")
+    assert f"{LOCAL}/#/experiments/2/runs" in said("ui")
     assert served == []
 
 
@@ -176,46 +156,6 @@ def test_a_server_is_asked_whether_it_has_the_experiment(monkeypatch):
     assert not servers._serves(LOCAL, "x", f"{LOCAL}/#/experiments/12")
 
 
-def test_addresses_are_printed_and_opened_once_the_server_answers(monkeypatch, capsys):
-    waits = []
-    opened = []
-    failures = [True, True, False, False]
-
-    def get(server, timeout):
-        assert server == LOCAL
-        if failures.pop(0):
-            raise servers.requests.ConnectionError
-
-    monkeypatch.setattr(servers.requests, "get", get)
-    monkeypatch.setattr(servers.subprocess, "run", lambda words, **_: opened.append(words[-1]))
-    monkeypatch.setattr(servers.time, "sleep", lambda s: waits.append(capsys.readouterr().out))
-    servers._announce(LOCAL, "dashboard page", "page")
-    assert (waits, opened, capsys.readouterr().out) == (["", ""], ["page"], "dashboard page\n")
-    servers._announce(LOCAL, "dashboard page", "")  # no browser
-    assert (opened, capsys.readouterr().out) == (["page"], "dashboard page\n")
-    failures.extend([True] * servers.SECONDS_TO_START)
-    servers._announce(LOCAL, "dashboard page", "page")
-    assert (opened, failures, capsys.readouterr().out) == (["page"], [], "")
-
-
-@pytest.mark.parametrize(
-    "platform, variables, found",
-    [
-        ("linux", {}, False),
-        ("linux", {"DISPLAY": ":0"}, True),
-        ("linux", {"WAYLAND_DISPLAY": "wayland-0"}, True),
-        ("darwin", {}, True),
-    ],
-)
-def test_a_browser_is_opened_only_where_there_is_a_screen(monkeypatch, platform, variables, found):
-    monkeypatch.setattr(sys, "platform", platform)
-    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(name, raising=False)
-    for name, value in variables.items():
-        monkeypatch.setenv(name, value)
-    assert servers._has_screen() == found
-
-
 # ---- gsbench view
 
 
@@ -225,8 +165,8 @@ def test_the_viewer_shows_one_or_two_trials_until_ctrl_c(runs, monkeypatch, caps
     class Viewer:
         url = "http://127.0.0.1:8080"
 
-        def __init__(self, painters, port):
-            made.append((painters, port))
+        def __init__(self, trials, port):
+            made.append((trials, port))
 
         def stop(self):
             made.append("stopped")
@@ -243,15 +183,14 @@ def test_the_viewer_shows_one_or_two_trials_until_ctrl_c(runs, monkeypatch, caps
         sys.modules, "gsbench.view.server", SimpleNamespace(Viewer=Viewer, check_port=check_port)
     )
     monkeypatch.setattr("gsbench.view.trials.find_trial", lambda address, runs: address)
-    monkeypatch.setattr("gsbench.view.trials.load_viewed", lambda trial, device: (trial, device))
-    monkeypatch.setattr("gsbench.view.trials.TrialPainter", lambda *given: given)
+    monkeypatch.setattr("gsbench.view.trials.load_viewed", lambda *given: given)
     proven = SimpleNamespace(rasterizer="rasterizer")
     monkeypatch.setattr("gsbench.train.proof.create_proven", lambda name, device: proven)
     monkeypatch.setattr(servers.threading, "Event", Event)
     assert servers.view(split("a b --device cpu --port 0"), runs) == 0
     cpu = torch.device("cpu")
-    painters = [(("a", cpu), "rasterizer"), (("b", cpu), "rasterizer")]
-    assert made == [0, (painters, 0), "stopped"]
+    trials = [(name, "rasterizer", cpu) for name in "ab"]
+    assert made == [0, (trials, 0), "stopped"]
     assert capsys.readouterr().out.splitlines() == [
         "http://127.0.0.1:8080  (Ctrl+C ends it)",
         "stopped",

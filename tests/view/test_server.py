@@ -13,27 +13,25 @@ import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
 
-from gsbench.events import Cause
 from gsbench.raster import create_rasterizer
 from gsbench.view import server
 from gsbench.view.server import Session, Viewer, check_port
-from gsbench.view.trials import Layers, TrialPainter, find_trial, load_viewed
+from gsbench.view.trials import find_trial, load_viewed
 from tests.helpers import refusal
 from tests.view.browser import Browser
 
 
 @pytest.fixture(scope="module")
-def painters(small_runs):
+def trials(small_runs):
     cpu = torch.device("cpu")
-    trials = [find_trial(f"small:courtyard:{name}:0", small_runs) for name in ("adc", "volumetric")]
-    rasterizer = create_rasterizer("reference", cpu)
-    return [TrialPainter(load_viewed(trial, cpu), rasterizer) for trial in trials]
+    found = [find_trial(f"small:courtyard:{name}:0", small_runs) for name in ("adc", "volumetric")]
+    return [load_viewed(trial, create_rasterizer("reference", cpu), cpu) for trial in found]
 
 
 @pytest.fixture
-def viewer(painters):
+def viewer(trials):
     pytest.importorskip("viser", reason="the viewer needs viser (extra view)")
-    viewer = Viewer(painters, 0)
+    viewer = Viewer(trials, 0)
     yield viewer
     viewer.stop()
 
@@ -45,9 +43,9 @@ def wait_until(condition):
         time.sleep(0.005)
 
 
-def test_page_answers_until_it_is_stopped(painters):
+def test_page_answers_until_it_is_stopped(trials):
     pytest.importorskip("viser", reason="the viewer needs viser (extra view)")
-    viewer = Viewer(painters[:1], 0)
+    viewer = Viewer(trials[:1], 0)
     assert viewer.url.startswith("http://127.0.0.1:")
     with urllib.request.urlopen(viewer.url, timeout=20) as answer:
         assert answer.status == 200
@@ -67,64 +65,19 @@ def test_page_answers_until_it_is_stopped(painters):
     wait_until(is_gone)
 
 
-def test_two_trials_and_their_photograph_share_one_camera(viewer, painters, monkeypatch):
-    view = painters[0].trial.views[1]
-    picture = viewer.draw(view.camera, Layers(), view)
+def test_two_trials_and_their_photograph_share_one_camera(viewer, trials, monkeypatch):
+    view = trials[0].views[1]
+    picture = viewer.draw(view.camera, view)
     height, width = view.image.shape[:2]
     assert picture.shape == (height, 3 * width, 3)
-    panes = [view.image, *(painter.draw(view.camera, Layers()) for painter in painters)]
+    panes = [view.image, *(trial.draw(view.camera) for trial in trials)]
     for place, pane in enumerate(panes):
         # below the label, right of the dividing line
         assert_array_equal(picture[20:, place * width + 2 : (place + 1) * width], pane[20:, 2:])
     monkeypatch.setattr(server, "side_by_side", dict)
     labels = [f"courtyard random-{name} seed 0: 40 Gaussians" for name in ("adc", "volumetric")]
-    assert list(viewer.draw(view.camera, Layers(), None)) == labels
-    assert list(viewer.draw(view.camera, Layers(), view)) == ["photograph view001.png", *labels]
-
-
-def test_controls_choose_what_is_drawn_and_wake_the_pages(viewer):
-    woken = []
-    viewer._sessions[7] = SimpleNamespace(wake=lambda: woken.append(1), stop=lambda: None)
-    first, second = viewer.views.values()
-    assert viewer.layers() == Layers(3, 100.0, False, -1.523, False)
-    assert (viewer.resting_height, viewer.photograph()) == (540, first)
-    degree, share, threshold = viewer._degree, viewer._share, viewer._threshold
-    assert (degree.min, degree.max, degree.step) == (0, 3, 1)
-    assert (share.min, share.max, share.step) == (1, 100, 1)
-    volumes = np.concatenate([painter.trial.log10_volumes for painter in viewer.painters])
-    assert volumes.max() < -2  # and the slider begins at -1.523
-    assert (threshold.min, threshold.max) == (math.floor(volumes.min()), -1)
-    flags = [(viewer._cloud, True), (viewer._causes, True)]
-    changes = [(degree, 0), (share, 50), (threshold, -2.0), *flags]
-    for count, (control, value) in enumerate(changes, start=1):
-        control.value = value
-        assert len(woken) == count
-    assert viewer.layers() == Layers(0, 50.0, True, -2.0, True)
-    for sent, used in ((-5, 0), (10**6, 3)):  # a page may send any value
-        degree.value = sent
-        assert viewer.layers().sh_degree == used
-    for height, pixels in (("810", 810), ("99999", 270)):
-        viewer._height.value = height
-        assert viewer.resting_height == pixels
-    for name, beside, wanted in (("free", True, None), (second.name, True, second)):
-        viewer._view.value, viewer._beside.value = name, beside
-        assert viewer.photograph() is wanted
-    viewer._beside.value = False
-    assert viewer.photograph() is None
-    assert len(woken) == 12  # once for each change
-
-
-def test_the_legend_counts_the_large_gaussians_of_each_trial_by_cause(viewer):
-    one, other = (painter.trial for painter in viewer.painters)
-    one.causes[:], other.causes[:] = Cause.CLONE, Cause.CLONE
-    threshold = round(float(np.sort(one.log10_volumes)[-4]) - 5e-4, 3)  # four of one are larger
-    one.causes[one.log10_volumes.argmax()] = Cause.ADDED
-    larger = (other.log10_volumes > threshold).sum()
-    viewer._threshold.value = threshold
-    assert viewer._legend.content == (
-        f"V > {10**threshold:.3g}<br><span style='color:#56b4e9'>&#9679;</span> clone: 3 | "
-        f"{larger}<br><span style='color:#0072b2'>&#9679;</span> added: 1 | 0"
-    )
+    assert list(viewer.draw(view.camera, None)) == labels
+    assert list(viewer.draw(view.camera, view)) == ["photograph view001.png", *labels]
 
 
 def make_page(shown, **camera):
@@ -147,7 +100,7 @@ def test_a_page_is_drawn_coarsely_while_it_moves_and_sharply_once_at_rest(viewer
     page = make_page(shown)
 
     def draw(camera, *chosen):
-        assert chosen == (viewer.layers(), viewer.photograph())
+        assert chosen == (viewer.view,)
         drawn.append((camera.width, camera.height))
         if len(drawn) == 1:
             page.moves[0](None)
@@ -159,7 +112,7 @@ def test_a_page_is_drawn_coarsely_while_it_moves_and_sharply_once_at_rest(viewer
     time.sleep(0.03)
     # three panes share the page's width of 1.5 heights
     assert drawn == shown == [(120, 240), (120, 240), (270, 540)]
-    viewer._redraw()
+    viewer._view.value = "free"  # all pages are drawn again
     wait_until(lambda: len(shown) == 5)
     viewer._disconnect(page)
     assert not viewer._sessions
@@ -177,6 +130,7 @@ def test_a_page_moves_to_the_view_that_it_chooses(viewer):
     assert_allclose(camera.up_direction, [0, -1, 0])
     # the picture reaches 33.5 px beside its principal point, and its focal length is 50 px
     assert math.tan(camera.fov / 2) == pytest.approx(33.5 / 50 / (1.5 / 3))
+    assert viewer.view is viewer.views["view000.png"]
     camera.aspect = None  # not known yet
     viewer._view.value = "view001.png"
     assert camera.position[0] == 1  # another page chose it
@@ -185,7 +139,7 @@ def test_a_page_moves_to_the_view_that_it_chooses(viewer):
     assert math.tan(camera.fov / 2) == pytest.approx(25.5 / 50 * 3)
     viewer._view.value = "free"
     viewer._go_to_view(SimpleNamespace(client=page))
-    assert camera.position[0] == 2
+    assert (camera.position[0], viewer.view, viewer.panes) == (2, None, 2)
 
 
 def test_nonsense_of_a_page_is_not_drawn_and_nothing_is_once_it_is_closed(viewer):

@@ -122,7 +122,7 @@ def side_by_side(first: Experiment, second: Experiment) -> tuple[Experiment, Exp
 
     Raises ``InputError`` if there is no such scene.
     """
-    by_scene = [group_by(one.trials, lambda trial: trial.scene) for one in (first, second)]
+    by_scene = [group_by(one.trials, "scene") for one in (first, second)]
     views = [
         {
             scene: {tuple(map(trial.conditions.get, OF_VIEWS)) for trial in own}
@@ -160,12 +160,12 @@ def check_averageable(trials: Sequence[TrialResult], where: str) -> None:
             f"the table cell {where} would average trials made by different versions of {listed}: "
             "train them again with one of them"
         )
-    by_scene = group_by(trials, lambda trial: trial.scene)
+    by_scene = group_by(trials, "scene")
     for scene, group in by_scene.items():
         if keys := differing_conditions(group) or differing_settings(group):
             place = where if "scene=" in where else f"{where}, scene {scene}"
             raise _refusal(place, keys, group)
-        for seed, own in sorted(group_by(group, lambda trial: trial.seed).items()):
+        for seed, own in sorted(group_by(group, "seed").items()):
             if len(own) > 1:
                 paths = ", ".join(trial.label for trial in own)
                 raise InputError(
@@ -178,7 +178,7 @@ def check_averageable(trials: Sequence[TrialResult], where: str) -> None:
 
 def swept_settings(trials: Iterable[Trained]) -> list[str]:
     """The settings in which trials of one scene and arm differ, unless `is_ignored`."""
-    groups = group_by(trials, lambda trial: (trial.scene, trial.init, trial.densify)).values()
+    groups = group_by(trials, "scene", "init", "densify").values()
     return sorted(set().union(*map(differing_settings, groups)))
 
 
@@ -188,7 +188,7 @@ def with_variants(trials: Sequence[C]) -> list[C]:
     Trials with different values thus belong to different arms. Only settings that were swept for
     the trial's own initialiser and densifier count, so a further arm renames no other.
     """
-    by_densifier = group_by(trials, lambda trial: (trial.init, trial.densify))
+    by_densifier = group_by(trials, "init", "densify")
     swept = {key: swept_settings(own) for key, own in by_densifier.items()}
     if not any(swept.values()):
         return list(trials)

@@ -6,7 +6,7 @@ beforehand has a mean and an interval.
 """
 
 import itertools
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -14,6 +14,7 @@ from typing import Any
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.notes import Note, texts
 from gsbench.analysis.old_declarations import all_questions
+from gsbench.analysis.pairs import BASELINE
 from gsbench.analysis.quantities import choose_quantities
 from gsbench.analysis.questions import Asked, choose_pairs
 from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by
@@ -44,12 +45,18 @@ class Answer:
     about trials of code that was edited since.
     """
 
-    baseline: Arm
-    arm: Arm
     verdict: Verdict
     others: tuple[Verdict, ...] = ()
     metrics: tuple[Verdict, ...] = ()
     earlier: bool = False
+
+    @property
+    def baseline(self) -> Arm:
+        return self.verdict.question.baseline
+
+    @property
+    def arm(self) -> Arm:
+        return self.verdict.question.idea
 
     @property
     def badge(self) -> str:
@@ -80,7 +87,7 @@ class Comparison:
 
     experiment: Experiment
     trials: tuple[TrialResult, ...]
-    answers: tuple[Answer, ...]
+    answers: tuple[Answer, ...] = ()
 
     @property
     def pairs(self) -> tuple[tuple[Arm, Arm], ...]:
@@ -104,44 +111,38 @@ class Comparison:
     def remarks(self) -> list[Note]:
         """Notes that belong to the sentences, wherever they stand."""
         compared = {arm for one in self.answers for arm in (one.baseline, one.arm)}
-        alone = [arm for arm in dict.fromkeys(t.arm for t in self.trials) if arm not in compared]
+        by_arm = group_by(self.trials, "arm")
+        alone = [arm for arm in by_arm if arm not in compared]
         notes = [Note.of("no partner", arm=arm) for arm in alone if self.answers or len(alone) > 1]
         for answer in self.answers:
             used = {trial.path for trial in answer.verdict.pairs.trials}
-            own = [trial for trial in self.trials if trial.arm in (answer.arm, answer.baseline)]
             # the baseline may have more seeds and scenes: they cost nothing
-            unused = [t for t in own if t.arm == answer.arm and t.path not in used]
+            unused = [one.label for one in by_arm.get(answer.arm, []) if one.path not in used]
             if unused and answer.verdict.state == ANSWERED:
-                labels = [trial.label for trial in unused]
-                notes.append(Note.of("unused", trials=labels, arm=answer.arm))
+                notes.append(Note.of("unused", trials=unused, arm=answer.arm))
             notes += [note for note in answer.verdict.notes if note.kind == "valueless"]
         return [*notes, *same_bits_notes(self.trials)]
 
     def to_json(self) -> dict[str, Any]:
         """The verdicts and what is left out, for other programs."""
+        answers = [
+            {
+                "arm": str(answer.arm),
+                "baseline": str(answer.baseline),
+                "badge": answer.badge,
+                "sentence": answer.sentence,
+                "notes": texts(answer.verdict.notes),
+                "verdicts": [
+                    _as_json(one) for one in (answer.verdict, *answer.others, *answer.metrics)
+                ],
+            }
+            for answer in self.answers
+        ]
         left_out = texts([*self.remarks, *self.experiment.warnings])
-        return {
-            "answers": [_as_json(answer) for answer in self.answers],
-            "risk": self.risk,
-            "left_out": left_out,
-        }
+        return {"answers": answers, "risk": self.risk, "left_out": left_out}
 
 
-def _as_json(answer: Answer) -> dict[str, Any]:
-    return {
-        "arm": str(answer.arm),
-        "baseline": str(answer.baseline),
-        "badge": answer.badge,
-        "sentence": answer.sentence,
-        "notes": texts(answer.verdict.notes),
-        "verdicts": [
-            verdict_json(one) for one in (answer.verdict, *answer.others, *answer.metrics)
-        ],
-    }
-
-
-def verdict_json(verdict: Verdict) -> dict[str, Any]:
-    """A verdict for other programs."""
+def _as_json(verdict: Verdict) -> dict[str, Any]:
     interval = verdict.interval
     return {
         "metric": verdict.question.metric,
@@ -167,113 +168,86 @@ def compare(experiment: Experiment, baseline: str | None = None) -> Comparison:
     trials = tuple(with_variants(experiment.trials))
     if (experiment.folder / TUNING).exists():
         # the points of a search were chosen by results, so no test of them is valid
-        return Comparison(experiment, trials, ())
-    if baseline is not None:
-        pairs = choose_pairs(trials, Asked(metric=DEFAULT_METRIC, baseline=baseline))
-        known = {trial.arm for trial in trials}
-        answers = [
-            _with_metrics(interval_of(trials, *pair, DEFAULT_METRIC), trials, *pair)
-            for pair in pairs
-            if known.issuperset(pair)
-        ]
-        return Comparison(experiment, trials, tuple(answers))
-    return Comparison(experiment, trials, tuple(_answers(experiment, trials)))
-
-
-def _answers(experiment: Experiment, trials: Sequence[TrialResult]) -> list[Answer]:
-    everything = [*trials, *experiment.older]
-    arms = {(trial.scene, trial.digest): trial.arm for trial in trials}
-    # questions that an experiment's file names have an answer each
-    verdicts: dict[tuple[Arm, Arm, str], list[Verdict]] = {}
-    for question in all_questions(experiment):
-        question = _named(question, arms)
-        verdict = judge(everything, question, experiment.unfinished)
-        key = question.baseline, question.idea, question.name
-        verdicts.setdefault(key, []).append(verdict)
-    ideas = {idea for _, idea, _ in verdicts}
+        return Comparison(experiment, trials)
+    asked = [] if baseline else _asked(experiment, trials)
+    terms = Asked(metric=DEFAULT_METRIC, baseline=baseline or BASELINE)
+    known, ideas = {trial.arm for trial in trials}, {answer.arm for answer in asked}
     unasked = [
         pair
-        for pair in choose_pairs(trials, Asked(metric=DEFAULT_METRIC))
-        if pair[1] not in ideas and {trial.arm for trial in trials}.issuperset(pair)
+        for pair in choose_pairs(trials, terms)
+        if pair[1] not in ideas and known.issuperset(pair)
     ]
-    answers = []
-    folded = {trial.path for trial in experiment.older}
-    for (first, second, _), own in verdicts.items():
-        newest = own[-1].question
-        code = {code_in(second) for _, second in newest.digests.values()}
-        current = [
-            one
-            for one in own
-            if {code_in(second) for _, second in one.question.digests.values()} == code
-        ]
-        answered = [one for one in current if one.state == ANSWERED]
-        shown = (answered or current)[-1]
-        others = tuple(one for one in reversed(own) if one is not shown)
-        earlier = any(trial.path in folded for trial in shown.pairs.trials)
-        answer = _with_metrics(shown, trials, first, second, others)
-        answers.append(replace(answer, earlier=earlier))
-    answers.sort(key=lambda answer: answer.earlier)
-    state, why = NOT_ASKED, ""
+    state, why = (NOT_TESTED if baseline else NOT_ASKED), ""
     if (experiment.folder / LEDGER).exists():
         state, why = NOT_TESTED, OLD_LEDGER
-    for pair in unasked:
-        shown = interval_of(trials, *pair, DEFAULT_METRIC, state, why)
-        answers.append(_with_metrics(shown, trials, *pair))
-    return _with_askers(experiment, answers)
+    intervals = [interval_of(trials, *pair, DEFAULT_METRIC, state, why) for pair in unasked]
+    if any(verdict.state == NOT_ASKED for verdict in intervals):
+        intervals = _with_askers(experiment, intervals)
+    answers = [*asked, *(_with_metrics(verdict, trials) for verdict in intervals)]
+    return Comparison(experiment, trials, tuple(answers))
 
 
-def _with_askers(experiment: Experiment, answers: Sequence[Answer]) -> list[Answer]:
-    """The answers; one that nobody asked here names another experiment that asked it.
+def _asked(experiment: Experiment, trials: Sequence[TrialResult]) -> list[Answer]:
+    """The answers on what was asked; questions that an experiment's file names have one each."""
+    everything = [*trials, *experiment.older]
+    arms = {(trial.scene, trial.digest): trial.arm for trial in trials}
+    verdicts = []
+    for question in all_questions(experiment):
+        # with the names that its arms have among all trials
+        sides = []
+        for side, name in enumerate((question.baseline, question.idea)):
+            found = (arms.get((scene, both[side])) for scene, both in question.digests.items())
+            sides.append(next(filter(None, found), name))
+        question = replace(question, baseline=sides[0], idea=sides[1])
+        verdicts.append(judge(everything, question, experiment.unfinished))
+    folded = {trial.path for trial in experiment.older}
+    answers = []
+    for own in group_by(verdicts, "question.baseline", "question.idea", "question.name").values():
+        code = _code_of(own[-1].question)
+        current = [one for one in own if _code_of(one.question) == code]
+        shown = ([one for one in current if one.state == ANSWERED] or current)[-1]
+        others = tuple(one for one in reversed(own) if one is not shown)
+        earlier = any(trial.path in folded for trial in shown.pairs.trials)
+        answers.append(replace(_with_metrics(shown, trials, others), earlier=earlier))
+    return sorted(answers, key=lambda answer: answer.earlier)
 
-    The other experiments are read once, and only if there is such an answer.
+
+def _code_of(question: Question) -> set[str]:
+    return {code_in(second) for _, second in question.digests.values()}
+
+
+def _with_askers(experiment: Experiment, verdicts: Sequence[Verdict]) -> list[Verdict]:
+    """The verdicts; one that nobody asked here names another experiment that asked it.
+
+    That experiment has a question about all of its trials.
     """
-    if all(answer.verdict.state != NOT_ASKED for answer in answers):
-        return [*answers]
     elsewhere = questions_elsewhere(experiment.folder)
-    return [
-        replace(answer, verdict=replace(answer.verdict, asker=_asker(answer.verdict, elsewhere)))
-        for answer in answers
-    ]
 
-
-def _asker(verdict: Verdict, elsewhere: Mapping[str, Sequence[Question]]) -> str:
-    """The experiment with a question about all trials of a verdict that nobody asked, or ""."""
-    trials = verdict.pairs.trials
-    if verdict.state != NOT_ASKED or not trials:
+    def asker(verdict: Verdict) -> str:
+        trials = verdict.pairs.trials
+        for name, asked in elsewhere.items():
+            for question in asked if trials else ():
+                if question.metric == verdict.quantity.key and all(
+                    question.has(trial.digest, trial.scene, trial.seed) for trial in trials
+                ):
+                    return name
         return ""
 
-    def asks(question: Question) -> bool:
-        return question.metric == verdict.quantity.key and all(
-            question.has(trial.digest, trial.scene, trial.seed) for trial in trials
-        )
-
-    return next((name for name, asked in elsewhere.items() if any(map(asks, asked))), "")
-
-
-def _named(question: Question, arms: Mapping[tuple[str, str], Arm]) -> Question:
-    """The question with the names that its arms have among all trials."""
-    sides = []
-    for side, name in enumerate((question.baseline, question.idea)):
-        found = (arms.get((scene, both[side])) for scene, both in question.digests.items())
-        sides.append(next(filter(None, found), name))
-    return replace(question, baseline=sides[0], idea=sides[1])
+    return [replace(verdict, asker=asker(verdict)) for verdict in verdicts]
 
 
 def _with_metrics(
-    verdict: Verdict,
-    trials: Sequence[TrialResult],
-    baseline: Arm,
-    arm: Arm,
-    others: tuple[Verdict, ...] = (),
+    verdict: Verdict, trials: Sequence[TrialResult], others: tuple[Verdict, ...] = ()
 ) -> Answer:
-    own = [trial for trial in trials if trial.arm in (baseline, arm)]
+    pair = verdict.question.baseline, verdict.question.idea
+    own = [trial for trial in trials if trial.arm in pair]
     known = [*(choose_quantities(own) if own else ()), *(one.quantity for one in others)]
-    metrics = tuple(
-        interval_of(own, baseline, arm, quantity.key)
+    metrics = (
+        interval_of(own, *pair, quantity.key)
         for quantity in dict.fromkeys(known)
         if quantity.direction and not quantity.cost and quantity.key != verdict.quantity.key
     )
-    return Answer(baseline, arm, verdict, others, tuple(m for m in metrics if m.pairs.rows))
+    return Answer(verdict, others, tuple(one for one in metrics if one.pairs.rows))
 
 
 def joined(comparisons: Sequence[Comparison]) -> Comparison:
@@ -283,42 +257,37 @@ def joined(comparisons: Sequence[Comparison]) -> Comparison:
     """
     if len(comparisons) == 1:
         return comparisons[0]
-    comparisons = [_with_place(one) for one in comparisons]
+    trials, answers = list[TrialResult](), list[Answer]()
+    for one in comparisons:
+        place = ("experiment", one.experiment.name)
+
+        def arm(own: Arm, place: tuple[str, str] = place) -> Arm:
+            return replace(own, variant=(place, *own.variant))
+
+        def named(verdict: Verdict, arm: Callable[[Arm], Arm] = arm) -> Verdict:
+            asked = verdict.question
+            sides = arm(asked.baseline), arm(asked.idea)
+            return replace(verdict, question=replace(asked, baseline=sides[0], idea=sides[1]))
+
+        trials += [replace(trial, variant=(place, *trial.variant)) for trial in one.trials]
+        answers += [
+            replace(
+                answer,
+                verdict=named(answer.verdict),
+                others=tuple(map(named, answer.others)),
+                metrics=tuple(map(named, answer.metrics)),
+            )
+            for answer in one.answers
+        ]
     experiments = [one.experiment for one in comparisons]
-    both = replace(
-        experiments[0],
-        name=" and ".join(one.name for one in experiments),
-        trials=tuple(itertools.chain(*(one.trials for one in experiments))),
-        faults=tuple(itertools.chain(*(one.faults for one in experiments))),
-        older=tuple(itertools.chain(*(one.older for one in experiments))),
-        versions=tuple(itertools.chain(*(one.versions for one in experiments))),
-    )
-    trials = itertools.chain(*(one.trials for one in comparisons))
-    answers = itertools.chain(*(one.answers for one in comparisons))
+
+    parts: dict[str, Any] = {
+        part: tuple(itertools.chain(*(getattr(one, part) for one in experiments)))
+        for part in ("trials", "faults", "older", "versions")
+    }
+    name = " and ".join(one.name for one in experiments)
+    both = replace(experiments[0], name=name, **parts)
     return Comparison(both, tuple(trials), tuple(answers))
-
-
-def _with_place(comparison: Comparison) -> Comparison:
-    def arm(own: Arm) -> Arm:
-        return replace(own, variant=(("experiment", comparison.experiment.name), *own.variant))
-
-    def verdict(own: Verdict) -> Verdict:
-        idea, baseline = arm(own.question.idea), arm(own.question.baseline)
-        return replace(own, question=replace(own.question, idea=idea, baseline=baseline))
-
-    answers = (
-        Answer(
-            arm(one.baseline),
-            arm(one.arm),
-            verdict(one.verdict),
-            tuple(map(verdict, one.others)),
-            tuple(map(verdict, one.metrics)),
-            one.earlier,
-        )
-        for one in comparison.answers
-    )
-    trials = (replace(trial, variant=arm(trial.arm).variant) for trial in comparison.trials)
-    return replace(comparison, trials=tuple(trials), answers=tuple(answers))
 
 
 def chosen(comparison: Comparison, trials: Sequence[TrialResult], where: str) -> Comparison:
@@ -328,17 +297,18 @@ def chosen(comparison: Comparison, trials: Sequence[TrialResult], where: str) ->
     have been made after seeing results. One without a pair of trials left goes.
     """
     kept = {trial.path for trial in trials}
-    own = [trial for trial in comparison.trials if trial.path in kept]
+    own = tuple(trial for trial in comparison.trials if trial.path in kept)
     answers = []
     for answer in comparison.answers:
         used = {trial.path for trial in answer.verdict.pairs.trials}
+        pair = answer.baseline, answer.arm
         if used and used <= kept:
             answers.append(answer)
-        elif {answer.baseline, answer.arm} <= {trial.arm for trial in own}:
+        elif {trial.arm for trial in own}.issuperset(pair):
             metric, why = answer.verdict.quantity.key, f"{where} chose its trials"
-            verdict = interval_of(own, answer.baseline, answer.arm, metric, NOT_TESTED, why)
-            answers.append(_with_metrics(verdict, own, answer.baseline, answer.arm))
-    return replace(comparison, trials=tuple(own), answers=tuple(answers))
+            verdict = interval_of(own, *pair, metric, NOT_TESTED, why)
+            answers.append(_with_metrics(verdict, own))
+    return replace(comparison, trials=own, answers=tuple(answers))
 
 
 def winners(comparison: Comparison) -> dict[tuple[str, frozenset[str]], set[Arm]]:
@@ -348,19 +318,16 @@ def winners(comparison: Comparison) -> dict[tuple[str, frozenset[str]], set[Arm]
     """
     found: dict[tuple[str, frozenset[str]], tuple[set[Arm], set[Arm]]] = {}
     for answer in comparison.answers:
-        verdict = answer.verdict
-        place = verdict.quantity.key, frozenset(verdict.question.seeds)
-        better, worse = found.setdefault(place, (set(), set()))
-        sides = answer.baseline, answer.arm
-        if verdict.state == ANSWERED and verdict.outcome in (SUPPORTED, REFUTED):
-            if verdict.question.sign != verdict.quantity.direction:
-                continue
-            sides = sides if verdict.outcome == SUPPORTED else sides[::-1]
-            worse.add(sides[0])
-            better.add(sides[1])
-        else:
-            worse.update(sides)
-    return {place: better - worse for place, (better, worse) in found.items()}
+        verdict, question = answer.verdict, answer.verdict.question
+        place = verdict.quantity.key, frozenset(question.seeds)
+        better, others = found.setdefault(place, (set(), set()))
+        if verdict.state != ANSWERED or verdict.outcome not in (SUPPORTED, REFUTED):
+            others.update((answer.baseline, answer.arm))
+        elif question.sign == verdict.quantity.direction:
+            sides = answer.baseline, answer.arm
+            better.add(sides[verdict.outcome == SUPPORTED])
+            others.add(sides[verdict.outcome == REFUTED])
+    return {place: better - others for place, (better, others) in found.items()}
 
 
 def same_bits_notes(trials: Sequence[TrialResult]) -> list[Note]:

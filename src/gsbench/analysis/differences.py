@@ -122,15 +122,15 @@ def conditions_between_scenes(trials: Sequence[TrialResult]) -> dict[str, Scenes
 
     A mean over such scenes would be about nothing.
     """
-    by_scene = group_by(trials, lambda trial: trial.scene)
-    keys = differing_conditions([own[0] for own in by_scene.values()], code=False)
-    keys = {key: values for key, values in keys.items() if key not in OF_A_SCENE}
+    by_scene = group_by(trials, "scene")
+    differing = differing_conditions([own[0] for own in by_scene.values()], code=False)
+    keys = [key for key in differing if key not in OF_A_SCENE]
     return _between_scenes(by_scene, keys, lambda trial, key: trial.conditions.get(key, "none"))
 
 
 def settings_between_scenes(trials: Sequence[TrialResult]) -> dict[str, ScenesByValue]:
     """The settings in which the scenes of one arm differ, without those of the scene itself."""
-    by_scene = group_by([trial for trial in trials if trial.config], lambda trial: trial.scene)
+    by_scene = group_by([trial for trial in trials if trial.config], "scene")
     first, *others = (own[0].config for own in by_scene.values()) if by_scene else ({},)
     # Compared as they are, not as text: this runs for every pair of arms.
     keys = {
@@ -153,17 +153,10 @@ def _between_scenes(
     """
     differing = {}
     for key in keys:
-        values_by_scene = {
-            scene: {value_of(trial, key) for trial in own} for scene, own in by_scene.items()
-        }
-        if any(len(values) > 1 for values in values_by_scene.values()):
-            continue
-        scenes_by_value: ScenesByValue = {}
-        for scene, (value,) in values_by_scene.items():
-            scenes_by_value.setdefault(value, []).append(scene)
-        if len(scenes_by_value) > 1:
-            differing[key] = scenes_by_value
-    return differing
+        values = {scene: {value_of(trial, key) for trial in by_scene[scene]} for scene in by_scene}
+        if all(len(own) == 1 for own in values.values()):
+            differing[key] = group_by(values, lambda scene: min(values[scene]))  # noqa: B023
+    return {key: scenes for key, scenes in differing.items() if len(scenes) > 1}
 
 
 def between_scenes_notes(*sides: Sequence[TrialResult]) -> list[Note]:
@@ -174,7 +167,7 @@ def between_scenes_notes(*sides: Sequence[TrialResult]) -> list[Note]:
     """
     arms_by_text: dict[str, list[str]] = {}
     for side in sides:
-        for arm, own in group_by(side, lambda trial: trial.arm).items():
+        for arm, own in group_by(side, "arm").items():
             differing = conditions_between_scenes(own) | settings_between_scenes(own)
             texts = []
             for key, by_value in differing.items():
@@ -257,9 +250,9 @@ def compared_trials(trials: Iterable[TrialResult], first: Arm, second: Arm) -> l
 
     Without a common scene it is one pair. Raises KeyError for an arm without trials.
     """
-    by_arm = group_by(trials, lambda trial: trial.arm)
+    by_arm = group_by(trials, "arm")
     ones, others = by_arm[first], by_arm[second]
-    here, there = (group_by(own, lambda trial: trial.scene) for own in (ones, others))
+    here, there = (group_by(own, "scene") for own in (ones, others))
     shared = [_first_pair(own, there[scene]) for scene, own in here.items() if scene in there]
     return shared or [_first_pair(ones, others)]
 

@@ -7,13 +7,13 @@ recorded.
 import itertools
 import math
 import statistics
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from operator import attrgetter
 from typing import Any
 
 from gsbench.analysis.differences import (
     between_scenes_notes,
     compared_trials,
-    differing_code,
     differing_keys,
     ingredients_between,
     ingredients_note,
@@ -21,49 +21,38 @@ from gsbench.analysis.differences import (
 )
 from gsbench.analysis.notes import Note
 from gsbench.analysis.pairs import pair_trials
-from gsbench.analysis.quantities import COSTS, Reader, relative_change
+from gsbench.analysis.quantities import COSTS, relative_change
 from gsbench.analysis.results import Arm, TrialResult, group_by, trials_of
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.analysis.trial_settings import canonical
-from gsbench.gaussians.paper_values import PAPER_CAP
 from gsbench.parsing import read_if_sound
-from gsbench.runs.config_hash import is_ingredient
 from gsbench.runs.experiments import SearchPoint, TuningRecord
 from gsbench.runs.layout import EVENTS, TUNING
-from gsbench.words import counted, listed
+from gsbench.words import counted, value_words
 
 CAP, LIMIT = "densify.cap", "densify.max_gaussians"
 DIGITS = 3  # significant digits of a number of Gaussians
 LONGEST = 60  # the most characters of a value that are shown
 UNKNOWN, NONE = "not recorded", "–"
-ALIKE, UNLIKE = "", "≠"
-DIFFERS = "differs"  # heading of the column that marks differing rows
+UNLIKE = "≠"
 # relative difference up to which counts are equal; densify.cap=governor holds counts closer
 EQUAL_COUNTS = 0.02
 MAX_VALUES = 8  # the most points of a search that are shown
-VIEWS = "validation views"  # every search judges its points on them
 
 
-def caveats(
-    trials: Sequence[TrialResult],
-    first: Arm,
-    second: Arm,
-) -> list[Note]:
+def caveats(trials: Sequence[TrialResult], first: Arm, second: Arm) -> list[Note]:
     """Notes on several differing ingredients and on unequal tuning."""
     names = ingredients_between(trials, first, second)
     mixed = ingredients_note(names, first, second) if is_mixed(names) else None
     return [note for note in (mixed, tuning_note(trials, (first, second))) if note]
 
 
-def counts_notes(
-    trials: Sequence[TrialResult],
-    pairs: Iterable[tuple[Arm, Arm]],
-) -> list[Note]:
+def counts_notes(trials: Sequence[TrialResult], pairs: Iterable[tuple[Arm, Arm]]) -> list[Note]:
     """A note for each baseline on the arms that have more Gaussians over common scenes, or fewer.
 
     It says how to compare all of these at equal counts.
     """
-    by_arm, notes = group_by(trials, lambda trial: trial.arm), []
+    by_arm, notes = group_by(trials, "arm"), []
     for first, own in group_by(pairs, lambda pair: pair[0]).items():
         baseline, unequal = by_arm.get(first, []), dict[Arm, float]()
         for _, second in own:
@@ -73,18 +62,12 @@ def counts_notes(
         if not unequal:
             continue
         others = [trial for arm in unequal for trial in by_arm[arm]]
-        texts = [
+        arms = [
             f"{arm} {100 * abs(more):.0f} % {'more' if more > 0 else 'fewer'}"
             for arm, more in unequal.items()
         ]
-        notes.append(
-            Note.of(
-                "unequal counts",
-                arms=texts,
-                baseline=first,
-                advice=equal_counts_advice([*baseline, *others]),
-            )
-        )
+        advice = equal_counts_advice([*baseline, *others])
+        notes.append(Note.of("unequal counts", arms=arms, baseline=first, advice=advice))
     return notes
 
 
@@ -98,7 +81,7 @@ def equal_counts_advice(trials: Sequence[TrialResult]) -> str:
     if min(counts) <= points:
         return f"start all arms with fewer than {points:,} points, as no limit can be below these"
     aims = {(trial.config.get(CAP), trial.config.get(LIMIT)) for trial in trials}
-    if len(aims) == 1 and {cap for cap, _ in aims} == {"governor"}:
+    if len(aims) == 1 and next(iter(aims))[0] == "governor":
         return (
             "train longer, since the governor (densify.cap) had too few rounds to reach its count"
         )
@@ -107,133 +90,54 @@ def equal_counts_advice(trials: Sequence[TrialResult]) -> str:
     return f"give all arms {words} and another name"
 
 
-def limit_notes(trials: Sequence[TrialResult], pairs: Iterable[tuple[Arm, Arm]]) -> list[Note]:
-    """A note for each limit on the count that compared arms share and that some did not reach.
-
-    The limit held an arm if a trial on each scene came near it, or was refused growth by a cap
-    that may end lower. The paper's own cap is no limit for equal counts: all arms have it.
-    """
-    notes, arms = [], set(itertools.chain(*pairs))
-    limited = [trial for trial in trials if trial.arm in arms and _limit(trial)]
-    for limit, sharing in group_by(limited, _limit).items():
-        by_arm = group_by(sharing, lambda trial: trial.arm)
-        free: dict[str, list[TrialResult]] = {}
-        for arm, own in by_arm.items():
-            for of_scene in group_by(own, lambda trial: trial.scene).values():
-                if not any(map(_is_held, of_scene)):
-                    free.setdefault(str(arm), []).extend(of_scene)
-        if not free or len(by_arm) < 2:
-            continue
-        unheld = [trial for own in free.values() for trial in own]
-        scenes = {trial.scene for trial in unheld}
-        places = sorted(scenes) if scenes != {trial.scene for trial in sharing} else []
-        notes.append(
-            Note.of(
-                "limit not reached",
-                arms=list(free),
-                limit=limit,
-                largest=max(trial.record.num_gaussians or 0 for trial in unheld),
-                scenes=listed(places),
-            )
-        )
-    return notes
-
-
-def _limit(trial: TrialResult) -> int:
-    """The limit on the count that the trial's experiment asked for; 0 without one."""
-    budget = trial.record.budget
-    if budget is None or trial.record.num_gaussians is None or trial.made_elsewhere:
-        return 0
-    limit = budget.max_gaussians or 0
-    return 0 if (limit, budget.cap) == (PAPER_CAP, "soft") else limit
-
-
-def _is_held(trial: TrialResult) -> bool:
-    """Return whether the trial's limit held its count."""
-    budget, count = trial.record.budget, trial.record.num_gaussians or 0
-    # a governor and a curve hold growth back early, also if the limit is never reached
-    refuses = budget is not None and budget.cap not in ("governor", "curve")
-    refused = refuses and bool(trial.record.events.get("blocked_by_cap"))
-    return refused or count >= (1 - EQUAL_COUNTS) * _limit(trial)
-
-
-def fairness_table(
-    trials: Sequence[TrialResult],
-    first: Arm,
-    second: Arm,
-    older: Sequence[TrialResult] = (),
-) -> Table:
+def fairness_table(trials: Sequence[TrialResult], first: Arm, second: Arm) -> Table:
     """The fairness sheet of two arms as a table with notes.
 
-    ``trials`` are all trials of the experiment that count, each with its variant, ``older`` those
-    of earlier code. Measured rows cover the paired trials: one value, or the smallest, the largest
-    and the mean. Raises KeyError for an arm without trials.
+    ``trials`` are all trials of the experiment that count, each with its variant. Measured rows
+    cover the paired trials: one value, or the smallest, the largest and the mean. Raises KeyError
+    for an arm without trials.
     """
     pairs = pair_trials(trials, first, second)
     compared = list(itertools.chain(*pairs)) or trials
     groups = [trials_of(compared, arm) for arm in (first, second)]
-    rows = [_row(what, list(map(show, groups))) for what, show in MEASURED.items()]
+    shown = {"trials": [str(len(own)) for own in groups]}
+    shown |= {what: [_shown_over(own, read) for own in groups] for what, read in MEASURED.items()}
     configs = [
         (one.config, other.config) for one, other in compared_trials(compared, first, second)
     ]
-    sides = list(zip(*configs, strict=True))
-    keys = itertools.chain(*(differing_keys(*both) for both in configs))
-    for index, key in enumerate(dict.fromkeys(keys)):
-        shown = [_shown_in(side, key) for side in sides]
-        rows.append(_row(key, shown, rule_above=index == 0))
+    for key in itertools.chain(*(differing_keys(*both) for both in configs)):
+        # several values if they differ between scenes
+        sides = (
+            dict.fromkeys(_shown(own[key]) if key in own else NONE for own in side)
+            for side in zip(*configs, strict=True)
+        )
+        shown[key] = list(map(", ".join, sides))
+    rows = []
+    for index, (what, values) in enumerate(shown.items()):
+        entries = map(TableEntry, [*values, UNLIKE if values[0] != values[1] else ""])
+        rows.append(Row((what,), tuple(entries), rule_above=index == len(MEASURED) + 1))
     notes = [ingredients_note(ingredients_between(trials, first, second), first, second)]
     notes += between_scenes_notes(*groups)
     notes += [Note.of("compared", pairs=len(pairs))]
-    tuning = [f"Tuning. {note}" for note in tuning_notes(trials, (first, second), older)]
-    columns = tuple(Column("", name, ("", name)) for name in (str(first), str(second), DIFFERS))
+    tuning = [f"Tuning. {note}" for note in tuning_notes(trials, (first, second))]
+    columns = tuple(Column("", name, ("", name)) for name in (str(first), str(second), "differs"))
     title = f"Fairness sheet: {second} against {first}"
     return Table(title, ("what",), columns, tuple(rows), (*map(str, notes), *tuning), wrapped=True)
 
 
-def _row(what: str, values: Sequence[str], rule_above: bool = False) -> Row:
-    """A row with the values of both arms, and whether they differ."""
-    differs = ALIKE if values[0] == values[1] else UNLIKE
-    return Row((what,), tuple(map(TableEntry, [*values, differs])), rule_above)
-
-
-def _shown_in(configs: Sequence[Mapping[str, Any]], key: str) -> str:
-    """The values of a setting: several if they differ between scenes."""
-    values = [_shown(config[key]) if key in config else NONE for config in configs]
-    return ", ".join(dict.fromkeys(values))
-
-
 def _shown(value: Any) -> str:
-    text = value if isinstance(value, str) else canonical(value)
+    text = value_words(value if isinstance(value, str) else canonical(value))
     return text if len(text) <= LONGEST else f"{text[: LONGEST - 1]}…"
 
 
-def _span(read: Reader) -> Callable[[Sequence[TrialResult]], str]:
-    """A function that shows a number over trials: one value, or smallest, largest and mean."""
-
-    def show(trials: Sequence[TrialResult]) -> str:
-        values = [value for trial in trials if (value := read(trial)) is not None]
-        if not values:
-            return UNKNOWN
-        low, high = f"{min(values):,.0f}", f"{max(values):,.0f}"
-        return low if low == high else f"{low} to {high}, mean {statistics.fmean(values):,.0f}"
-
-    return show
-
-
-def _distinct(read: Callable[[TrialResult], str | None]) -> Callable[[Sequence[TrialResult]], str]:
-    """A function that lists the different texts of trials."""
-    return lambda trials: ", ".join(sorted({read(trial) or UNKNOWN for trial in trials}))
-
-
-def _resolution(trial: TrialResult) -> str | None:
-    size = trial.record.resolution
-    return None if size is None else f"{size[0]}×{size[1]} px"
-
-
-def _start(trial: TrialResult, fact: str, form: str) -> str | None:
-    """A fact of the trial's initial points, formatted; None if it was not measured."""
-    value = getattr(trial.record.initial_cloud, fact, None)
-    return None if value is None else format(value, form)
+def _shown_over(trials: Sequence[TrialResult], read: Callable[[TrialResult], Any]) -> str:
+    """A fact of trials: one value; of several numbers the smallest, the largest and the mean."""
+    values = [read(trial) for trial in trials]
+    numbers = [value for value in values if isinstance(value, int | float)]
+    if not numbers:
+        return ", ".join(sorted({value or UNKNOWN for value in values}))
+    low, high = f"{min(numbers):,.0f}", f"{max(numbers):,.0f}"
+    return low if low == high else f"{low} to {high}, mean {statistics.fmean(numbers):,.0f}"
 
 
 def budget_words(trial: TrialResult) -> str | None:
@@ -242,67 +146,61 @@ def budget_words(trial: TrialResult) -> str | None:
     if budget is None:
         return None
     count, seconds = budget.max_gaussians, budget.seconds
-    parts = [
-        f"{count:,} Gaussians ({budget.cap})" if count else "",
-        f"{seconds:g} s" if seconds else "",
-    ]
-    return ", ".join(filter(None, parts)) or "none"
+    parts = [f"{count:,} Gaussians ({budget.cap})"] if count else []
+    parts += [f"{seconds:g} s"] if seconds else []
+    return ", ".join(parts) or "none"
 
 
-def _code(trial: TrialResult) -> str | None:
+def _of_cloud(trial: TrialResult, fact: str, form: str) -> str | None:
+    """A fact of the trial's initial points, formatted; None if it was not measured."""
+    value = getattr(trial.record.initial_cloud, fact, None)
+    return None if value is None else format(value, form)
+
+
+def _code(trial: TrialResult) -> str:
     release = trial.record.versions.get("gsbench")
     program = f"{trial.program} {trial.trainer_version}".strip()
-    return (
-        ", ".join(
-            filter(None, [program, f"gsbench {release}" if release else "", *trial.code_texts])
-        )
-        or None
-    )
+    parts = [program, f"gsbench {release}" if release else "", *trial.code_texts]
+    return ", ".join(filter(None, parts))
 
 
-# Rows that every sheet has, with the function that shows an arm's trials.
-MEASURED: dict[str, Callable[[Sequence[TrialResult]], str]] = {
-    "trials": lambda trials: str(len(trials)),
-    "views for training": _span(lambda trial: trial.record.train_views),
-    "held-out views": _span(lambda trial: trial.record.test_views),
-    "pictures": _distinct(_resolution),
-    "photographs (hash)": _distinct(lambda trial: trial.record.hashes.get("data", "")[:12]),
-    "test views with a near twin in training": _span(
+# Rows that every sheet has: a fact of a trial, as a number or as text.
+MEASURED: dict[str, Callable[[TrialResult], Any]] = {
+    "views for training": attrgetter("record.train_views"),
+    "held-out views": attrgetter("record.test_views"),
+    "pictures": (
+        lambda trial: trial.record.resolution and "{}×{} px".format(*trial.record.resolution)
+    ),
+    "photographs (hash)": lambda trial: trial.record.hashes.get("data", "")[:12],
+    "test views with a near twin in training": (
         lambda trial: None if trial.record.twins is None else len(trial.record.twins.near)
     ),
-    "initial points": _span(lambda trial: trial.record.num_init_points),
-    "initial points in two training views": _distinct(lambda trial: _start(trial, "seen", ".1%")),
-    "agreement of their colours with photographs": _distinct(
-        lambda trial: _start(trial, "color_agreement", ".2f")
+    "initial points": attrgetter("record.num_init_points"),
+    "initial points in two training views": lambda trial: _of_cloud(trial, "seen", ".1%"),
+    "agreement of their colours with photographs": (
+        lambda trial: _of_cloud(trial, "color_agreement", ".2f")
     ),
-    "initial cloud (hash)": _distinct(lambda trial: trial.cloud[:12]),
-    "iterations": _span(lambda trial: trial.record.iterations),
-    "rounds of the densifier": _span(lambda trial: len(trial.folder.curves(EVENTS)) or None),
-    "budget": _distinct(budget_words),
-    "Gaussians in the end": _span(lambda trial: trial.record.num_gaussians),
-    "seconds of training": _span(lambda trial: trial.record.seconds.get("train")),
-    "memory (MB)": _span(lambda trial: trial.record.peak_memory_mb),
-    "rasterizer": _distinct(lambda trial: trial.record.raster),
-    "protocol": _distinct(lambda trial: trial.record.protocol),
-    "machine": _distinct(lambda trial: trial.machine),
-    "code": _distinct(_code),
+    "initial cloud (hash)": lambda trial: trial.cloud[:12],
+    "iterations": attrgetter("record.iterations"),
+    "rounds of the densifier": lambda trial: len(trial.folder.curves(EVENTS)) or None,
+    "budget": budget_words,
+    "Gaussians in the end": attrgetter("record.num_gaussians"),
+    "seconds of training": lambda trial: trial.record.seconds.get("train"),
+    "memory (MB)": attrgetter("record.peak_memory_mb"),
+    "rasterizer": attrgetter("record.raster"),
+    "protocol": attrgetter("record.protocol"),
+    "machine": attrgetter("machine"),
+    "code": _code,
 }
 
 
-def tuning_notes(
-    trials: Sequence[TrialResult], pair: Sequence[Arm], older: Sequence[TrialResult] = ()
-) -> list[Note]:
-    """List, for each arm of a pair, its searches, and the settings that these trials vary.
-
-    These trials are measured on the test views, so varying settings among them is tuning on the
-    verdict's own views.
-    """
+def tuning_notes(trials: Sequence[TrialResult], pair: Sequence[Arm]) -> list[Note]:
+    """List, for each arm of a pair, its searches, and whether the arms were tuned alike."""
     unlike = tuning_note(trials, pair)
     notes = [unlike] if unlike else []
     for arm in pair:
         own = trials_of(trials, arm)
         notes += [_search_note(own, name, record) for name, record in searches_of(own[0]).items()]
-        notes += _varied_settings([*trials, *older], own[0])
     return notes or [Note.of("no tuning")]
 
 
@@ -312,27 +210,21 @@ def tuning_note(trials: Sequence[TrialResult], pair: Sequence[Arm]) -> Note | No
     A search counts if its best point has exactly the arm's settings. Settings that were all run as
     arms are no search, since each has its own verdict.
     """
-    budgets = [_tuning_budget(trials_of(trials, arm)[0]) for arm in pair]
-    if len(set(budgets)) < 2:
+    budgets = []
+    for arm in pair:
+        trial = trials_of(trials, arm)[0]
+        sizes = [
+            (len(search.points), len(search.seeds))
+            for search in searches_of(trial).values()
+            if _has_settings(trial, search.best)
+        ]
+        points, seeds = max(sizes, key=math.prod, default=(0, 0))
+        tried = f"{counted(points, 'point')} of {counted(seeds, 'seed')} on validation views"
+        budgets.append(tried if points else "none")
+    if budgets[0] == budgets[1]:
         return None
-    each = [f"{arm} {budget}" for arm, budget in zip(pair, budgets, strict=True)]
-    return Note.of("unlike tuning", arms=each)
-
-
-def _tuning_budget(trial: TrialResult) -> str:
-    """The budget of the largest search that chose the trial's settings; "none" without one.
-
-    For example ``6 points of 2 seeds on validation views``.
-    """
-    searches = [
-        search for search in searches_of(trial).values() if _has_settings(trial, search.best)
-    ]
-    if not searches:
-        return "none"
-    largest = max(searches, key=lambda search: len(search.points) * len(search.seeds))
-    return (
-        f"{counted(len(largest.points), 'point')} of {counted(len(largest.seeds), 'seed')} on "
-        f"{VIEWS}"
+    return Note.of(
+        "unlike tuning", arms=[f"{arm} {own}" for arm, own in zip(pair, budgets, strict=True)]
     )
 
 
@@ -377,33 +269,6 @@ def _search_note(own: Sequence[TrialResult], experiment: str, search: TuningReco
         more=max(0, len(search.points) - MAX_VALUES),
         others="" if _has_settings(own[0], best) else " These trials have other values.",
     )
-
-
-def _varied_settings(trials: Sequence[TrialResult], own: TrialResult) -> list[Note]:
-    """Name the settings and code that vary among arms with one initialiser and densifier class."""
-    target = own.config.get("densify._target_")
-    same_class = [
-        t
-        for t in trials
-        if t.init == own.init and t.config and t.config.get("densify._target_") == target
-    ]
-    # each scene may have settings of its own, which are no choices
-    by_scene = group_by(same_class, lambda trial: trial.scene).values()
-    most = max((group_by(of_scene, _choice) for of_scene in by_scene), key=len, default={})
-    if len(most) < 2:
-        return []
-    firsts = [same[0] for same in most.values()]
-    configs = [trial.config for trial in firsts]
-    keys = {key for config in configs for key in differing_keys(configs[0], config)}
-    code = [str(part) for part in differing_code(firsts) if part.kind != "stage"]
-    return [Note.of("varied", arm=own.arm, choices=len(most), settings=[*sorted(keys), *code])]
-
-
-def _choice(trial: TrialResult) -> Hashable:
-    """The user's choices for a trial: settings, modules, and edits of gsbench's packages."""
-    config = [(k, canonical(v)) for k, v in trial.config.items() if is_ingredient(k)]
-    code = [(part, made) for part, made in trial.code.items() if part.kind != "stage"]
-    return frozenset(config), frozenset(code)
 
 
 def _has_settings(trial: TrialResult, point: SearchPoint | None) -> bool:

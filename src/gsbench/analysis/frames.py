@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from gsbench.analysis.comparison import Comparison, compare
 from gsbench.analysis.quantities import asked_quantity
-from gsbench.analysis.questions import LeastEffect, read_least
+from gsbench.analysis.questions import read_least
 from gsbench.analysis.results import Experiment, TrialResult, group_by
 from gsbench.analysis.sentences import DECLARED_TABLE, TABLE
 from gsbench.analysis.verdicts import Verdict
@@ -120,7 +120,7 @@ def compare_methods(frame: pd.DataFrame, asked: Declared, name: str = "results")
             f"{metric}: say whether more is better (--better higher, direction 1) or less"
         )
     least = asked.least or quantity.worthwhile
-    size = None if least is None else read_least(least, "--least")
+    size = (None, False) if least is None else read_least(least, "--least")
     questions = [
         _question(trials, asked, idea, quantity.direction, size).with_id(TABLE) for idea in ideas
     ]
@@ -134,19 +134,21 @@ def _question(
     asked: Declared,
     idea: str,
     sign: int,
-    least: LeastEffect | None,
+    least: tuple[float | None, bool],
 ) -> Question:
     """The question about all trials of a method, or about those that were declared."""
-    places: dict[tuple[str, str], list[int]] = {}
-    for trial in trials:
-        places.setdefault((trial.densify, trial.scene), []).append(trial.seed)
-    seeds = {scene: tuple(sorted(own)) for (method, scene), own in places.items() if method == idea}
+    places = group_by(trials, "densify", "scene")
+    seeds = {
+        scene: tuple(sorted(one.seed for one in own))
+        for (method, scene), own in places.items()
+        if method == idea
+    }
     untested, baseline = "", asked.baseline
     if asked.methods:
         seeds = dict.fromkeys(asked.scenes, asked.seeds)
     else:
         for scene, own in seeds.items():
-            first = sorted(places.get((baseline, scene), []))[: len(own)]
+            first = sorted(one.seed for one in places.get((baseline, scene), []))[: len(own)]
             if not set(own) >= set(first):
                 untested = f"it leaves out seeds of {baseline} on {scene}"
     return Question(
@@ -154,8 +156,8 @@ def _question(
         baseline=Arm("", baseline),
         metric=asked.metric,
         sign=sign,  # type: ignore[arg-type]
-        least=None if least is None else least.size,
-        relative=least is not None and least.relative,
+        least=least[0],
+        relative=least[1],
         digests={scene: (_digest(baseline), _digest(idea)) for scene in seeds},
         seeds=seeds,
         rule=DECLARED_TABLE if asked.methods else TABLE,
@@ -193,7 +195,7 @@ def _trials(frame: pd.DataFrame, metric: str, direction: int, name: str) -> list
         method, scene, seed = str(row[0]), str(row[1]), _seed(row[2])
         own = {key: column[number] for key, column in metrics.items()}
         trials.append(_trial(name, method, scene, seed, own, facts))
-    for place, same in group_by(trials, lambda one: (one.densify, one.scene, one.seed)).items():
+    for place, same in group_by(trials, "densify", "scene", "seed").items():
         if len(same) > 1:
             raise InputError(f"{place[0]}, {place[1]}, seed {place[2]} is twice in it")
     return trials

@@ -2,6 +2,7 @@
 
 import base64
 import io
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -149,41 +150,29 @@ def choose_views(pairs: Sequence[TrialPair]) -> tuple[list[ViewComparison], list
     A view's gain is the first arm's mean error minus the second arm's. Of each scene, one seed is
     used: the first whose pictures can be read.
     """
-    views: list[tuple[float, TrialPair, str]] = []
-    faults: dict[str, str] = {}  # by scene
-    scenes_read: set[str] = set()
-    for one, other in pairs:
-        if one.scene in scenes_read:
-            continue
+    gains: dict[str, list[tuple[float, str, str, TrialPair]]] = {}  # by scene
+    faults: dict[str, str] = {}
+    for pair in pairs:
+        scene = pair[0].scene
         try:
-            for view in view_names(one):
-                first, second, truth = read_compared(one, other, view)
-                gain = (
-                    absolute_error(first, truth=truth).mean()
-                    - absolute_error(second, truth=truth).mean()
-                )
-                views.append((float(gain), (one, other), view))
-            scenes_read.add(one.scene)
+            for view in () if scene in gains else view_names(pair[0]):
+                first, second, truth = read_compared(*pair, view)
+                errors = (absolute_error(image, truth).mean() for image in (first, second))
+                gain = float(next(errors) - next(errors))
+                gains.setdefault(scene, []).append((gain, pair[0].label, view, pair))
         except InputError as error:
-            faults.setdefault(one.scene, str(error))
-    return [
-        compare_view(which, pair, view) for which, pair, view in _worst_median_best(views)
-    ], list(faults.values())
-
-
-def _worst_median_best(
-    views: Sequence[tuple[float, TrialPair, str]],
-) -> list[tuple[str, TrialPair, str]]:
-    """From (gain, pair, view), those with the least, median and largest gain, each once."""
-    ordered = sorted(views, key=lambda view: (view[0], view[1][0].label, view[2]))
-    if len(ordered) < 2:
-        return [("the only view", pair, view) for _, pair, view in ordered]
-    places = {"least": 0, "median": len(ordered) // 2, "largest": -1}
-    if len(ordered) == 2:
-        del places["median"]
-    return [
-        (f"the view with the {word} gain", *ordered[place][1:]) for word, place in places.items()
+            gains.pop(scene, None)
+            faults.setdefault(scene, str(error))
+    ordered = sorted(itertools.chain(*gains.values()))
+    last = len(ordered) - 1
+    # of two views, the second is the one with the largest gain, and not the median
+    named = {0: "least", len(ordered) // 2: "median", last: "largest"} if ordered else {}
+    chosen = [
+        compare_view(f"the view with the {word} gain", pair, view)
+        for place, word in named.items()
+        for _, _, view, pair in [ordered[place]]
     ]
+    return chosen, list(faults.values())
 
 
 def compare_view(which: str, pair: TrialPair, view: str) -> ViewComparison:

@@ -64,28 +64,17 @@ SENTENCES: dict[str, str] = {
         "Unequal numbers of Gaussians: {arms:all} than {baseline}. To compare at equal ones: "
         "{advice}."
     ),
-    "limit not reached": (
-        "The limit of {limit:,} Gaussians (densify.max_gaussians) did not bind{scenes:if: on %}: "
-        "trials of {arms:all} ended with {largest:,} at most. So it makes no counts equal."
-    ),
     "no ingredient": "{arm} and {baseline} differ in no recorded setting.",
     "ingredients": "{arm} differs from {baseline} by {ingredients:all}{alone}.",
     "compared": "Compared: {pairs:n pair} of trials of one scene and seed.",
     # ---- the tuning of arms
-    "no tuning": (
-        "No tuning is recorded: each arm ran with one choice of settings. What was tried elsewhere "
-        "is not known."
-    ),
+    "no tuning": "No search is recorded. What was tried elsewhere is not known.",
     "unlike tuning": "They were not tuned alike: {arms:all}.",
     "vain search": "{arm}: the search {experiment} found nothing.",
     "search": (
         "{arm}: the best of {points:n point} by {metric} of validation views ({scenes:all}; seed "
         "{seeds:list}; the search {experiment}) is {chosen:all}. Tried: "
         "{tried:list}{more:if: and % more}.{others}"
-    ),
-    "varied": (
-        "{arm}: {choices:n choice} of settings and code ran here. They differ in {settings:all}, "
-        "and all were measured on the test views that the verdict uses."
     ),
     # ---- verdicts, and what was declared
     "same bits": (
@@ -112,17 +101,9 @@ SENTENCES: dict[str, str] = {
     "not available": "n/a, {reason}.",
     "no mean": "No mean over the scenes is shown, since they differ in conditions or code.",
     "unusable": "Left out ({count}): {folders:few}.",
-    "agreement": (
-        "Metrics agree with people only in part. Their rank correlation with viewers' scores of "
-        "3DGS models was {metrics:list} in one study (arXiv 2511.06830, table 3)."
-    ),
     # ---- trials: who made them, on what, and doubts
     "worthless": "{mark} {trial} is {what}{others}.",
     "passed over": "{text}.",
-    "filters": (
-        "Pictures of scene.images and of scene.downscale were made by different filters: results "
-        "on them differ by about 0.3 to 0.45 dB."
-    ),
     "few rounds": FEW_ROUNDS,
     "odd": "{scene} {init}: {doubt}.",
     "accepted": "{scene} {init}, accepted by scene.accept=[{rule}]: {doubt}.",

@@ -6,13 +6,13 @@ declaration and by the versions of an arm's code.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import field, replace
 
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.quantities import asked_quantity
 from gsbench.analysis.questions import Asked, choose_pairs, draft, level_of
-from gsbench.analysis.results import Experiment, TrialResult, group_by
+from gsbench.analysis.results import Experiment, TrialResult
 from gsbench.parsing import Amount, Count, Record
 from gsbench.runs.commands import ERROR_RATE, Digest, Question, code_in
 from gsbench.runs.experiments import Arm, unix_time
@@ -32,16 +32,14 @@ class _OldQuestion(Record):
     arm: Arm | None = None
     scenes: dict[str, tuple[str, str]] = field(default_factory=dict)
     seeds: tuple[Count, ...] = ()
-    about: str = ""
     name: str = ""
 
 
 class _OldDeclaration(Record):
     time: str
-    questions: tuple[_OldQuestion, ...] = ()
-    error_rate: Amount = ERROR_RATE
+    questions: tuple[_OldQuestion, ...]
     looks: tuple[Count, ...] = ()
-    trials: dict[str, tuple[Count, ...]] | None = None
+    trials: dict[str, tuple[Count, ...]] = field(default_factory=dict)
 
 
 def all_questions(experiment: Experiment) -> list[Question]:
@@ -59,24 +57,34 @@ def old_questions(experiment: Experiment) -> list[Question]:
     for declaration in declarations:
         for asked in declaration.questions:
             if asked.scenes:
-                own = [_named(asked, declaration, trials)]
+                share = ERROR_RATE / len(declaration.questions)
+                own = [replace(_named(asked, trials), looks=declaration.looks, level=share)]
             else:
-                own = _of_sweep(asked, declaration, trials)
+                own = _of_sweep(asked.metric, declaration, trials)
             for question in own:
                 found[question.baseline, question.idea, question.metric, question.name] = question
-    return [
-        replace(question, n=n, level=level_of(n, rate=question.level)).with_id(OLD)
-        for question in found.values()
-        for n in [_version(question, trials)]
-    ]
+    numbered = []
+    for question in found.values():
+        # the versions of the idea's code that were measured on the question's places
+        versions = {
+            code_in(trial.digest)
+            for trial in trials
+            if (trial.scene, trial.seed) in question.places
+            and f"{trial.init}-{trial.densify}" == question.idea.name
+        }
+        n = max(1, len(versions))
+        level = level_of(n, rate=question.level)
+        numbered.append(replace(question, n=n, level=level, rule=OLD).with_id(OLD))
+    return numbered
 
 
-def _named(
-    asked: _OldQuestion, declaration: _OldDeclaration, trials: Sequence[TrialResult]
-) -> Question:
+def _named(asked: _OldQuestion, trials: Sequence[TrialResult]) -> Question:
     """A question that names its trials, as of a file of claims or of planned looks."""
     of_key = {trial.key: trial for trial in trials}
-    digests = {key: trial.digest for key, trial in of_key.items()}
+
+    def digest(key: str) -> Digest:
+        return of_key[key].digest if key in of_key else key
+
     sides: list[Arm] = []
     for side, arm in enumerate((asked.baseline, asked.arm)):
         own = [of_key[both[side]].arm for both in asked.scenes.values() if both[side] in of_key]
@@ -88,33 +96,22 @@ def _named(
         sign=asked.sign,  # type: ignore[arg-type]
         least=asked.least,
         relative=asked.relative,
-        digests={
-            scene: (digests.get(one, one), digests.get(two, two))
-            for scene, (one, two) in asked.scenes.items()
-        },
+        digests={scene: (digest(one), digest(two)) for scene, (one, two) in asked.scenes.items()},
         seeds=dict.fromkeys(asked.scenes, asked.seeds),
-        looks=declaration.looks,
-        level=declaration.error_rate / len(declaration.questions),
-        rule=OLD,
         name=asked.name,
     )
 
 
 def _of_sweep(
-    asked: _OldQuestion, declaration: _OldDeclaration, trials: Sequence[TrialResult]
+    key: str, declaration: _OldDeclaration, trials: Sequence[TrialResult]
 ) -> list[Question]:
     """The questions of a sweep's metric about all compared arms."""
     planned = declaration.trials
-    own = [
-        trial
-        for trial in trials
-        if (planned is None or trial.seed in planned.get(trial.key, ()))
-        and asked.about in ("", trial.question)
-    ]
-    metric = asked_quantity(asked.metric, own)
+    own = [trial for trial in trials if trial.seed in planned.get(trial.key, ())]
+    metric = asked_quantity(key, own)
     if not (own and metric.direction):
         return []
-    terms = Asked(metric=asked.metric, sign=metric.direction, least=metric.worthwhile)
+    terms = Asked(metric=key, sign=metric.direction, least=metric.worthwhile)
     pairs = choose_pairs(own, terms)
     known, moment = {trial.arm for trial in own}, unix_time(declaration.time) or 0
     questions = []
@@ -123,48 +120,9 @@ def _of_sweep(
             continue
         question = draft(baseline, idea, own, terms)
         of_idea = [trial for trial in own if trial.arm == idea]
-        digests, seeds = dict(question.digests), dict(question.seeds)
-        if planned is not None:  # failed ones, too
-            seeds |= {one.scene: planned[one.key] for one in of_idea if one.scene in seeds}
-            digests, of_missing = _of_missing(question, planned, own)
-            seeds |= of_missing
+        # failed ones, too
+        seeds = {one.scene: planned[one.key] for one in of_idea if one.scene in question.seeds}
         late = min(trial.measured for trial in of_idea) < moment
-        question = replace(question, digests=digests, seeds=seeds, rule=OLD)
-        level, why = declaration.error_rate / len(pairs), LATE if late else ""
-        questions.append(replace(question, level=level, untested=why))
+        level, why = ERROR_RATE / len(pairs), LATE if late else ""
+        questions.append(replace(question, seeds=seeds, level=level, untested=why))
     return questions
-
-
-def _of_missing(
-    question: Question, planned: Mapping[str, tuple[int, ...]], trials: Sequence[TrialResult]
-) -> tuple[dict[str, tuple[Digest, Digest]], dict[str, tuple[int, ...]]]:
-    """The digests of a question, with the declared scenes of which an arm has no trial yet.
-
-    Returns also the seeds of these scenes. Without them a sweep would be decided by the scenes that
-    happen to be trained first. A declaration has keys of trials, not arms: arms that differ in
-    swept settings only have one name, and each of them lacks what one of them lacks.
-    """
-    measured = {(trial.scene, trial.arm): trial.digest for trial in trials}
-    keys = group_by([key for key in planned if key.count("/") == 2], lambda key: key.split("/")[0])
-    arms = question.baseline, question.idea
-    digests, seeds = dict(question.digests), {}
-    for scene in sorted(keys.keys() - question.seeds.keys()):
-        own = [[key for key in keys[scene] if key.split("/")[1] == arm.name] for arm in arms]
-        if all(own):
-            # a key stands for the digest of what is not trained yet
-            first, second = (
-                measured.get((scene, arm), of_arm[0]) for arm, of_arm in zip(arms, own, strict=True)
-            )
-            digests[scene], seeds[scene] = (first, second), planned[own[1][0]]
-    return digests, seeds
-
-
-def _version(question: Question, trials: Sequence[TrialResult]) -> int:
-    """The number of versions of the idea's code that were measured on the question's places."""
-    own = [
-        trial
-        for trial in trials
-        if f"{trial.init}-{trial.densify}" == question.idea.name
-        and trial.seed in question.seeds.get(trial.scene, ())
-    ]
-    return max(1, len({code_in(trial.digest) for trial in own}))

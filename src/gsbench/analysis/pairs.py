@@ -15,7 +15,7 @@ from gsbench.analysis.cells import check_averageable
 from gsbench.analysis.differences import differing_conditions
 from gsbench.analysis.notes import Note
 from gsbench.analysis.quantities import asked_quantity, value_of
-from gsbench.analysis.results import TrialPair, TrialResult, group_by
+from gsbench.analysis.results import TrialPair, TrialResult, group_by, trials_of
 from gsbench.errors import InputError
 from gsbench.runs.commands import Question
 from gsbench.runs.experiments import Arm
@@ -38,16 +38,6 @@ class ScenePairs:
     trials: tuple[TrialPair, ...]
     baseline: Array
     arm: Array
-
-    def subset(self, indices: Sequence[int]) -> ScenePairs:
-        chosen = list(indices)
-        return ScenePairs(
-            self.scene,
-            tuple(self.seeds[k] for k in chosen),
-            tuple(self.trials[k] for k in chosen),
-            self.baseline[chosen],
-            self.arm[chosen],
-        )
 
 
 @dataclass(frozen=True)
@@ -109,9 +99,12 @@ class Pairs:
 
     def first(self, seeds: int) -> Pairs:
         """The pairs of the first ``seeds`` seeds of every scene."""
-        return replace(
-            self, rows=tuple(row.subset(range(min(seeds, len(row.seeds)))) for row in self.rows)
+        parts = ("seeds", "trials", "baseline", "arm")
+        rows = (
+            replace(row, **{part: getattr(row, part)[:seeds] for part in parts})
+            for row in self.rows
         )
+        return replace(self, rows=tuple(rows))
 
 
 def pair(
@@ -150,23 +143,18 @@ def pair(
             rows.append(row)
         else:
             left_out.append(Note.of(SAME_CAPTURE, scene=scene, other=known))
-    if uneven := {
-        len(row.seeds) for row in rows if len(row.seeds) > min(len(row.seeds) for row in rows)
-    }:
-        least = min(len(row.seeds) for row in rows)
+    counts = [len(row.seeds) for row in rows] or [0]
+    if (least := min(counts)) < max(counts):
         few = [row.scene for row in rows if len(row.seeds) == least]
-        left_out.append(Note.of("uneven", least=least, scenes=few, most=max(uneven)))
+        left_out.append(Note.of("uneven", least=least, scenes=few, most=max(counts)))
     return Pairs(tuple(rows), tuple(left_out), question.relative)
 
 
 def pair_trials(trials: Sequence[TrialResult], baseline: Arm, arm: Arm) -> list[TrialPair]:
     """The pairs of trials of two arms, sorted by scene and seed, without regard to metrics."""
     pairs: list[TrialPair] = []
-    for scene, own in sorted(group_by(trials, lambda trial: trial.scene).items()):
-        sides = (
-            [trial for trial in own if trial.arm == baseline],
-            [trial for trial in own if trial.arm == arm],
-        )
+    for scene, own in sorted(group_by(trials, "scene").items()):
+        sides = trials_of(own, baseline), trials_of(own, arm)
         seeds = sorted({trial.seed for side in sides for trial in side})
         with suppress(InputError):  # the verdict on these arms reports it
             pairs += _match_seeds(scene, *sides, seeds).values()
@@ -189,11 +177,8 @@ def _match_seeds(
     for own in (baseline, arm):
         if own:
             check_averageable(own, f"scene={scene} {own[0].arm}")
-    baseline_by_seed, arm_by_seed = (
-        {trial.seed: trial for trial in own} for own in (baseline, arm)
-    )
-    shared = baseline_by_seed.keys() & arm_by_seed.keys()
-    pairs = {seed: (baseline_by_seed[seed], arm_by_seed[seed]) for seed in seeds if seed in shared}
+    one, other = ({trial.seed: trial for trial in own} for own in (baseline, arm))
+    pairs = {seed: (one[seed], other[seed]) for seed in seeds if seed in one and seed in other}
     if pairs:
         differing = differing_conditions([*baseline, *arm], code=code)
         if not budgets:

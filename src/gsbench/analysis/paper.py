@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import yaml
 
 from gsbench.analysis.cells import Cell, check_averageable, make_cell
-from gsbench.analysis.quantities import Quantity, choose_quantities, quantity
+from gsbench.analysis.quantities import choose_quantities, quantity
 from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.analysis.tables import build_table
@@ -32,27 +32,7 @@ PRINTED_NAMES = {"adc": "3DGS", "volumetric": "Ours", "sfm": "SfM", "dim": "DIM"
 # marks of measured cells beside printed numbers (`agreement`)
 ROUNDING, INTERVAL, DIFFERS = "=", "≈", "≠"
 
-FindPrinted = Callable[[str, Arm, str], "PrintedNumber | None"]  # by scene, arm and quantity
-
-
-@dataclass(frozen=True)
-class PrintedNumber:
-    """A printed number: ``range`` is half a unit of its last digit on both sides."""
-
-    text: str
-
-    @property
-    def value(self) -> float:
-        return float(self.text)
-
-    @property
-    def decimals(self) -> int:
-        return len(self.text.partition(".")[2])
-
-    @property
-    def range(self) -> tuple[float, float]:
-        half_unit = 0.5 * 10.0**-self.decimals
-        return self.value - half_unit, self.value + half_unit
+FindPrinted = Callable[[str, Arm, str], str | None]  # by scene, arm and quantity: a number as text
 
 
 @dataclass(frozen=True)
@@ -66,13 +46,10 @@ class PrintedTable:
     arms: Sequence[tuple[str, str]]
     scenes: Mapping[str, Sequence[Sequence[str]]]
 
-    def find(self, scene: str, init: str, densify: str, key: str) -> PrintedNumber | None:
-        """The number of an arm; None if it is not printed."""
-        for quantity_key, texts in zip(self.quantities, self.scenes.get(scene, ()), strict=False):
-            for arm, text in zip(self.arms, texts, strict=True):
-                if (quantity_key, *arm) == (key, init, densify):
-                    return PrintedNumber(text)
-        return None
+    def find(self, scene: str, init: str, densify: str, key: str) -> str | None:
+        """The number of an arm as text, whose digits tell its rounding; None if not printed."""
+        of_scene = dict(zip(self.quantities, self.scenes.get(scene, ()), strict=False))
+        return dict(zip(self.arms, of_scene.get(key, ()), strict=False)).get((init, densify))
 
 
 @dataclass(frozen=True)
@@ -113,11 +90,7 @@ def load_published(name: str = PAPER) -> Published:
     file = files("gsbench.analysis").joinpath(f"published/{name}.yaml")
     content = yaml.safe_load(file.read_text(encoding="utf-8"))
     tables = {
-        table: PrintedTable(
-            printed["quantities"],
-            [(init, densify) for init, densify in printed["arms"]],
-            printed["scenes"],
-        )
+        table: PrintedTable(**printed | {"arms": list(map(tuple, printed["arms"]))})
         for table, printed in content["tables"].items()
     }
     return Published(**content | {"tables": tables})
@@ -143,11 +116,10 @@ def paper_tables(
     """
     paper = load_published()
     printed = paper.tables[name]
-    arms = printed.arms
     trials = list(experiment.trials if trials is None else trials)
     inits = {trial.init for trial in trials}
     # the paper's initialiser -> ours
-    run_as = {of_paper: _run_as(of_paper, inits) for of_paper, _ in arms}
+    run_as = {of_paper: _run_as(of_paper, inits) for of_paper, _ in printed.arms}
     notes = []
     if name == "table1" and run_as["dim"] not in inits and len(inits) == 1:
         (run_as["dim"],) = inits
@@ -155,7 +127,7 @@ def paper_tables(
             f"Initial clouds from {run_as['dim']} replace the paper's DIM: the columns do not "
             "repeat its experiment."
         ]
-    shown = [(run_as[init], densify) for init, densify in arms]
+    shown = [(run_as[init], densify) for init, densify in printed.arms]
     trials = [trial for trial in trials if (trial.init, trial.densify) in shown]
     if not trials:
         needed = ", ".join(f"init={init} densify={densify}" for init, densify in shown)
@@ -185,14 +157,16 @@ def paper_tables(
     if left_out := [key for key in keys if key not in compared]:
         notes.append(f"Not compared, since the paper prints no such number: {', '.join(left_out)}.")
 
-    def find(scene: str, arm: Arm, key: str) -> PrintedNumber | None:
+    def find(scene: str, arm: Arm, key: str) -> str | None:
         return printed.find(scene, papers_init[arm.init], arm.densify, key)
 
     title = f"{title}, difference from the printed values"
-    return [
-        measured,
-        _differences(title, "paper", trials, scenes, compared, find, notes, paper.setup),
-    ]
+    below = " ".join(notes), _setup_words(paper)
+    return [measured, _differences(title, "paper", trials, scenes, compared, find, below)]
+
+
+def _setup_words(paper: Published) -> str:
+    return " ".join(f"The paper on {topic}: it {words}." for topic, words in paper.setup.items())
 
 
 def _run_as(init: str, inits: set[str]) -> str:
@@ -228,12 +202,13 @@ def published_table(trials: Sequence[TrialResult], name: str) -> Table:
             "orientation."
         )
 
-    def find(scene: str, arm: Arm, key: str) -> PrintedNumber | None:
+    def find(scene: str, arm: Arm, key: str) -> str | None:
         of_paper = printed.arms[0] if len(printed.arms) == 1 else (arm.init, arm.densify)
         return printed.find(scene, *of_paper, key)
 
+    below = " ".join(notes), _setup_words(paper)
     return _differences(
-        f"Difference from {name}", name, own, scenes, printed.quantities, find, notes, paper.setup
+        f"Difference from {name}", name, own, scenes, printed.quantities, find, below
     )
 
 
@@ -245,7 +220,6 @@ def _differences(
     keys: Sequence[str],
     find: FindPrinted,
     notes: Sequence[str],
-    setup: Mapping[str, str],
 ) -> Table:
     """A table with a row per scene and arm: the printed number, and measured minus printed."""
     shown = [quantity(key, trials) for key in keys]
@@ -253,52 +227,50 @@ def _differences(
     marks: Counter[str] = Counter()
     rows = []
     ordered = sorted(trials, key=lambda trial: scenes.index(trial.scene))
-    for (scene, arm), group in group_by(ordered, lambda trial: (trial.scene, trial.arm)).items():
+    for (scene, arm), group in group_by(ordered, "scene", "arm").items():
         check_averageable(group, f"scene={scene} init={arm.init} densify={arm.densify}")
         entries: list[TableEntry] = []
         for one in shown:
             cell, printed = make_cell(group, one, [scene], expected), find(scene, arm, one.key)
-            entries.append(TableEntry(printed.text if printed else ""))
-            entries.append(_difference(cell, printed, one, marks))
+            entry = TableEntry("—")
+            if printed and cell.mean is not None:
+                mark = agreement(cell, printed)
+                marks[mark] += 1
+                decimals = max(one.decimals, _decimals(printed))
+                change = signed(cell.mean - float(printed), f".{decimals}f")
+                entry = TableEntry(f"{change} {mark}", cell=cell)
+            entries += [TableEntry(printed or ""), entry]
         rows.append(Row((scene, arm.init, str(replace(arm, init=""))), tuple(entries)))
-    columns = []
-    for one in shown:
-        columns.append(Column(one.name, paper, (one.key, paper)))
-        columns.append(Column(one.name, "Δ", (one.key, "delta")))
-    setup_notes = [f"The paper on {topic}: it {words}." for topic, words in setup.items()]
+    columns = [
+        Column(one.name, heading, (one.key, key))
+        for one in shown
+        for heading, key in ((paper, paper), ("Δ", "delta"))
+    ]
     legend = (
         f"Δ is measured minus printed. Of {marks.total()} cells {marks[ROUNDING]} are within "
         f"rounding ({ROUNDING}), {marks[INTERVAL]} within our {CONFIDENCE:.0%} t interval of the "
         f"mean ({INTERVAL}), {marks[DIFFERS]} differ ({DIFFERS}). The paper prints no deviation, "
         "so the spread of its own trials is not taken into account; a single trial has no interval."
     )
-    headings = ("scene", "init", "densify")
-    below = legend, " ".join(notes), " ".join(setup_notes)
-    return Table(title, headings, tuple(columns), tuple(rows), tuple(filter(None, below)))
+    below = tuple(filter(None, (legend, *notes)))
+    return Table(title, ("scene", "init", "densify"), tuple(columns), tuple(rows), below)
 
 
-def _difference(
-    cell: Cell, printed: PrintedNumber | None, shown: Quantity, marks: Counter[str]
-) -> TableEntry:
-    """The measured minus the printed value with its mark; the mark is counted in ``marks``."""
-    if printed is None or cell.mean is None:
-        return TableEntry("—")
-    mark = agreement(cell, printed)
-    marks[mark] += 1
-    decimals = max(shown.decimals, printed.decimals)
-    return TableEntry(f"{signed(cell.mean - printed.value, f'.{decimals}f')} {mark}", cell=cell)
+def _decimals(printed: str) -> int:
+    return len(printed.partition(".")[2])
 
 
-def agreement(cell: Cell, printed: PrintedNumber) -> str:
+def agreement(cell: Cell, printed: str) -> str:
     """The mark of a measured cell: ``=``, ``≈`` or ``≠``.
 
-    ``=`` if its mean is in the printed number's range, ``≈`` if its interval overlaps the range,
-    else ``≠``. A single trial has no interval.
+    ``=`` if its mean is in the printed number's range, half a unit of its last digit on both sides;
+    ``≈`` if its interval overlaps the range, else ``≠``. A single trial has no interval.
     """
     from gsbench.analysis.statistics import StudentT  # here, since SciPy is slow to import
 
     assert cell.mean is not None
-    low, high = printed.range
+    value, half = float(printed), 0.5 * 10.0 ** -_decimals(printed)
+    low, high = value - half, value + half
     if low <= cell.mean <= high:
         return ROUNDING
     if cell.std is None:

@@ -80,12 +80,12 @@ def estimate_components(differences: Sequence[NDArray[np.float64]]) -> Component
     total, repeated = int(counts.sum()), [values for values in differences if len(values) > 1]
     if not repeated:
         raise InputError("planning needs pilot trials with at least two seeds of one scene")
-    squares = sum(float(((values - values.mean()) ** 2).sum()) for values in repeated)
+    squares = sum(values.var() * len(values) for values in repeated)
     within = math.sqrt(squares / (total - len(counts)))
     if len(counts) == 1:
         return Components(None, within, 1, total)
     means = np.array([values.mean() for values in differences])
-    overall = float(np.concatenate(list(differences)).mean())
+    overall = (counts * means).sum() / total
     # n_0 of unbalanced data
     pairs_per_scene = (total - float((counts**2).sum()) / total) / (len(counts) - 1)
     square = float((counts * (means - overall) ** 2).sum()) / (len(counts) - 1)
@@ -99,8 +99,8 @@ def estimate_components(differences: Sequence[NDArray[np.float64]]) -> Component
 def deviation_range(components: Components) -> tuple[float, float]:
     """The deviations between which that of trainings lies in `UNSURE` of such pilots."""
     degrees = components.trials - components.scenes
-    tails = (1 - (1 - UNSURE) / 2, (1 - UNSURE) / 2)
-    low, high = (math.sqrt(degrees / special.chdtri(degrees, 1 - tail)) for tail in tails)
+    ends = special.chdtri(degrees, [(1 - UNSURE) / 2, (1 + UNSURE) / 2])
+    low, high = map(float, np.sqrt(degrees / ends))
     return components.within * low, components.within * high
 
 
@@ -175,12 +175,10 @@ class Purpose:
     def power(self, design: Design, difference: float, noise: Components) -> float:
         """The chance that the command shows ``difference`` where pairs differ as in ``noise``."""
         deviation, shares = noise.within, noise.shares_of(design.scenes)
-        if deviation == 0:
-            return 1.0 if difference else 0.0
         if self.screen:
             first, then = replace(self, rate=self.screen, screen=0.0), replace(self, screen=0.0)
             return math.prod(test.power(design, difference, noise) for test in (first, then))
-        if not self.looks:
+        if not self.looks or deviation == 0:
             return power_of_mean(deviation, design, difference, self.rate, shares)
         shown = np.zeros(DRAWS, dtype=bool)
         open_ = ~shown
@@ -189,10 +187,9 @@ class Purpose:
             reach = region.limits(level) * error
             better = open_ & (size + mean > reach)
             shown |= better
-            ends = better | (size + mean < -reach)
+            open_ &= ~better & (size + mean >= -reach)
             if self.give_up:
-                ends |= mean + region.limits(2 * self.give_up) * error < 0
-            open_ &= ~ends
+                open_ &= mean + region.limits(2 * self.give_up) * error >= 0
         return float(shown.mean())
 
     def designs(self, difference: float, noise: Components) -> list[Design]:
@@ -271,9 +268,9 @@ class Plan:
             return [asdict(design) | {"trials": design.trials} for design in designs]
 
         like_these = None if self.like_these is None else listed(self.like_these)
-        components = asdict(self.components)
         return {
-            "pilot": {"pairs": components.pop("trials")} | components,
+            "pilot": {"pairs": self.components.trials}
+            | {key: value for key, value in asdict(self.components).items() if key != "trials"},
             "these_scenes": listed(self.these),
             "scenes_like_these": like_these,
             "share_of_pilots": UNSURE,

@@ -113,7 +113,7 @@ def relative_change(
 
 def _means(trials: Iterable[TrialResult], read: Reader) -> dict[str, float]:
     """The mean of a cost by scene."""
-    with_value = group_by([trial for trial in trials if read(trial)], lambda trial: trial.scene)
+    with_value = group_by([trial for trial in trials if read(trial)], "scene")
     return {scene: fmean(read(trial) or 0.0 for trial in own) for scene, own in with_value.items()}
 
 

@@ -30,7 +30,7 @@ from gsbench.errors import InputError
 from gsbench.runs.commands import Digest, History, Place, Question, code_in
 from gsbench.runs.config_hash import is_ignored, is_of_scene
 from gsbench.runs.experiments import Arm
-from gsbench.words import counted, least_text, some_of
+from gsbench.words import counted, some_of
 
 ORDINALS = ("first", "second", "third", "fourth", "fifth")
 LAST_LOOK = 0.6  # of a question's level
@@ -88,21 +88,10 @@ def count_tries(places: Collection[Place], earlier: Iterable[Collection[Place]])
     return found + 1
 
 
-@dataclass(frozen=True)
-class LeastEffect:
-    """The least effect that matters: a difference, or (``relative``) a fraction of the baseline."""
+def read_least(value: float | str, where: str) -> tuple[float, bool]:
+    """Read the least effect that matters: ``0.005``, or ``10%`` of the baseline's value.
 
-    size: float
-    relative: bool
-
-    def __str__(self) -> str:
-        return least_text(self.size, self.relative)
-
-
-def read_least(value: float | str, where: str) -> LeastEffect:
-    """Read ``0.005``, or ``10%`` of the baseline's value.
-
-    Raises InputError unless it is a number above 0.
+    The second value is True for such a part. Raises InputError unless it is a number above 0.
     """
     text = str(value).strip()
     relative = text.endswith("%")
@@ -115,7 +104,7 @@ def read_least(value: float | str, where: str) -> LeastEffect:
             f"{where} must be a number above 0, got {value!r}: give a difference such as 0.005, or "
             "10% (of the baseline's value)"
         )
-    return LeastEffect(size, relative)
+    return size, relative
 
 
 # ---- the trials of a command, and of earlier ones
@@ -190,7 +179,7 @@ class Asked:
     looks: tuple[int, ...] = ()
     shared: bool = False
     split: str = ""  # ask about trials with this rule of held-out views alone
-    named: tuple[tuple[NamedQuestion, int, LeastEffect | None], ...] = ()
+    named: tuple[tuple[NamedQuestion, int, tuple[float | None, bool]], ...] = ()
 
 
 def ask(
@@ -219,7 +208,7 @@ def _named_draft(
     number: int,
     named: NamedQuestion,
     sign: int,
-    least: LeastEffect | None,
+    least: tuple[float | None, bool],
     planned: Sequence[Trained],
     asked: Asked,
     measured: Sequence[Trained],
@@ -230,8 +219,8 @@ def _named_draft(
         question,
         metric=named.metric or asked.metric,
         sign=sign,  # type: ignore[arg-type]
-        least=None if least is None else least.size,
-        relative=least is not None and least.relative,
+        least=least[0],
+        relative=least[1],
         name=f"{named.idea}-{number}",
         says=named.says,
         where=named.where,

@@ -5,12 +5,14 @@ A trial's folder is ``<runs>/<experiment>/<scene>/<init>-<densify>/<hash8>-seed<
 tables over thousands of trials start quickly.
 """
 
+import itertools
 import math
 import re
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from operator import attrgetter
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from gsbench.analysis.trial_result import TrialResult as TrialResult
 from gsbench.analysis.trial_settings import Configurations, settings_text
@@ -50,11 +52,6 @@ class Unfinished:
     digest: Digest
     failed: bool = False
     running: bool = False
-
-    @classmethod
-    def of(cls, trial: TrialResult) -> "Unfinished":
-        """A finished trial that lacks what a question asks of it."""
-        return cls(trial.path, trial.digest, failed=True)
 
     @property
     def scene(self) -> str:
@@ -114,9 +111,13 @@ def trials_of(trials: Sequence[TrialResult], arm: Arm) -> list[TrialResult]:
     return [trial for trial in trials if trial.arm == arm]
 
 
-def group_by(items: Iterable[T], key: Callable[[T], K]) -> dict[K, list[T]]:
-    """The items grouped by ``key(item)``, in order of appearance."""
-    groups: dict[K, list[T]] = {}
+def group_by(items: Iterable[T], *by: str | Callable[[T], Any]) -> dict[Any, list[T]]:
+    """The items grouped in order of appearance, by attributes with these names or by ``by(item)``.
+
+    Several names give tuples of values as keys.
+    """
+    first, groups = by[0], dict[Any, list[T]]()
+    key = first if callable(first) else attrgetter(*map(str, by))
     for item in items:
         groups.setdefault(key(item), []).append(item)
     return groups
@@ -125,7 +126,7 @@ def group_by(items: Iterable[T], key: Callable[[T], K]) -> dict[K, list[T]]:
 def seeds_text(trials: Iterable[TrialResult]) -> str:
     """``seed 0`` or ``seeds 0, 1``"""
     seeds = sorted(trial.seed for trial in trials)
-    return f"{'seed' if len(seeds) == 1 else 'seeds'} {', '.join(map(str, seeds))}"
+    return f"seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds))}"
 
 
 def load_experiment(runs_dir: Path, name: str) -> Experiment:
@@ -161,13 +162,11 @@ def read_experiment(folder: Path) -> Experiment:
         except UnusableError as reason:
             faults[path] = one_line(str(reason))
     of_settings = _read_settings(trials, settings)
-    faults |= {
-        trial.path: f"damaged, {fault}" for trial in trials if (fault := of_settings.get(trial.key))
-    }
+    for trial in trials:
+        if fault := of_settings.get(trial.key):
+            faults[trial.path] = f"damaged, {fault}"
     usable = [trial for trial in trials if trial.path not in faults]
-    usable.sort(
-        key=lambda trial: (trial.scene, trial.init, trial.densify, trial.seed, trial.config_hash)
-    )
+    usable.sort(key=lambda one: (one.scene, one.init, one.densify, one.seed, one.config_hash))
     history = read_history(folder)
     warnings = sorted(f"{path.relative_to(runs_dir)}: {fault}" for path, fault in faults.items())
     return Experiment(
@@ -182,17 +181,15 @@ def read_experiment(folder: Path) -> Experiment:
 
 def _with_askers(trials: Sequence[TrialResult]) -> tuple[TrialResult, ...]:
     """The trials; those that share a training are asked by the questions of any of them."""
-    by_training: dict[str, list[str]] = {}
-    for trial in trials:
-        if training := trial.record.hashes.get("train"):
-            by_training.setdefault(training, []).extend(trial.record.questions)
-    found = []
-    for trial in trials:
-        questions = by_training.get(trial.record.hashes.get("train", ""), [])
-        if questions and not trial.record.questions:
-            trial = replace(trial, record=replace(trial.record, questions=questions))
-        found.append(trial)
-    return tuple(found)
+    by_training = group_by(trials, lambda trial: trial.record.hashes.get("train", trial.path))
+    found = {}
+    for own in by_training.values():
+        questions = list(itertools.chain(*(trial.record.questions for trial in own)))
+        for trial in own:
+            if questions and not trial.record.questions:
+                trial = replace(trial, record=replace(trial.record, questions=questions))
+            found[trial.path] = trial
+    return tuple(found[trial.path] for trial in trials)
 
 
 def _unfinished(
@@ -332,12 +329,9 @@ def _read_settings(trials: Sequence[TrialResult], settings: Configurations) -> d
     """
     faults: dict[str, str] = {}
     for of_arm in group_by(trials, lambda trial: trial.key.rpartition("/")[0]).values():
-        by_key = group_by(of_arm, lambda trial: trial.key)
-        if len(by_key) > 1:
-            faults |= {
-                key: settings.read(key, [trial.path for trial in same])
-                for key, same in by_key.items()
-            }
+        paths = group_by([(t.key, t.path) for t in of_arm], lambda pair: pair[0])
+        if len(paths) > 1:
+            faults |= {key: settings.read(key, [p for _, p in own]) for key, own in paths.items()}
     return faults
 
 
@@ -383,23 +377,20 @@ def read_trial(path: Path, runs_dir: Path, settings: Configurations) -> TrialRes
             )
     except FileNotFoundError:
         raise UnusableError(_why_unfinished(path)) from None
-    except UnfinishedError as error:
-        raise UnusableError(f"unfinished, {error.path.name} {error.reason}") from None
     except DamagedError as error:
-        raise UnusableError(f"damaged, {error.path.name} {error.reason}") from None
+        state = "unfinished" if isinstance(error, UnfinishedError) else "damaged"
+        raise UnusableError(f"{state}, {error.path.name} {error.reason}") from None
     except InputError as error:
         raise UnusableError(f"strange, {error}") from None
     match = TRIAL_FOLDER.fullmatch(path.name)
     if match is None:
         raise UnusableError(f"{FOREIGN}, the folder is not named <hash8>-seed<k>")
-    recorded = {
-        "experiment": record.experiment,
-        "scene": record.scene,
-        "arm": f"{record.init}-{record.densify}",
-    }
-    recorded["seed"] = str(record.seed)
     names = (path.relative_to(runs_dir).parts[0], *path.parts[-3:-1], match["seed"])
-    for (key, value), name in zip(recorded.items(), names, strict=True):
+    arm = f"{record.init}-{record.densify}"
+    recorded = record.experiment, record.scene, arm, str(record.seed)
+    for key, value, name in zip(
+        ("experiment", "scene", "arm", "seed"), recorded, names, strict=True
+    ):
         if value != name:
             raise UnusableError(f"{FOREIGN}, its {RESULTS} is of {key} {value!r}")
     return TrialResult(path, match["hash"], record, settings=settings)

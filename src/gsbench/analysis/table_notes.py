@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from gsbench.analysis.fairness import caveats, counts_notes, limit_notes
+from gsbench.analysis.fairness import caveats, counts_notes
 from gsbench.analysis.notes import Note
 from gsbench.analysis.results import TrialResult, group_by, seeds_text
 from gsbench.events import FEWEST_ROUNDS
@@ -37,7 +37,6 @@ HEAVIEST = (
     "worthless",
     "unusable",
     "unused",
-    "limit not reached",
     "unequal counts",
     "no partner",
     "same bits",
@@ -68,21 +67,21 @@ def trials_notes(comparison: Comparison, trials: Sequence[TrialResult]) -> list[
 
 def comparison_notes(comparison: Comparison) -> list[Note]:
     """Notes on the compared arms: remarks and caveats."""
-    by_arm = group_by(comparison.trials, lambda trial: trial.arm)
+    by_arm = group_by(comparison.trials, "arm")
     between = [
         note
         for first, second in comparison.pairs
         for note in caveats([*by_arm[first], *by_arm[second]], first, second)
     ]
     both = comparison.trials, comparison.pairs
-    return [*comparison.remarks, *limit_notes(*both), *counts_notes(*both), *between]
+    return [*comparison.remarks, *counts_notes(*both), *between]
 
 
 def doubt_notes(trials: Sequence[TrialResult]) -> list[Note]:
     """Notes on results that are worth little or may surprise.
 
-    They are about renders not better than one colour, executors that failed their proof, pictures
-    made by different filters, and what rules found odd (`gsbench.scene.rules`).
+    They are about renders not better than one colour, executors that failed their proof, and what
+    rules found odd (`gsbench.scene.rules`).
     """
     notes = []
     if worthless := [trial for trial in trials if trial.record.learnt_nothing]:
@@ -94,11 +93,6 @@ def doubt_notes(trials: Sequence[TrialResult]) -> list[Note]:
         )
     for trial in trials:
         notes += [Note.of("passed over", text=line) for line in trial.record.raster_passed_over]
-    known = [trial.config for trial in trials if trial.config]
-    folders = {config.get("scene.images") for config in known}
-    downscales = {config.get("scene.downscale") for config in known}
-    if len(folders) > 1 and len(downscales) > 1:
-        notes.append(Note.of("filters"))
     by_arm = group_by(trials, lambda trial: trial.key.partition("/")[2])  # of one schedule each
     notes += [note for own in by_arm.values() if (note := _rounds_note(own[0]))]
     for trial in trials:
@@ -153,7 +147,7 @@ def cloud_notes(trials: Sequence[TrialResult]) -> list[Note]:
         trials, lambda trial: (trial.scene, trial.init, trial.record.hashes.get("init"))
     )
     for (scene, init, _), group in groups.items():
-        clouds = group_by([trial for trial in group if trial.cloud], lambda trial: trial.cloud)
+        clouds = group_by([trial for trial in group if trial.cloud], "cloud")
         if len(clouds) > 1:
             made = [f"{cloud[:SHOWN]}: {_arms(own)}" for cloud, own in clouds.items()]
             notes.append(Note.of("clouds", scene=scene, init=init, clouds=len(clouds), trials=made))
@@ -165,7 +159,7 @@ def held_out_notes(trials: Sequence[TrialResult]) -> list[Note]:
     notes = []
     recorded = [trial for trial in trials if trial.record.held_out]
     several_scenes = len({trial.scene for trial in recorded}) > 1
-    splits = group_by(recorded, lambda trial: (trial.question, trial.record.held_out))
+    splits = group_by(recorded, "question", "record.held_out")
     for (question, rule), own in sorted(splits.items(), key=lambda item: (-len(item[1]), item[0])):
         counts = sorted(
             {(trial.record.test_views or 0, trial.record.train_views or 0) for trial in own}
@@ -196,5 +190,5 @@ def _points_from(trial: TrialResult) -> str:
 
 def _arms(trials: Sequence[TrialResult]) -> str:
     """``adc seeds 0, 1; volumetric seed 0``"""
-    groups = group_by(trials, lambda trial: trial.densify)
+    groups = group_by(trials, "densify")
     return "; ".join(f"{densify} {seeds_text(own)}" for densify, own in groups.items())

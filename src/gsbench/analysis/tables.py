@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
@@ -27,7 +26,6 @@ from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.analysis.table_notes import LEARNT_NOTHING, by_weight, trials_notes
 from gsbench.analysis.trial_settings import canonical
-from gsbench.eval.facts import find_metric
 from gsbench.words import counted
 
 if TYPE_CHECKING:
@@ -205,7 +203,6 @@ def _best(
 
     bold: set[Position] = set()
     for key, places in group_by(cells, rivals).items():
-        better = winners.get(key, set())
         merits = {
             place: direction[key[0]] * mean
             for place in places
@@ -213,7 +210,7 @@ def _best(
         }
         for place, merit in merits.items():
             own = {arms[trial.path] for trial in cells[place].trials}
-            if merit == max(merits.values()) and own <= better:
+            if merit == max(merits.values()) and own <= winners.get(key, set()):
                 bold.add(place)
     return bold
 
@@ -239,28 +236,22 @@ def _means(
     def trials(row: Labels, column: Labels, scene: str) -> Sequence[TrialResult]:
         return groups.get((*row[:scene_index], scene, *row[scene_index:], *column), [])
 
-    def shared(quantity: Quantity) -> list[str]:
-        """The scenes on which every arm has a value."""
-        left = list(scenes)
-        for row, column in itertools.product(mean_rows, column_labels):
-            for scene in list(left):
-                values = map(quantity.read, trials(row, column, scene))
-                if all(value is None for value in values):
-                    left.remove(scene)
-        return left
+    def have(scene: str, quantity: Quantity) -> bool:
+        return all(
+            any(quantity.read(trial) is not None for trial in trials(row, column, scene))
+            for row, column in itertools.product(mean_rows, column_labels)
+        )
 
-    shared_scenes = {quantity.key: shared(quantity) for quantity in quantities}
-    most_scenes = max(map(len, shared_scenes.values()))
-    if most_scenes == 0:
-        return {}
+    shared = {one.key: [scene for scene in scenes if have(scene, one)] for one in quantities}
+    most_scenes = max(map(len, shared.values()))
     label = f"mean of {counted(most_scenes, 'scene')}"
     cells: dict[Position, Cell] = {}
     for row, quantity, column in itertools.product(mean_rows, quantities, column_labels):
-        own_scenes = shared_scenes[quantity.key]
+        own_scenes = shared[quantity.key]
         averaged = list(itertools.chain(*(trials(row, column, scene) for scene in own_scenes)))
         labels = (*row[:scene_index], label, *row[scene_index:])
         cells[labels, column, quantity.key] = make_cell(averaged, quantity, own_scenes, expected)
-    return cells
+    return cells if most_scenes else {}
 
 
 def _have_unlike_scenes(trials: Sequence[TrialResult]) -> bool:
@@ -268,7 +259,7 @@ def _have_unlike_scenes(trials: Sequence[TrialResult]) -> bool:
 
     ``trials`` have their variants.
     """
-    by_arm = group_by(trials, lambda trial: trial.arm).values()
+    by_arm = group_by(trials, "arm").values()
     return any(conditions_between_scenes(of_arm) or differing_code(of_arm) for of_arm in by_arm)
 
 
@@ -286,18 +277,16 @@ def _reading_notes(
         "protocols": sorted({trial.record.protocol for trial in trials}),
         "bold": " Bold: the best mean, and shown to be better." if has_bold else "",
     }
-    notes = [
-        Note.of("one trial", **facts)
-        if expected == 1
-        else Note.of("mean", trials=expected, spread=spread, **facts)
-    ]
+    if expected == 1:
+        notes = [Note.of("one trial", **facts)]
+    else:
+        notes = [Note.of("mean", trials=expected, spread=spread, **facts)]
     if any(0 < cell.count < expected or not cell.trials for cell in cells.values()):
         notes.append(Note.of("few values", trials=expected))
     for one in quantities:
         own = [cell for position, cell in cells.items() if position[2] == one.key]
         reasons = {cell.reason for cell in own if cell.trials and cell.reason}
-        missing = [Note.of("not available", reason=reason) for reason in sorted(reasons)]
-        notes += [replace(note, about=one.name) for note in missing]
+        notes += [Note("not available", (("reason", why),), one.name) for why in sorted(reasons)]
     return notes
 
 
@@ -310,30 +299,3 @@ def _natural(key: Labels) -> tuple[tuple[int, float, str], ...]:
         except ValueError:
             parts.append((1, 0.0, text))
     return tuple(parts)
-
-
-# Spearman's rank correlation with viewers' scores of trained 3DGS models: Chen et al. 2025, MUGSQA
-# (arXiv 2511.06830), table 3, main set.
-AGREEMENT = {
-    "psnr": 0.52,
-    "ssim": 0.37,
-    "lpips_vgg": 0.41,
-    "lpips_alex": 0.44,
-    "ms_ssim": 0.64,
-    "fsim": 0.68,
-    "gmsd": 0.55,
-}
-
-
-def with_agreement(tables: Sequence[Table]) -> list[Table]:
-    """The tables; the first says how weakly its metrics agree with people, if that is known."""
-    shown = {column.key[0] for table in tables for column in table.columns}
-    found = [
-        f"{value} for {facts.label}"
-        for key, value in AGREEMENT.items()
-        if key in shown and (facts := find_metric(key))
-    ]
-    if not found:
-        return list(tables)
-    note = str(Note.of("agreement", metrics=found))
-    return [replace(tables[0], notes=(*tables[0].notes, note)), *tables[1:]]

@@ -9,8 +9,9 @@ share) / log(scenes), 0 if one scene has all variance and 1 if all have the same
 of noise (findings/simulations.md, "Thresholds"); it is tabulated in ``thresholds.npz``.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 
 import numpy as np
@@ -27,42 +28,33 @@ LEAST_P, MOST_P = 1e-12, 0.99  # the p between which thresholds are computed
 STEPS = 45  # of the bisection for p, which halve its relative error each
 
 
-@dataclass(frozen=True)
-class Table:
-    """f [S, K, L, Y] at these numbers of scenes and seeds, levels (falling) and evennesses."""
+@cache
+def table() -> Mapping[str, Array]:
+    """f [S, K, L, Y] at numbers of ``scenes`` and ``seeds``, ``levels`` (falling) and ``knots``.
 
-    scenes: Array
-    seeds: Array
-    levels: Array
-    knots: Array
-    f: Array
+    Knots are evennesses.
+    """
+    with np.load(TABLE) as file:
+        return {name: file[name].astype(np.float64) for name in file.files}
 
-    def curves(self, scenes: int, seeds: int) -> Array:
-        """f at the levels and knots [L, Y], interpolated between numbers of scenes and seeds.
 
-        Beyond the table its last row or column holds.
-        """
-        at = float(np.interp(np.log(scenes), np.log(self.scenes), np.arange(len(self.scenes))))
-        of_seeds = float(np.interp(seeds, self.seeds, np.arange(len(self.seeds))))
-        f = _between(self.f, at)
-        return _between(f, of_seeds)
+@cache
+def _curves(scenes: int, seeds: int) -> Array:
+    """f at the levels and knots [L, Y], interpolated between numbers of scenes and seeds.
+
+    Beyond the table its last row or column holds.
+    """
+    known = table()
+    f = known["f"]
+    for number, own in ((np.log(scenes), np.log(known["scenes"])), (seeds, known["seeds"])):
+        f = _between(f, float(np.interp(number, own, np.arange(len(own)))))
+    return f
 
 
 def _between(values: Array, place: float) -> Array:
     """The values at a place between two rows."""
     low = min(int(place), len(values) - 2)
     return np.asarray(values[low] + (place - low) * (values[low + 1] - values[low]))
-
-
-@cache
-def table() -> Table:
-    with np.load(TABLE) as file:
-        return Table(**{name: file[name].astype(np.float64) for name in file.files})
-
-
-@cache
-def _curves(scenes: int, seeds: int) -> Array:
-    return table().curves(scenes, seeds)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,33 +68,26 @@ class Region:
     seeds: int
     even: Array
 
-    def limits(self, level: float) -> Array:
-        """The thresholds [D] at a level."""
-        if self.scenes == 1:
-            return np.full(self.even.shape, self._student(level))
-        if level < LEAST_LEVEL:
-            return np.full(self.even.shape, self._student(level))
-        low, part = _place(level)
-        curves = _curves(self.scenes, self.seeds)
-        curve = curves[low] + part * (curves[low + 1] - curves[low])
-        f = np.interp(self.even, table().knots, curve)
+    @cached_property
+    def _f(self) -> Array:
+        """f at the levels of the table [L, D]."""
+        curves = _curves(self.scenes, self.seeds) * (self.scenes > 1)
+        return np.stack([np.interp(self.even, table()["knots"], curve) for curve in curves])
+
+    def limits(self, level: Array | float) -> Array:
+        """The thresholds [D] at a level, or at one for each mean."""
+        row, part = _place(level)
+        which = np.arange(len(self.even))
+        f = self._f[row, which] + part * (self._f[row + 1, which] - self._f[row, which])
+        f = np.where(np.less(level, LEAST_LEVEL), 0.0, f)
         return np.asarray(self._student(level) * np.exp(f * self._ratio(level)))
 
     def p_values(self, sizes: Array) -> Array:
         """The two-sided p [D] of means with these ``sizes`` [D] in standard errors."""
-        if self.scenes == 1:
-            return np.asarray(2 * special.stdtr(self.seeds - 1, -sizes))
-        curves = _curves(self.scenes, self.seeds)
-        f = np.stack([np.interp(self.even, table().knots, curve) for curve in curves])
-        which = np.arange(len(sizes))
         low, high = np.full(sizes.shape, np.log(LEAST_P)), np.zeros(sizes.shape)
         for _ in range(STEPS):
             middle = (low + high) / 2
-            level = np.exp(middle)
-            row, part = _place(level)
-            between = f[row, which] + part * (f[row + 1, which] - f[row, which])
-            between = np.where(level < LEAST_LEVEL, 0.0, between)
-            significant = sizes > self._student(level) * np.exp(between * self._ratio(level))
+            significant = sizes > self.limits(np.exp(middle))
             low, high = np.where(significant, low, middle), np.where(significant, middle, high)
         return np.exp(high)
 
@@ -111,13 +96,13 @@ class Region:
 
     def _ratio(self, level: Array | float) -> Array:
         """log(normal / Student's threshold); below the lowest level of the table, that of it."""
-        own = np.clip(level, table().levels[-1], MOST_P)
+        own = np.clip(level, table()["levels"][-1], MOST_P)
         return np.asarray(np.log(-special.ndtri(own / 2) / self._student(own)))
 
 
 def _place(level: Array | float) -> tuple[NDArray[np.int64], Array]:
     """Between which two levels of the table a level is: the first one's row, and how far."""
-    levels = table().levels
+    levels = table()["levels"]
     rows = np.arange(len(levels), dtype=np.float64)
     place = np.interp(-np.log(level), -np.log(levels), rows)
     low = np.minimum(place.astype(np.int64), len(levels) - 2)

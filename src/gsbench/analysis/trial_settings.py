@@ -20,12 +20,11 @@ class Configurations:
     """The settings that determine results, of all trials of an experiment.
 
     Each file is read once for all seeds. ``trial`` is the key that the seeds of a trial share
-    (`TrialResult.key`). ``known`` has, by this key, the settings of trials that have not run
-    and thus have no file.
+    (`TrialResult.key`).
     """
 
-    def __init__(self, known: Mapping[str, Mapping[str, Any]] | None = None) -> None:
-        self._known: dict[str, Mapping[str, Any]] = dict(known or {})
+    def __init__(self) -> None:
+        self._known: dict[str, Mapping[str, Any]] = {}
 
     def shared(self, trial: str, folder: Path) -> Mapping[str, Any]:
         """A trial's settings, read from ``folder`` or from an earlier seed; {} if unreadable."""

@@ -16,7 +16,7 @@ from gsbench.analysis.notes import Note
 from gsbench.analysis.pairs import SAME_CAPTURE, Pairs, are_equal, pair
 from gsbench.analysis.quantities import Quantity, asked_quantity
 from gsbench.analysis.questions import look_shares
-from gsbench.analysis.results import TrialResult, Unfinished, group_by, trials_of
+from gsbench.analysis.results import TrialResult, Unfinished
 from gsbench.analysis.statistics import (
     ALPHA,
     UNDECIDED,
@@ -52,17 +52,9 @@ NOT_TESTED: State = "not tested"
 NOT_ASKED: State = "not asked beforehand"
 
 
-@dataclass(frozen=True)
-class SceneEstimate:
-    """The mean paired difference of one scene, with its 95 % interval; it is not tested.
-
-    Without an interval if one arm lacks results, or with a single pair.
-    """
-
-    scene: str
-    mean: float
-    seeds: int
-    interval: Interval | None
+# a scene's mean paired difference, its seeds, and its 95 % interval, which is not tested; without
+# an interval if one arm lacks results, or with a single pair
+SceneRow = tuple[str, float, int, Interval | None]
 
 
 @dataclass(frozen=True)
@@ -87,7 +79,6 @@ class Verdict:
     outcome: Outcome = "undecided"
     test: StudentT | None = None
     like_these: LikeThese | None = None
-    scenes: tuple[SceneEstimate, ...] = ()
     done: int = 0
     final: bool = True
     untestable: Note | None = None
@@ -102,6 +93,18 @@ class Verdict:
     def wanted(self) -> int:
         """The number of the question's trials."""
         return self.question.trials
+
+    @property
+    def scenes(self) -> list[SceneRow]:
+        """The estimates of single scenes."""
+        lacking = {one.scene for one in self.lacking}
+        found: list[SceneRow] = []
+        for row, differences in zip(self.pairs.rows, self.pairs.differences, strict=True):
+            if len(differences):
+                test = None if row.scene in lacking else t_test(differences[None])
+                interval = None if test is None else test.interval(ALPHA)
+                found.append((row.scene, float(differences.mean()), len(differences), interval))
+        return found
 
     @property
     def least(self) -> float | None:
@@ -152,24 +155,6 @@ class Verdict:
         differences = self.pairs.differences
         return differences.size > 0 and not differences.any()
 
-    @property
-    def loss_excluded(self) -> bool:
-        """Return whether the interval excludes a loss of the least difference that matters."""
-        if self.interval is None or self.least is None:
-            return False
-        sign = self.question.sign
-        return min(sign * self.interval.low, sign * self.interval.high) > -self.least
-
-    def gain_excluded(self, error_rate: float) -> bool:
-        """Return whether a gain of the least difference that matters is excluded.
-
-        ``error_rate`` is the chance that such a gain is excluded although it is there.
-        """
-        if self.test is None or self.least is None:
-            return False
-        sign, interval = self.question.sign, self.test.interval(2 * error_rate)
-        return max(sign * interval.low, sign * interval.high) < self.least
-
     def shown(self, value: float) -> str:
         """A difference as text: ``−0.0123``, or ``+28.4 %`` if the question is relative."""
         if self.question.relative:
@@ -203,14 +188,12 @@ def judge(
     )
     if why := _untestable(verdict):
         others = tuple(note for note in verdict.notes if note != why)
-        return replace(verdict, untestable=why, notes=others, scenes=_scenes(verdict))
+        return replace(verdict, untestable=why, notes=others)
     if question.looks and verdict.state not in (NOT_TESTED, NOT_ASKED):
-        verdict = _at_looks(verdict)
-    elif verdict.state == ANSWERED:
-        verdict = _without_lacking(_decide(verdict), own, open_)
-    else:
-        verdict = replace(_measure(verdict), final=verdict.state in (NOT_TESTED, NOT_ASKED))
-    return replace(verdict, scenes=_scenes(verdict))
+        return _at_looks(verdict)
+    if verdict.state == ANSWERED:
+        return _without_lacking(_decide(verdict), own, open_)
+    return replace(_measure(verdict), final=verdict.state in (NOT_TESTED, NOT_ASKED))
 
 
 def _state(
@@ -262,13 +245,25 @@ def _at_looks(asked: Verdict) -> Verdict:
 
 def passes(verdict: Verdict) -> bool:
     """Return whether an undecided gate ends: its version is not worse by the least difference."""
-    return verdict.question.rule == GATE and verdict.outcome == UNDECIDED and verdict.loss_excluded
+    return verdict.question.rule == GATE and _excludes(verdict, -1, verdict.interval)
 
 
 def gives_up(verdict: Verdict) -> bool:
     """Return whether an undecided idea of a ledger ends: a gain is unlikely (`GIVE_UP`)."""
-    in_ledger = verdict.question.rule in (SCREENING, LOND) and verdict.outcome == UNDECIDED
-    return in_ledger and verdict.gain_excluded(GIVE_UP)
+    if verdict.test is None or verdict.question.rule not in (SCREENING, LOND):
+        return False
+    return _excludes(verdict, 1, verdict.test.interval(2 * GIVE_UP))
+
+
+def _excludes(verdict: Verdict, toward: int, interval: Interval | None) -> bool:
+    """Return whether an interval excludes a gain (``toward`` 1) or loss of the least that matters.
+
+    False unless the verdict is undecided.
+    """
+    if interval is None or verdict.least is None or verdict.outcome != UNDECIDED:
+        return False
+    side = verdict.question.sign * toward
+    return max(side * interval.low, side * interval.high) < verdict.least
 
 
 def _measure(verdict: Verdict) -> Verdict:
@@ -296,46 +291,30 @@ def _without_lacking(
 ) -> Verdict:
     """The verdict, undecided if it favours an arm that lacks results which the other arm has."""
     question, read = verdict.question, verdict.quantity.read
-    sides = {second for _, second in question.digests.values()}
+    ideas = {second for _, second in question.digests.values()}
     done: tuple[set[tuple[str, int]], set[tuple[str, int]]] = (set(), set())
+    missing = [(one, int(one.is_of(question, 1))) for one in unfinished]
     for trial in trials:
-        if read(trial) is not None:
-            done[trial.digest in sides].add((trial.scene, trial.seed))
-    valueless = [Unfinished.of(trial) for trial in trials if read(trial) is None]
+        side = int(trial.digest in ideas)
+        if read(trial) is None:
+            missing.append((Unfinished(trial.path, trial.digest, failed=True), side))
+        else:
+            done[side].add((trial.scene, trial.seed))
     lacking: tuple[list[Unfinished], list[Unfinished]] = ([], [])
-    for one in (*unfinished, *valueless):
-        side = int(one.is_of(question, 1))
+    for one, side in missing:
         if (one.scene, one.seed) in done[1 - side] - done[side]:
             lacking[side].append(one)
 
     def favours_lacking(outcome: Outcome) -> bool:
-        favoured_sides = favoured(outcome, question.sign, verdict.quantity.direction)
-        return any(lacking[side] for side in favoured_sides)
+        sides = favoured(outcome, question.sign, verdict.quantity.direction)
+        return any(lacking[side] for side in sides)
 
     like, favours = verdict.like_these, favours_lacking(verdict.outcome)
     if like is not None and favours_lacking(like.outcome):
         like = replace(like, outcome=UNDECIDED)
-    return replace(
-        verdict,
-        outcome=UNDECIDED if favours else verdict.outcome,
-        like_these=like,
-        lacking=(*lacking[0], *lacking[1]),
-        favours_lacking=favours,
-    )
-
-
-def _scenes(verdict: Verdict) -> tuple[SceneEstimate, ...]:
-    lacking = {one.scene for one in verdict.lacking}
-    found = []
-    for row, differences in zip(verdict.pairs.rows, verdict.pairs.differences, strict=True):
-        if not len(differences):
-            continue
-        test = None if row.scene in lacking else t_test(differences[None])
-        interval = None if test is None else test.interval(ALPHA)
-        found.append(
-            SceneEstimate(row.scene, float(differences.mean()), len(differences), interval)
-        )
-    return tuple(found)
+    outcome = UNDECIDED if favours else verdict.outcome
+    own = (*lacking[0], *lacking[1])
+    return replace(verdict, outcome=outcome, like_these=like, lacking=own, favours_lacking=favours)
 
 
 def find_outlying(pairs: Pairs) -> list[TrialResult]:
@@ -372,26 +351,22 @@ def interval_of(
     """Mean and 95 % interval of all trials of two arms in any metric; it is no verdict."""
     own = [trial for trial in trials if trial.arm in (baseline, idea)]
     quantity = asked_quantity(metric, own)
-    seeds = {
-        arm: {
-            scene: {trial.seed for trial in of_scene}
-            for scene, of_scene in group_by(trials_of(own, arm), lambda trial: trial.scene).items()
-        }
-        for arm in (baseline, idea)
-    }
-    scenes = [scene for scene in seeds[baseline] if scene in seeds[idea]]
+    first, second = (
+        {(trial.scene, trial.seed) for trial in own if trial.arm == arm} for arm in (baseline, idea)
+    )
+    seeds: dict[str, tuple[int, ...]] = {}
+    for scene, seed in sorted(first & second):
+        seeds[scene] = (*seeds.get(scene, ()), seed)
     question = Question(
         idea=idea,
         baseline=baseline,
         metric=metric,
         sign=quantity.direction,  # type: ignore[arg-type]
         least=quantity.worthwhile,
-        digests=dict.fromkeys(scenes, ("baseline", "idea")),
-        seeds={one: tuple(sorted(seeds[baseline][one] & seeds[idea][one])) for one in scenes},
+        digests=dict.fromkeys(seeds, ("baseline", "idea")),
+        seeds=seeds,
         untested=why or state,
     )
     pairs = pair(own, question, lambda trial: "idea" if trial.arm == idea else "baseline")
     notes = (*pairs.left_out, *between_scenes_notes(pairs.of_baseline, pairs.of_arm))
-    verdict = Verdict(question, quantity, pairs, state, ALPHA, done=len(own), notes=notes)
-    verdict = _measure(verdict)
-    return replace(verdict, scenes=_scenes(verdict))
+    return _measure(Verdict(question, quantity, pairs, state, ALPHA, done=len(own), notes=notes))

@@ -10,6 +10,7 @@ import os
 import sys
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 
 from gsbench.analysis.quantities import COSTS
 from gsbench.app.grids import planned_trials, run_sweep
@@ -24,6 +25,7 @@ from gsbench.eval.options import EvalConfig
 from gsbench.launch.batch import check_parts, missing_folders, need_no_check, run_batch
 from gsbench.launch.dry_run import describe_plan
 from gsbench.launch.outcomes import Outcome
+from gsbench.launch.record import forget_refused
 from gsbench.words import command, counted
 
 log = logging.getLogger(__name__)
@@ -48,6 +50,9 @@ def launch(argv: list[str]) -> int:
         ended = run_by_hydra(sweep, run_batch) or own_path(sweep)
     if not ended.trials:  # a sweep whose question is decided needs no trial
         return 0
+    if all(outcome.status == "failed" and outcome.bad_input for outcome in ended.outcomes):
+        with suppress(OSError):
+            forget_refused(ended.trials)
     return summarize(ended.outcomes, ended.trials)
 
 

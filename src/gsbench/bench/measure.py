@@ -3,8 +3,9 @@
 import itertools
 import statistics
 import time
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,9 @@ from gsbench.bench.scenes import SEED, make_scene
 from gsbench.densify import ADC
 from gsbench.errors import InputError
 from gsbench.gaussians.paper_values import RATES
-from gsbench.logs import Progress, progress
+from gsbench.logs import progress
 from gsbench.pipeline.parts import build_own_rasterizer
-from gsbench.raster import Rasterizer, create_rasterizer
+from gsbench.raster import create_rasterizer
 from gsbench.raster.executors import find_executor
 from gsbench.system.device import disable_tf32
 from gsbench.system.isolate import run_isolated
@@ -58,6 +59,10 @@ class Setting:
     ply: Path | None = None  # instead of ``scene`` and ``count``
     threads: int | None = None  # None: torch's default
 
+    @property
+    def size(self) -> str:
+        return f"{self.width}x{self.height}"
+
 
 class Stepper:
     """A training of ``setting`` with ``raster``, an executor's name or a class's import path."""
@@ -72,11 +77,14 @@ class Stepper:
             setting.scene, setting.width, setting.height, setting.count, setting.ply
         )
         self.count = len(gaussians)
+        own = None
+        if "." in raster:  # the user has typed the path of a class, and so trusts it
+            own = build_own_rasterizer({"_target_": raster}, [raster.partition(".")[0]])
         self.trainer = Trainer(
             scene,
             gaussians.map(lambda tensor: tensor.detach().to(self.device)),
             ADC(start=NEVER - 1, stop=NEVER, opacity_reset_interval=NEVER, max_gaussians=None),
-            make_rasterizer(raster, self.device, self.threads),
+            own or create_rasterizer(raster, self.device, self.threads),
             constant_scene_options(),
             SEED,
         )
@@ -118,11 +126,8 @@ class Stepper:
 
         A step has view, render, loss, backward pass, statistics and Adam. Losses are read at times.
         """
-        steps = STEPS_AT_ONCE[self.device.type]
         begin = self._now()
-        for _ in range(steps):
-            self.trainer.iterate(UNUSED_FOLDER)
-        self.trainer.losses.wait()
+        steps = self._iterate()
         return steps / (self._now() - begin)
 
     def frames_per_second(self) -> float:
@@ -136,14 +141,19 @@ class Stepper:
 
     def profiled_steps(self) -> dict[str, dict[str, float]]:
         """The kernels of whole training steps and the host's waits, as `per_step` has them."""
-        steps = STEPS_AT_ONCE[self.device.type]
         gpu = [ProfilerActivity.CUDA] if self.device.type == "cuda" else []
         self._now()
         with profile(activities=[ProfilerActivity.CPU, *gpu], acc_events=True) as profiler:
-            for _ in range(steps):
-                self.trainer.iterate(UNUSED_FOLDER)
-            self.trainer.losses.wait()
+            steps = self._iterate()
         return per_step(profiler.key_averages(), steps, self.device)
+
+    def _iterate(self) -> int:
+        """Make whole training steps, and return how many."""
+        steps = STEPS_AT_ONCE[self.device.type]
+        for _ in range(steps):
+            self.trainer.iterate(UNUSED_FOLDER)
+        self.trainer.losses.wait()
+        return steps
 
     def _now(self) -> float:
         if self.device.type == "cuda":
@@ -172,9 +182,9 @@ def per_step(
             waits_ms[event.key] = round(own_ms, 4)
         elif event.device_type.name == kind:
             times[event.key] = event.self_device_time_total / 1e3 / steps if on_gpu else own_ms
-    ordered = sorted(times.items(), key=lambda item: -item[1])
-    kernels = {name: round(value, 4) for name, value in ordered[:LONGEST_KERNELS]}
-    kernels["all others"] = round(sum(value for _, value in ordered[LONGEST_KERNELS:]), 4)
+    ordered = sorted(times, key=times.__getitem__, reverse=True)
+    kernels = {name: round(times.pop(name), 4) for name in ordered[:LONGEST_KERNELS]}
+    kernels["all others"] = round(sum(times.values()), 4)
     return {"kernels_ms": kernels, "waits": waits, "waits_ms": waits_ms}
 
 
@@ -190,19 +200,6 @@ def device_of(raster: str) -> torch.device:
     if device.type == "cuda" and not torch.cuda.is_available():
         raise InputError(f"raster={raster} runs on a CUDA device, and torch finds none here")
     return device
-
-
-def make_rasterizer(raster: str, device: torch.device, threads: int) -> Rasterizer:
-    """Make the executor called ``raster``, or the class at that import path.
-
-    The user has typed the path, and so trusts it.
-    """
-    own = (
-        build_own_rasterizer({"_target_": raster}, [raster.partition(".")[0]])
-        if "." in raster
-        else None
-    )
-    return create_rasterizer(raster, device, threads) if own is None else own
 
 
 def constant_scene_options() -> TrainConfig:
@@ -222,22 +219,16 @@ def peak_memory(raster: str, setting: Setting) -> float:
 
 
 def run_bench(
-    rasters: list[str],
-    sizes: list[tuple[int, int]],
-    counts: list[int],
-    *,
-    ply: Path | None = None,
+    rasters: Sequence[str],
+    settings: Iterable[Setting],
     repeats: int = 5,
-    threads: int | None = None,
     memory: bool = True,
-    scene: str = "trained",
     kernels: bool = False,
 ) -> list[dict[str, Any]]:
-    """Time the training step with each of ``rasters`` for each size and count.
+    """Time the training step with each of ``rasters`` in each of ``settings``.
 
-    A size is (width, height), a count is that of Gaussians. The rasterizers take turns, step by
-    step. Times are medians over ``repeats``, in ms. With ``ply``, that model is timed instead of
-    ``counts``. Raises InputError for a rasterizer that cannot run here. Columns:
+    The rasterizers take turns, step by step. Times are medians over ``repeats``, in ms. Raises
+    InputError for a rasterizer that cannot run here. Columns:
 
     - ``step_ms``: a whole step, as a training makes it;
     - ``forward_ms`` (render), ``loss_ms``, ``backward_ms`` (of loss and render) and ``adam_ms``:
@@ -253,56 +244,49 @@ def run_bench(
     """
     rows = []
     with progress("bench") as report:
-        for width, height in sizes:
-            for count in counts if ply is None else [0]:
-                setting = Setting(scene, width, height, count, ply, threads)
-                rows += _compare(rasters, setting, repeats, memory, kernels, report)
+        for setting in settings:
+            model = f"{setting.count:,} Gaussians" if setting.ply is None else setting.ply.name
+            say = partial(report, f"{setting.size}, {model}")
+            own = _compare(rasters, setting, repeats, kernels, say)
+            if memory:
+                for row in own:
+                    say(len(own), len(own), f"memory of {row['raster']}")
+                    task = f"measuring the memory of raster={row['raster']}"
+                    row["peak_memory_mb"] = run_isolated(
+                        peak_memory, row["raster"], setting, what=task
+                    )
+            rows += own
     return rows
 
 
 def _compare(
-    rasters: list[str],
+    rasters: Sequence[str],
     setting: Setting,
     repeats: int,
-    memory: bool,
     kernels: bool,
-    report: Progress,
+    say: Callable[[int, int, str], None],
 ) -> list[dict[str, Any]]:
-    model = f"{setting.count:,} Gaussians" if setting.ply is None else setting.ply.name
-    what, turns = f"{setting.width}x{setting.height}, {model}", WARM_UP_STEPS + repeats
+    """The rows of one setting, without the memory."""
     steppers = {raster: Stepper(raster, setting) for raster in rasters}
     samples: dict[str, list[dict[str, float]]] = {raster: [] for raster in rasters}
-    for repeat in range(turns):
+    for turn in range(WARM_UP_STEPS + repeats):
         for raster, stepper in steppers.items():
-            report(what, repeat, turns, raster)
+            say(turn, WARM_UP_STEPS + repeats, raster)
             sample = stepper.step()
-            sample |= {
-                "steps_per_second": stepper.steps_per_second(),
-                "fps": stepper.frames_per_second(),
-            }
-            if repeat >= WARM_UP_STEPS:
-                samples[raster].append(sample)
+            samples[raster].append(sample)
+            sample["step_ratio"] = sample["step_ms"] / samples[rasters[0]][turn]["step_ms"]
+            sample["steps_per_second"] = stepper.steps_per_second()
+            sample["fps"] = stepper.frames_per_second()
     rows = []
     for raster, stepper in steppers.items():
-        for own, first in zip(samples[raster], samples[rasters[0]], strict=True):
-            own["step_ratio"] = own["step_ms"] / first["step_ms"]
+        counted = samples[raster][WARM_UP_STEPS:]
         row: dict[str, Any] = {
             "raster": raster,
-            "scene": setting.scene if setting.ply is None else str(setting.ply),
-            "size": f"{setting.width}x{setting.height}",
+            "scene": str(setting.ply or setting.scene),
+            "size": setting.size,
             "count": stepper.count,
         }
-        row |= {
-            key: round(statistics.median(s[key] for s in samples[raster]), 3)
-            for key in samples[raster][0]
-        }
+        row |= {key: round(statistics.median(s[key] for s in counted), 3) for key in counted[0]}
         row |= {"threads": stepper.threads, "device": stepper.device.type, "peak_memory_mb": None}
         rows.append(row | (stepper.profiled_steps() if kernels else {}))
-    del steppers, stepper  # frees memory for the processes below
-    if memory:
-        setting = replace(setting, ply=setting.ply and setting.ply.absolute())
-        for row in rows:
-            report(f"{what}, memory", len(rows), len(rows), row["raster"])
-            task = f"measuring the memory of raster={row['raster']}"
-            row["peak_memory_mb"] = run_isolated(peak_memory, row["raster"], setting, what=task)
     return rows

@@ -7,7 +7,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsbench.errors import InputError
 from gsbench.gaussians.model import NUM_SH_REST, Gaussians
 from gsbench.gaussians.ply import read_ply
 from gsbench.scene.types import Camera, Scene, View
@@ -26,9 +25,6 @@ SIGMA_SPREAD = 0.7  # standard deviation of log sigma
 SPOTS, SPOT_SHARE, SPOT_RADIUS = 40, 0.5, 0.05
 # Crowded scene: share of Gaussians over one tile, and its side in units of the field of view's.
 CROWD_SHARE, CROWD_SIDE = 0.05, 0.007
-BOX_DEPTH, BOX_SIDE = 4.0, 4.0  # random scene: depth of its centre, and side
-NEIGHBOUR = 0.7  # distance to the nearest neighbours in units of count^-1/3, approximately
-INITIAL_OPACITY = 0.1  # 3DGS
 
 
 def trained_like_gaussians(count: int, seed: int = SEED) -> Gaussians:
@@ -37,7 +33,7 @@ def trained_like_gaussians(count: int, seed: int = SEED) -> Gaussians:
     Many are small and flat, a few are large, and opacities vary. They fill the view of
     `frontal_camera` and a margin around it.
     """
-    generator = _generator(count, seed)
+    generator = torch.Generator().manual_seed(seed)
     depth = FIRST_DEPTH * (torch.rand(count, generator=generator) * math.log(DEPTH_RATIO)).exp()
     fields = torch.tensor([1.4, 1.05])
     slopes = (torch.rand(count, 2, generator=generator) - 0.5) * fields  # [N, 2] x/z, y/z
@@ -55,25 +51,6 @@ def trained_like_gaussians(count: int, seed: int = SEED) -> Gaussians:
     )
 
 
-def random_gaussians(count: int, seed: int = SEED) -> Gaussians:
-    """Make ``count`` Gaussians like those at the start of a training.
-
-    They are faint spheres of equal size in a box in front of `frontal_camera`. Their size is the
-    distance to their neighbours.
-    """
-    generator = _generator(count, seed)
-    means = BOX_SIDE * (torch.rand(count, 3, generator=generator) - 0.5)
-    means[:, 2] += BOX_DEPTH
-    return Gaussians(
-        means=means,
-        log_scales=torch.full((count, 3), math.log(NEIGHBOUR * BOX_SIDE * count ** (-1 / 3))),
-        quaternions=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
-        opacity_logits=torch.full((count,), math.log(INITIAL_OPACITY / (1 - INITIAL_OPACITY))),
-        sh_dc=torch.randn(count, 3, generator=generator),
-        sh_rest=torch.zeros(count, NUM_SH_REST, 3),
-    )
-
-
 def skewed_gaussians(count: int, seed: int = SEED) -> Gaussians:
     """Make `trained_like_gaussians`, but move half of them to a few spots of the image.
 
@@ -81,7 +58,7 @@ def skewed_gaussians(count: int, seed: int = SEED) -> Gaussians:
     nine times the mean; without the spots it is 1.3 times the mean.
     """
     gaussians = trained_like_gaussians(count, seed)
-    generator = _generator(count, seed + 1)
+    generator = torch.Generator().manual_seed(seed + 1)
     weights = 1 / torch.arange(1, SPOTS + 1)  # Zipf's
     fields = torch.tensor([1.0, 0.7])
     spots = (torch.rand(SPOTS, 2, generator=generator) - 0.5) * fields  # [S, 2] x/z, y/z
@@ -110,7 +87,6 @@ def crowded_gaussians(count: int, seed: int = SEED) -> Gaussians:
 
 SCENES = {
     "trained": trained_like_gaussians,
-    "random": random_gaussians,
     "skewed": skewed_gaussians,
     "crowded": crowded_gaussians,
 }
@@ -126,10 +102,8 @@ def make_scene(
     if ply is not None:
         gaussians = read_ply(ply)
         camera = camera_before(gaussians, width, height)
-    elif kind in SCENES:
-        gaussians, camera = SCENES[kind](count), frontal_camera(width, height)
     else:
-        raise InputError(f"--scene {kind} is not known; choose {' or '.join(SCENES)}")
+        gaussians, camera = SCENES[kind](count), frontal_camera(width, height)
     noise = np.random.default_rng(SEED)
     images = [noise.integers(0, 256, (height, width, 3), dtype=np.uint8) for _ in range(VIEWS)]
     return gaussians, Scene(
@@ -137,9 +111,14 @@ def make_scene(
     )
 
 
-def frontal_camera(width: int, height: int) -> Camera:
-    """A camera at the origin that looks along z."""
-    return _along_z(width, height, np.zeros(3))
+def frontal_camera(
+    width: int, height: int, translation: tuple[float, ...] | np.ndarray = (0.0, 0.0, 0.0)
+) -> Camera:
+    """A camera that looks along z, by default at the origin."""
+    focal = FOCAL * width
+    return Camera(
+        width, height, focal, focal, width / 2, height / 2, np.eye(3), np.array(translation)
+    )
 
 
 def camera_before(scene: Gaussians, width: int, height: int) -> Camera:
@@ -149,15 +128,5 @@ def camera_before(scene: Gaussians, width: int, height: int) -> Camera:
     """
     center: Tensor = scene.means.median(0).values  # [3]
     distance = (scene.means - center).norm(dim=-1).median().item()
-    return _along_z(width, height, -center.double().numpy() + np.array([0.0, 0.0, 2 * distance]))
-
-
-def _along_z(width: int, height: int, translation: np.ndarray) -> Camera:
-    focal = FOCAL * width
-    return Camera(width, height, focal, focal, width / 2, height / 2, np.eye(3), translation)
-
-
-def _generator(count: int, seed: int) -> torch.Generator:
-    if count < 1:
-        raise InputError(f"count must be at least 1, got {count}")
-    return torch.Generator().manual_seed(seed)
+    translation = np.array([0.0, 0.0, 2 * distance]) - center.double().numpy()
+    return frontal_camera(width, height, translation)

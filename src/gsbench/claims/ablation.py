@@ -6,13 +6,14 @@ switch may have no effect while another is off (the scales of children if nothin
 that differ only in such switches are trained once.
 """
 
-import itertools
 from collections.abc import Mapping, Sequence
+from graphlib import CycleError, TopologicalSorter
+from itertools import chain, combinations
 from typing import Any
 
 from gsbench.errors import InputError
 from gsbench.settings import Switch, check_values
-from gsbench.words import did_you_mean, listed
+from gsbench.words import did_you_mean
 
 MAX_SWITCHES = 8
 
@@ -88,18 +89,15 @@ def runs_to_train(switches: Mapping[str, Switch]) -> list[Run]:
 
     Raises InputError if switches depend on each other.
     """
-    for name in switches:
-        chain, outer = [name], switches[name].within
-        while outer in switches:
-            if outer in chain:
-                raise InputError(
-                    f"the switches {', '.join(chain)} form a circle: each is within the next"
-                )
-            chain, outer = [*chain, outer], switches[outer].within
-    runs: set[Run] = set()
-    for size in range(len(switches) + 1):
-        combinations = map(Run, itertools.combinations(switches, size))
-        runs |= {effective_run(run, switches) for run in combinations}
+    try:
+        TopologicalSorter({name: [one.within] for name, one in switches.items()}).prepare()
+    except CycleError as error:
+        raise InputError(
+            f"the switches {', '.join(error.args[1][1:])} form a circle: each is within the next"
+        ) from None
+    sizes = range(len(switches) + 1)
+    on = chain.from_iterable(combinations(switches, size) for size in sizes)
+    runs = {effective_run(Run(one), switches) for one in on}
     return sorted(runs, key=lambda run: (-len(run), sorted(run)))
 
 
@@ -110,9 +108,3 @@ def off_settings(run: Run, switches: Mapping[str, Switch]) -> dict[str, Any]:
         if name not in run:
             settings |= switch.off
     return settings
-
-
-def run_name(run: Run, switches: Sequence[str]) -> str:
-    """``without shrink``; ``with all of them`` if all switches are on."""
-    off = [name for name in switches if name not in run]
-    return f"without {listed(off)}" if off else "with all of them"

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from gsbench.analysis.results import Experiment, newest_code, read_experiment, read_views
-from gsbench.claims.old_archive import NOT_AN_ARCHIVE, as_files
+from gsbench.claims.old_archive import as_files
 from gsbench.errors import InputError
 from gsbench.parsing import read_typed
 from gsbench.runs.experiments import TuningRecord
@@ -42,6 +42,17 @@ from gsbench.runs.layout import (
 from gsbench.settings import ARM_BYTES, is_folder_name
 from gsbench.words import readable_bytes
 
+# errors of contents that no gsbench wrote
+NOT_AN_ARCHIVE = (KeyError, TypeError, ValueError, AttributeError, RecursionError)
+BAD_ZIP = (
+    OSError,
+    zipfile.BadZipFile,
+    zlib.error,
+    LZMAError,
+    EOFError,
+    NotImplementedError,
+    RuntimeError,
+)
 FORMAT, VERSION, FIRST_VERSION = "gsbench results", 2, 1
 MANIFEST = "archive.json"
 PICTURES = (RENDERS, GROUND_TRUTH)
@@ -115,10 +126,8 @@ def _checked(home: Path) -> Experiment:
 
 def _check_configuration(config: Mapping[str, Any], results: Mapping[str, Any]) -> None:
     """Raise InputError if a trial's configuration contradicts its results."""
-    names = {"seed": config.get("seed")} | {
-        group: config[f"{group}.name"] for group in NAMED_GROUPS if f"{group}.name" in config
-    }
-    for key, value in names.items():
+    for key in ("seed", *NAMED_GROUPS):
+        value = config.get(key if key == "seed" else f"{key}.name", results[key])
         if value != results[key]:
             raise InputError(
                 f"its configuration says {key} {value}, its results {results[key]}: export it again"
@@ -127,30 +136,19 @@ def _check_configuration(config: Mapping[str, Any], results: Mapping[str, Any]) 
 
 def _read(file: Path) -> tuple[str, dict[str, bytes]]:
     """The experiment's name, and its files by their places in a runs folder."""
-    # reading a pipe or a device may never end
-    if file.exists() and not (file.is_file() or file.is_dir()):
-        raise InputError("it is not a regular file: give an archive")
+    if not file.is_file():  # reading a pipe or a device may never end
+        raise InputError(
+            "it is not a regular file: give an archive" if file.exists() else "no such file"
+        )
     try:
         with zipfile.ZipFile(file) as archive:
             manifest = json.loads(_member(archive, MANIFEST))
             _check_manifest(manifest)
             check_size(sum(info.file_size for info in archive.infolist()))
             contents = {str(name): _member(archive, str(name)) for name in manifest["sha256"]}
-    except FileNotFoundError:
-        raise InputError("no such file") from None
-    except IsADirectoryError:
-        raise InputError("it is a folder: give an archive") from None
     except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"its {MANIFEST} is not JSON ({error})") from None
-    except (
-        OSError,
-        zipfile.BadZipFile,
-        zlib.error,
-        LZMAError,
-        EOFError,
-        NotImplementedError,
-        RuntimeError,
-    ) as error:
+    except BAD_ZIP as error:
         raise InputError(
             f"it is not a complete zip archive ({error}): fetch or export it again"
         ) from None

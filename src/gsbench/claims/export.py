@@ -10,11 +10,11 @@ import json
 import re
 import time
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path, PurePath
-from typing import Any
+from typing import Any, TypeVar
 
 import yaml
 
@@ -37,8 +37,7 @@ from gsbench.claims.archive import (
 from gsbench.errors import InputError
 from gsbench.files import atomic
 from gsbench.parsing import read_bytes, read_typed, read_yaml
-from gsbench.runs.commands import Command, read_lines
-from gsbench.runs.commands import chained as chained_commands
+from gsbench.runs.commands import Command, Idea, PlannedTrial, chained, read_lines
 from gsbench.runs.experiments import STAMP, TuningRecord
 from gsbench.runs.layout import (
     COMMANDS,
@@ -59,6 +58,7 @@ FIXED_DATE = (1980, 1, 1, 0, 0, 0)
 PRIVATE = ("runs", "tracking")  # settings that only name the user's folders and servers
 PASSWORD = re.compile(r"(?<=://)[^/@\s]*@")  # user and password in a URL
 FOLDERS = re.compile(r"(?<=:)///+\S*/")  # folders in a file's URL, such as sqlite:////home/me/a.db
+Worded = TypeVar("Worded", Command, Idea, PlannedTrial)
 ITEM = re.compile(r"[^=,\[\]{}'\"]+")  # one value in a word such as scene=[a,b]
 
 
@@ -145,15 +145,12 @@ def _of_unfinished(path: Path) -> dict[str, bytes]:
 
 def _of_experiment(home: Path) -> dict[str, bytes]:
     """The experiment's own records."""
-    shared: dict[str, Callable[[Path], bytes]] = {
-        COMMANDS: _shared_commands,
-        DECLARED: lambda home: read_bytes(home / DECLARED),
-    }
-    return {
-        f"{home.name}/{name}": share(home)
-        for name, share in shared.items()
-        if (home / name).is_file()
-    }
+    files = {}
+    if (home / COMMANDS).is_file():
+        files[f"{home.name}/{COMMANDS}"] = _shared_commands(home)
+    if (home / DECLARED).is_file():
+        files[f"{home.name}/{DECLARED}"] = read_bytes(home / DECLARED)
+    return files
 
 
 def _searches(home: Path, trials: Sequence[TrialResult]) -> dict[str, bytes]:
@@ -176,17 +173,15 @@ def _shared_commands(home: Path) -> bytes:
     lines = []
     for line in read_lines(home):
         if isinstance(line, Command):
-            trials = {
-                name: replace(trial, words=tuple(without_private_words(trial.words)))
-                for name, trial in line.trials.items()
-            }
-            words = tuple(without_private_words(line.words))
-            line = replace(line, words=words, cwd="", trials=trials)
-            if line.idea:
-                shared = tuple(without_private_words(line.idea.words))
-                line = replace(line, idea=replace(line.idea, words=shared))
+            own = {name: _shared(trial) for name, trial in line.trials.items()}
+            idea = line.idea and _shared(line.idea)
+            line = replace(_shared(line), cwd="", trials=own, idea=idea)
         lines.append(line)
-    return chained_commands(lines).encode()
+    return chained(lines).encode()
+
+
+def _shared(entry: Worded) -> Worded:
+    return replace(entry, words=tuple(without_private_words(entry.words)))
 
 
 def without_private_words(words: Sequence[str]) -> list[str]:

@@ -7,11 +7,11 @@ to matter, or if it is shown not to be worse by the least difference that matter
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 from gsbench.analysis.notes import Note
 from gsbench.analysis.quantities import COSTS, NO_DIRECTION
-from gsbench.analysis.questions import FIRST_LOOK, LeastEffect, plan_looks, read_least
+from gsbench.analysis.questions import FIRST_LOOK, plan_looks, read_least
 from gsbench.analysis.results import Arm, TrialResult
 from gsbench.analysis.sentences import in_words, reason, with_notes
 from gsbench.analysis.statistics import REFUTED, SUPPORTED, TOO_SMALL
@@ -63,9 +63,9 @@ def declare_gate(
     names = list(scenes)
     return Question(
         metric=metric,
-        sign=1 if sign > 0 else -1,
-        least=size.size,
-        relative=size.relative,
+        sign=sign,
+        least=size[0],
+        relative=size[1],
         baseline=Arm("", BASELINE),
         idea=Arm("", NEW),
         digests=dict.fromkeys(names, (BASELINE, NEW)),
@@ -79,7 +79,7 @@ def declare_gate(
 
 def asked_difference(
     metric: str, least: str | None, values: Mapping[str, Any]
-) -> tuple[int, LeastEffect]:
+) -> tuple[Literal[-1, 1], tuple[float, bool]]:
     """The direction of ``metric`` (1: more is better) and the least difference that matters.
 
     ``least`` is text such as ``0.1`` or ``10%``; None takes the metric's usual least difference.
@@ -103,9 +103,9 @@ def asked_difference(
             f"{metric} has no usual least difference that matters: give --least, such as 0.1 or 10%"
         )
     size = read_least(str(usual) if least is None else least, "--least")
-    if metric in COSTS and not size.relative:
-        raise InputError(f"--least of {metric} must be a part, such as 10%, got {size}")
-    return sign, size
+    if metric in COSTS and not size[1]:
+        raise InputError(f"--least of {metric} must be a part, such as 10%, got {size[0]:g}")
+    return (1 if sign > 0 else -1), size
 
 
 def result_of(verdict: Verdict) -> str:
@@ -127,15 +127,17 @@ def describe(verdict: Verdict) -> str:
 
 def deviations(baseline: Sequence[TrialResult], new: Sequence[TrialResult]) -> list[Note]:
     """A note for each difference of machine or libraries between the two versions' trials."""
-    machine = ""  # beside the names of libraries, and sorted before them
-    sides = [
-        [{machine: trial.machine or "not recorded"} | trial.record.versions for trial in trials]
-        for trials in (baseline, new)
+
+    def made(trials: Sequence[TrialResult], name: str) -> list[str]:
+        values = (
+            one.record.versions.get(name, "none") if name else one.machine or "not recorded"
+            for one in trials
+        )
+        return sorted(set(values))
+
+    names = {name for one in (*baseline, *new) for name in one.record.versions} - {"gsbench"}
+    return [
+        Note.of(f"other {'library' if name else 'machine'}", library=name, baseline=old, new=now)
+        for name in ("", *sorted(names))  # the machine, and each library
+        if (old := made(baseline, name)) != (now := made(new, name))
     ]
-    notes = []
-    for name in sorted(set().union(*sides[0], *sides[1]) - {"gsbench"}):
-        old, now = (sorted({made.get(name, "none") for made in side}) for side in sides)
-        if old != now:
-            kind = "other machine" if name == machine else "other library"
-            notes.append(Note.of(kind, library=name, baseline=old, new=now))
-    return notes

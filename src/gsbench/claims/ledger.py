@@ -16,9 +16,8 @@ A ledger is an experiment whose commands open it and begin its ideas (`gsbench.r
 results are verdicts on the questions there, so nothing records them.
 """
 
-import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -46,9 +45,9 @@ IDEAS, RATE = 40, 0.1  # the defaults of a ledger
 # The chance that an idea without an effect passes on to its test, over all looks. Half of it or
 # twice as much finds about as many good ideas (findings/simulations.md).
 SCREEN = 0.1
-SEEDS_FROM, SEEDS_TO = 100_000, 1_000_000  # of tests
+SEEDS_FROM, SEEDS = 100_000, 900_000  # of tests
 KEPT, DROPPED, UNDECIDED, FAILED = "kept", "dropped", "undecided", "failed"
-BEGUN, IN_TEST = "begun", "in its test"
+BEGUN = "begun"
 CHOOSES = "it only chooses what is tested on new seeds"
 LOOKS_WORSE = "looks worse"  # on the seeds of all ideas, which is no verdict
 MEND = "bring back the file as gsbench wrote it, or begin another ledger"
@@ -78,39 +77,42 @@ class Book:
     @cached_property
     def verdicts(self) -> dict[str, Verdict]:
         """The verdict on each idea: that of its test, else that of the comparison before it."""
-        return {
-            idea: judge(
-                self.experiment.trials,
-                self.tests.get(idea) or self.screening(self.ideas[idea]),
-                self.experiment.unfinished,
-            )
-            for idea in self.begun
-        }
+        trials, unfinished = self.experiment.trials, self.experiment.unfinished
+        return {idea: judge(trials, self.question(idea), unfinished) for idea in self.begun}
+
+    def question(self, idea: str) -> Question:
+        """The question of an idea now: its test, else its screening."""
+        return self.tests.get(idea) or self.screening(self.ideas[idea])
 
     def screening(self, idea: Idea) -> Question:
         """The comparison on the seeds of all ideas, in looks, as if it were a test.
 
         An idea passes by one side of the interval, so the interval has twice the rate.
         """
-        seeds, old = self.opened.seeds, self.ideas[idea.against]
-        return self.ask(idea, old, SCREENING, seeds, 2 * SCREEN, plan_looks(len(seeds)))
+        baseline, seeds = self.ideas[idea.against], self.opened.seeds
+        asked = self.ask(idea, baseline, SCREENING, seeds, 2 * SCREEN)
+        return replace(asked, looks=plan_looks(len(seeds)))
 
     def test(self, name: str) -> Question:
-        """The test of an idea that looks better, in looks on new seeds."""
-        rate, ideas = self.opened.rate, self.opened.ideas
-        level = level_of_test(rate, ideas, len(self.tests) + 1, len(self.kept))
-        idea, seeds = self.ideas[name], self._new_seeds(name)
-        looks, level = plan_looks(len(seeds)), min(1.0, 2 * level)
-        return self.ask(idea, self.ideas[idea.against], LOND, seeds, level, looks)
+        """The test of an idea that looks better, in as many looks on new seeds.
+
+        These are in a row that begins where the hash of all lines before says, so another ledger on
+        the same captures has other seeds.
+        """
+        history, count = self.experiment.history, len(self.opened.seeds)
+        seen = {seed for one in history.questions for _, seed in one.places}
+        first = SEEDS_FROM + int(history.head, 16) % SEEDS
+        while not seen.isdisjoint(range(first, first + count)):
+            first += count
+        asked = self.screening(self.ideas[name])
+        level = level_of_test(
+            self.opened.rate, self.opened.ideas, len(self.tests) + 1, len(self.kept)
+        )
+        seeds = dict.fromkeys(asked.seeds, tuple(range(first, first + count)))
+        return replace(asked, rule=LOND, seeds=seeds, level=min(1.0, 2 * level))
 
     def ask(
-        self,
-        idea: Idea,
-        baseline: Idea,
-        rule: str,
-        seeds: tuple[int, ...],
-        level: float,
-        looks: tuple[int, ...] = (),
+        self, idea: Idea, baseline: Idea, rule: str, seeds: tuple[int, ...], level: float
     ) -> Question:
         """The question of an idea by one of the ledger's rules."""
         opened, scenes = self.opened, baseline.digests
@@ -125,55 +127,35 @@ class Book:
             seeds=dict.fromkeys(scenes, seeds),
             rule=rule,
             level=level,
-            looks=looks,
             versions=True,
             name=idea.name,
         )
 
-    def _new_seeds(self, idea: str) -> tuple[int, ...]:
-        """As many seeds as the ledger has, in a row, of which no trial of it has one.
-
-        The row begins where the hash of all lines before says, so another ledger on the same
-        captures has other seeds.
-        """
-        seen = {seed for one in self.experiment.history.questions for _, seed in one.places}
-        count, text = len(self.opened.seeds), f"{self.experiment.history.head} {idea}"
-        while True:
-            text = hashlib.sha256(text.encode()).hexdigest()
-            first = SEEDS_FROM + int(text, 16) % (SEEDS_TO - SEEDS_FROM - count)
-            seeds = tuple(range(first, first + count))
-            if seen.isdisjoint(seeds):
-                return seeds
-
     def is_measured(self, idea: str) -> bool:
         """Return whether a trial of the idea gave a result."""
-        digests = set(self.ideas[idea].digests.values())
         known = {digest for digest, _ in self.experiment.history.results}
-        return not digests.isdisjoint(known | {one.digest for one in self.experiment.trials})
+        known |= {one.digest for one in self.experiment.trials}
+        return not known.isdisjoint(self.ideas[idea].digests.values())
 
     def failure(self, idea: str) -> str:
         """The reason why an idea has no result, since its trials failed; "" otherwise."""
-        digests = self.ideas[idea].digests.items()
-        failed = (
-            one.path
-            for one in self.experiment.unfinished
-            if one.failed and (one.scene, one.digest) in digests
-        )
-        path = None if self.is_measured(idea) else next(failed, None)
-        return "" if path is None else TrialFolder(path).failure().reason
+        digests = self.ideas[idea].digests
+        for one in self.experiment.unfinished:
+            if one.failed and digests.get(one.scene) == one.digest and not self.is_measured(idea):
+                return TrialFolder(one.path).failure().reason
+        return ""
 
     def result(self, idea: str) -> str:
-        verdict, tested = self.verdicts[idea], idea in self.tests
         if self.failure(idea):
             return FAILED
+        verdict = self.verdicts[idea]
         found = result_of(verdict)
-        if not verdict.final or (found == KEPT and not tested):
-            return IN_TEST if tested else BEGUN
-        return found
+        ended = verdict.final and (found != KEPT or idea in self.tests)
+        return found if ended else BEGUN
 
     def is_decided(self, idea: str) -> bool:
         """Return whether the idea has a result; it has none if its trials failed."""
-        return self.result(idea) in (KEPT, DROPPED, UNDECIDED)
+        return self.result(idea) not in (FAILED, BEGUN)
 
     def why(self, idea: str) -> str:
         """The reason of a result."""
@@ -185,18 +167,21 @@ class Book:
 
     def line(self, idea: str) -> str:
         """``larger_splits against baseline: kept: better; psnr +0.5 (…); 3 new seeds, level …``"""
-        verdict, test = self.verdicts[idea], self.tests.get(idea)
-        where = f"{counted(verdict.pairs.seeds, 'seed')} of all ideas"
-        if test:
-            where = f"{counted(verdict.pairs.seeds, 'new seed')}, level {50 * test.level:.2g} %"
-        facts = [self.why(idea), f"{self.opened.metric} {numbers(verdict)}", where]
-        shown = "; ".join(facts if numbers(verdict) else facts[:1])
-        return f"{idea} against {self.ideas[idea].against}: {self.result(idea)}: {shown}"
+        verdict, test, facts = self.verdicts[idea], self.tests.get(idea), [self.why(idea)]
+        if not facts[0].startswith(result := self.result(idea)):  # such as undecided
+            facts[0] = f"{result}: {facts[0]}"
+        if shown := numbers(verdict):
+            where = f"{counted(verdict.pairs.seeds, 'seed')} of all ideas"
+            if test:
+                new = counted(verdict.pairs.seeds, "new seed")
+                where = f"{new}, level {50 * test.level:.2g} %"
+            facts += [f"{self.opened.metric} {shown}", where]
+        return f"{idea} against {self.ideas[idea].against}: {'; '.join(facts)}"
 
-    def ratio(self, idea: str, cost: str) -> float | None:
-        """An idea's cost over that of what it is compared with."""
+    def ratio(self, idea: str) -> float | None:
+        """The Gaussians of an idea over those of what it is compared with."""
         pairs = self.verdicts[idea].pairs
-        change = relative_change(pairs.of_baseline, pairs.of_arm, COSTS[cost][1])
+        change = relative_change(pairs.of_baseline, pairs.of_arm, COSTS["gaussians"][1])
         return None if change is None else 1 + change.of_totals
 
     @property
@@ -208,24 +193,16 @@ class Book:
         """The number of ideas that count; those that failed do not, since they tell nothing."""
         return sum(not self.failure(idea) for idea in self.begun)
 
-    def check_ideas_left(self) -> None:
-        """Raise InputError unless another idea may be tried."""
-        if self.tried >= self.opened.ideas:
-            raise InputError(
-                f"all {self.opened.ideas} planned ideas were tried, so the error rate is spent: "
-                "begin another ledger, with another baseline or other captures"
-            )
-
     def check_untouched(self, asked: Sequence[Question]) -> None:
         """Raise InputError if a scene of ``asked`` was used before, by name or photographs."""
         earlier = set(self.ideas[BASELINE].digests)
         for one in self.experiment.history.questions:
             if one.rule == CONFIRMATION and not any(map(one.covers, asked)):
                 earlier |= one.digests.keys()
-        scenes, trials = set(asked[0].digests), self.experiment.trials
-        photographs = {one.record.hashes.get("data") for one in trials if one.scene in earlier}
-        copies = {one.scene for one in trials if one.record.hashes.get("data") in photographs}
-        if used := scenes & (earlier | copies):
+        data = {one.scene: one.record.hashes.get("data") for one in self.experiment.trials}
+        seen = {data[scene] for scene in earlier & data.keys()}
+        used = {one for one in asked[0].digests if one in earlier or data.get(one, "") in seen}
+        if used:
             raise InputError(
                 f"{listed(sorted(used))} was seen by the ideas, or by an earlier confirmation: "
                 "confirm on other captures"
@@ -258,18 +235,17 @@ def read_ledger(home: Path) -> Book:
         )
     if history.faults:
         raise InputError(f"{history.faults[0]}: {MEND}")
-    book = Book(read_experiment(home), history.ledger)
-    known = {pair for idea in book.ideas.values() for pair in idea.digests.items()}
-    for one in book.experiment.history.questions:
-        known |= {(scene, digest) for scene, both in one.digests.items() for digest in both}
-    unknown = {(one.scene, one.digest) for one in book.experiment.trials} - known
+    experiment = read_experiment(home)
+    unknown = {(one.scene, one.digest) for one in experiment.trials}
+    for one in history.questions:
+        unknown -= {(scene, digest) for scene, both in one.digests.items() for digest in both}
     if unknown:
         raise InputError(
             f"the ledger does not know {counted(len(unknown), 'configuration')} with trials "
             f"({'/'.join(min(unknown))}): give other sweeps another name; if lines of the ledger "
             "are missing, bring them back"
         )
-    return book
+    return Book(experiment, history.ledger)
 
 
 def level_of_test(rate: float, ideas: int, number: int, kept: int) -> float:

@@ -5,7 +5,7 @@ files.
 """
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
@@ -14,7 +14,7 @@ from typing import Any
 from gsbench.analysis.cells import swept_settings
 from gsbench.analysis.comparison import compare
 from gsbench.analysis.report.build import build_report
-from gsbench.analysis.results import Experiment
+from gsbench.analysis.results import Experiment, TrialResult
 from gsbench.analysis.table_formats import Table, fill
 from gsbench.analysis.tables import build_table
 from gsbench.claims.archive import unpack_archive
@@ -22,6 +22,14 @@ from gsbench.errors import InputError
 from gsbench.files import own_output, write_text
 
 INDEX, REPORTS = "index.html", "reports"
+FACTS: dict[str, Callable[[TrialResult], Any]] = {
+    "scenes": lambda trial: trial.scene,
+    "seeds": lambda trial: trial.seed,
+    "protocol": lambda trial: trial.record.protocol,
+    "iterations": lambda trial: trial.record.iterations,
+    "machine": lambda trial: trial.machine or "not recorded",
+    "gsbench": lambda trial: trial.record.versions.get("gsbench", "unknown"),
+}
 
 
 def write_site(archives: Sequence[Path], out: Path, title: str, scratch: Path) -> list[str]:
@@ -47,12 +55,7 @@ def write_site(archives: Sequence[Path], out: Path, title: str, scratch: Path) -
     if not sections:
         raise InputError(f"no archive can be shown ({left_out[0]})")
     script = files("gsbench.claims").joinpath("site.js").read_text(encoding="utf-8")
-    values = {
-        "title": title,
-        "sections": sections,
-        "left_out": left_out,
-        "script": script,
-    }
+    values = {"title": title, "sections": sections, "left_out": left_out, "script": script}
     page = fill("site.html.j2", "gsbench.claims", **values)
     with own_output(out / INDEX):
         write_text(out / INDEX, page)
@@ -72,17 +75,9 @@ def _section(experiment: Experiment, key: str) -> dict[str, Any]:
     except InputError as error:
         notes.append(f"No table: {error}")
     comparison = compare(experiment)
-    facts = {
-        "trials": str(len(trials)),
-        "scenes": ", ".join(sorted({trial.scene for trial in trials})),
-        "seeds": ", ".join(map(str, experiment.seeds)),
-        "protocol": ", ".join(sorted({trial.record.protocol for trial in trials})),
-        "iterations": ", ".join(map(str, sorted({trial.record.iterations for trial in trials}))),
-        "machine": ", ".join(sorted({trial.machine or "not recorded" for trial in trials})),
-        "gsbench": ", ".join(
-            sorted({trial.record.versions.get("gsbench", "unknown") for trial in trials})
-        ),
-    }
+    facts = {"trials": str(len(trials))}
+    for name, read in FACTS.items():
+        facts[name] = ", ".join(map(str, sorted(set(map(read, trials)))))
     return {
         "name": experiment.name,
         "key": key,
@@ -106,11 +101,9 @@ def _by_quantity(table: Table) -> Iterator[Table]:
         yield replace(table, title=name, columns=columns, rows=rows, notes=())
 
 
-def _unique_key(name: str, taken: set[str]) -> str:
+def _unique_key(name: str, taken: Container[str]) -> str:
     """A key in lower case that is not ``taken``: file systems may not distinguish capitals."""
-    plain = re.sub(r"[^a-z0-9_-]+", "-", name.lower()).strip("-") or "experiment"
-    return next(
-        key
-        for n in range(1, len(taken) + 2)
-        if (key := plain if n == 1 else f"{plain}-{n}") not in taken
-    )
+    key = re.sub(r"[^a-z0-9_-]+", "-", name.lower()).strip("-") or "experiment"
+    while key in taken:
+        key += "-2"
+    return key

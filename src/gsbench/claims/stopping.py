@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from gsbench.analysis.comparison import compare
-from gsbench.analysis.fairness import counts_notes, limit_notes
+from gsbench.analysis.fairness import counts_notes
 from gsbench.analysis.notes import texts
 from gsbench.analysis.results import TrialResult, newest_code, read_experiment
 from gsbench.analysis.verdicts import Verdict, judge
@@ -83,7 +83,7 @@ def finished_trials(trials: Iterable[Trial]) -> list[TrialResult]:
 def log_verdicts(trials: Iterable[Trial]) -> None:
     """Log a line for each idea of the experiments of ``trials``, and what one must know beside it.
 
-    These are unequal counts and limits without effect. A ledger says its own verdicts: what is said
+    These are unequal counts. A ledger says its own verdicts: what is said
     of a sweep does not fit its ideas.
     """
     for home in dict.fromkeys(trial.files.home for trial in trials):
@@ -92,7 +92,7 @@ def log_verdicts(trials: Iterable[Trial]) -> None:
             continue
         comparison = compare(newest_code(experiment))
         both = comparison.trials, comparison.pairs
-        before = [*counts_notes(*both), *limit_notes(*both)]
+        before = counts_notes(*both)
         headlines = [answer.headline for answer in comparison.answers]
         for line in [*texts(before), *headlines, *comparison.experiment.versions]:
             log.info("%s", line)

@@ -73,28 +73,28 @@ def _remote(url: str, policy: RetryPolicy) -> Iterator[zipfile.ZipFile]:
             raise zipfile.BadZipFile(str(error)) from None
 
     with requests.Session() as session:
-        try:
+        with _opening(url):
             archive = with_retries(once, url, policy)
-        except NO_ARCHIVE as error:
-            if isinstance(error, InputError):
-                raise
-            raise _no_archive(url, error) from error
         with archive:
             yield archive
 
 
 def open_archive(file: IO[bytes], where: str) -> zipfile.ZipFile:
     """Open the zip archive in ``file``; raises `InputError` naming ``where`` if it is none."""
-    try:
+    with _opening(where):
         return zipfile.ZipFile(file)
+
+
+@contextmanager
+def _opening(where: str) -> Iterator[None]:
+    try:
+        yield
+    except InputError:  # a ValueError, too
+        raise
     except NO_ARCHIVE as error:
-        raise _no_archive(where, error) from error
-
-
-def _no_archive(where: str, error: Exception) -> InputError:
-    return InputError(
-        f"{where} is not a complete zip archive ({error}): give another address with --mirror"
-    )
+        raise InputError(
+            f"{where} is not a complete zip archive ({error}): give another address with --mirror"
+        ) from error
 
 
 def wanted_members(
@@ -113,14 +113,12 @@ def wanted_members(
         if not any(name.startswith(f"{part}/") for part in wanted) or "/." in f"/{name}":
             continue  # hidden files, including "..", are never wanted
         # A damaged name may decode to surrogates.
-        if len(name.encode("utf-8", "surrogatepass")) > MAX_NAME_BYTES or not name.isprintable():
+        too_long = len(name.encode("utf-8", "surrogatepass")) > MAX_NAME_BYTES
+        is_odd = too_long or not name.isprintable() or "//" in name or ":" in name
+        if is_odd or not is_safe_member(name):
             raise InputError(
-                f"{where}: the member {name!r:.80} has a name that no file can have: give another "
-                "--mirror"
-            )
-        if "//" in name or ":" in name or not is_safe_member(name):
-            raise InputError(
-                f"{where}: the member {info.filename!r} has an unsafe name: give another --mirror"
+                f"{where}: the member {name!r:.80} has an unsafe name, or a name that no file can "
+                "have: give another --mirror"
             )
         members[name] = info
     for name in members:
@@ -140,16 +138,9 @@ def wanted_members(
 
 def is_complete(path: Path, size: int, crc: int) -> bool:
     """Return whether the file ``path`` exists with this size and CRC-32."""
-    try:
-        if path.stat().st_size != size:
-            return False
-        checksum = 0
-        with path.open("rb") as file:
-            while piece := file.read(CHUNK):
-                checksum = zlib.crc32(piece, checksum)
-    except OSError:
+    if not path.is_file() or path.stat().st_size != size:
         return False
-    return checksum == crc
+    return zlib.crc32(path.read_bytes()) == crc
 
 
 def extract(

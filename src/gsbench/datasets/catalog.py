@@ -75,10 +75,11 @@ def read_catalog() -> dict[str, PublicDataset]:
     content: dict[str, Any] = yaml.safe_load(CATALOG_FILE.read_text(encoding="utf-8"))
     datasets = {}
     for name, entry in content.items():
-        archives = []
-        for archive in entry.pop("archives"):
-            archives.append(Archive(archive["url"], archive["scenes"], archive.get("size", "")))
-        datasets[name] = PublicDataset(name=name, archives=tuple(archives), **entry)
+        archives = tuple(
+            Archive(archive["url"], archive["scenes"], archive.get("size", ""))
+            for archive in entry.pop("archives")
+        )
+        datasets[name] = PublicDataset(name=name, archives=archives, **entry)
     return datasets
 
 
@@ -90,12 +91,12 @@ def data_dir() -> Path:
 @cache
 def _catalogued_scenes() -> dict[str, tuple[str, str]]:
     """The data set and the folder of each scene in the catalogue."""
-    found = {}
-    for dataset in read_catalog().values():
-        for archive in dataset.archives:
-            for scene, folder in archive.scenes.items():
-                found[scene] = (dataset.name, folder)
-    return found
+    return {
+        scene: (dataset.name, folder)
+        for dataset in read_catalog().values()
+        for archive in dataset.archives
+        for scene, folder in archive.scenes.items()
+    }
 
 
 def how_to_get(scenes: Iterable[tuple[str, Path]]) -> str:

@@ -62,15 +62,7 @@ def _structural(
 # the end of the key of a metric that is measured after an affine correction of the colours
 CORRECTED = "_cc"
 
-
-def _corrected(facts: MetricFacts) -> MetricFacts:
-    """The facts about this metric after a correction of the colours."""
-    words = f"{facts.label} after a correction of the colours"
-    key, label = f"{facts.key}{CORRECTED}", f"{facts.label} cc"
-    return replace(facts, key=key, label=label, setting=MORE, words=words)
-
-
-_PLAIN = (  # `gsbench.eval.evaluator.MEASURES` has the class of each
+_PLAIN = (  # `gsbench.eval.evaluator.MEASURES` has the function of each
     MetricFacts(
         "psnr", "PSNR", 1, 2, "dB", 0.1, lowest=0.0, words="mean squared error, logarithmic"
     ),
@@ -90,7 +82,13 @@ _PLAIN = (  # `gsbench.eval.evaluator.MEASURES` has the class of each
     _structural("gmsd", "GMSD", -1, 0.5, "how unevenly the gradients agree"),
 )
 _CORRECTED = tuple(
-    _corrected(facts)
+    replace(
+        facts,
+        key=f"{facts.key}{CORRECTED}",
+        label=f"{facts.label} cc",
+        setting=MORE,
+        words=f"{facts.label} after a correction of the colours",
+    )
     for facts in _PLAIN
     if facts.key in ("psnr", "ssim") or facts.key.startswith(LPIPS)
 )

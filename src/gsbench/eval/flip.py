@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from gsbench.eval.images import as_batch, check_pair, correlate, in_double_precision, mix_channels
+from gsbench.eval.images import as_batch, check_pair, correlate, in_double_precision
 from gsbench.eval.protocol import FLIP_PPD
 
 # Linear sRGB to CIE XYZ with the illuminant D65.
@@ -56,7 +56,8 @@ def flip_map(image: Tensor, target: Tensor, ppd: float = FLIP_PPD) -> Tensor:
 
 def _mix(images: Tensor, rows: Sequence[Sequence[float]]) -> Tensor:
     """The colours of [B, 3, H, W] times a matrix."""
-    return torch.cat([mix_channels(images, (row[0], row[1], row[2])) for row in rows], dim=1)
+    red, green, blue = images.split(1, dim=1)
+    return torch.cat([red * row[0] + green * row[1] + blue * row[2] for row in rows], dim=1)
 
 
 def _filter(images: Tensor, horizontal: Sequence[float], vertical: Sequence[float]) -> Tensor:

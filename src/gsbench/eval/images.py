@@ -49,21 +49,6 @@ def check_pair(image: Tensor, target: Tensor) -> None:
         )
 
 
-def check_size(image: Tensor, min_side: int, metric: str) -> None:
-    """Raise ValueError for a batch [B, 3, H, W] with a side below ``min_side`` px."""
-    height, width = image.shape[-2:]
-    if min(height, width) < min_side:
-        raise ValueError(
-            f"{metric} needs images of at least {min_side} px a side, got {width}x{height}"
-        )
-
-
-def mix_channels(images: Tensor, weights: tuple[float, float, float]) -> Tensor:
-    """The weighted sum [B, 1, H, W] of the channels of [B, 3, H, W]."""
-    red, green, blue = weights
-    return images[:, :1] * red + images[:, 1:2] * green + images[:, 2:] * blue
-
-
 def correlate(images: Tensor, weights: Sequence[float], axis: int) -> Tensor:
     """Weighted sums of neighbours along ``axis``, which gets ``len(weights) - 1`` px smaller."""
     size = images.shape[axis] - len(weights) + 1

@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gsbench.errors import InputError
-from gsbench.weights import MissingWeightsError, WeightsFile, find_weights, load_state
+from gsbench.weights import WeightsFile, find_weights, load_into, load_state
 
 # The networks' input normalisation, per channel: (x - SHIFT) / SCALE for x in [-1, 1].
 SHIFT = (-0.030, -0.088, -0.188)
@@ -35,7 +35,7 @@ class Backbone:
     layers: tuple[Layer, ...]
     taps: tuple[int, ...]  # indices of the modules whose output is compared
     min_size: int  # px; with a shorter side, some layer has no output
-    features: tuple[WeightsFile, ...]  # alternatives; the first is downloaded
+    features: WeightsFile
     heads: WeightsFile
 
     def build(self) -> tuple[nn.Sequential, list[int]]:
@@ -74,12 +74,10 @@ class Fire(nn.Module):
         return both.relu_()  # [B, 2 * expanded, H, W]
 
 
-def _torchvision(
-    name: str, sha256: str, copy_sha256: str, copy: str, source: str
-) -> tuple[WeightsFile, ...]:
+def _torchvision(name: str, sha256: str, copy: str, copy_sha256: str, source: str) -> WeightsFile:
     """torchvision's file, or a copy of its convolutional layers without the classifier."""
     url = f"https://download.pytorch.org/models/{name}"  # BSD-3-Clause
-    return WeightsFile((name,), url, sha256), WeightsFile((copy,), None, copy_sha256, source)
+    return WeightsFile((name,), url, sha256, f"{copy}, from {source}", ((copy, copy_sha256),))
 
 
 def _heads(net: str, sha256: str) -> WeightsFile:
@@ -101,8 +99,8 @@ BACKBONES = {
         _torchvision(
             "vgg16-397923af.pth",
             "397923af8e79cdbb6a7127f12361acd7a2f83e06b05044ddf496e83de57a5bf0",
-            "5ec800ff5c189c3fef18ab4abcecdf326ec5662e690866094e9f55006cdd9ecf",
             "vgg16_features.safetensors",
+            "5ec800ff5c189c3fef18ab4abcecdf326ec5662e690866094e9f55006cdd9ecf",
             PORT.format("vgg16"),
         ),
         _heads("vgg", "a78928a0af1e5f0fcb1f3b9e8f8c3a2a5a3de244d830ad5c1feddc79b8432868"),
@@ -114,8 +112,8 @@ BACKBONES = {
         _torchvision(
             "alexnet-owt-7be5be79.pth",
             "7be5be791159472b1fbf3c69796f7cb30dca7ad8466c2df70058c37116cdee02",
-            "889a9ed0249fad79da5157ecf3125bef56243b12ec058c99296bc803ad24ec94",
             "alexnet_features.safetensors",
+            "889a9ed0249fad79da5157ecf3125bef56243b12ec058c99296bc803ad24ec94",
             PORT.format("alexnet"),
         ),
         _heads("alex", "df73285e35b22355a2df87cdb6b70b343713b667eddbda73e1977e0c860835c0"),
@@ -130,8 +128,8 @@ BACKBONES = {
         _torchvision(
             "squeezenet1_1-b8a52dc0.pth",
             "b8a52dc049b60e4b6ab68ad0df457362afab8b6304b2febdc1650a5dab4d7e7b",
-            "435cedb387e95bc8291893f61a3a64f0345b8c23a05139aceef43947efb3d52d",
             "squeezenet1_1_features.pth",
+            "435cedb387e95bc8291893f61a3a64f0345b8c23a05139aceef43947efb3d52d",
             "torchvision, ImageNet",
         ),
         _heads("squeeze", "4a5350f23600cb79923ce65bb07cbf57dca461329894153e05a1346bd531cf76"),
@@ -157,8 +155,11 @@ class Lpips:
         self.net, self.device = net, torch.device(device)
         self.backbone = BACKBONES[net]
         stack, widths = self.backbone.build()
-        load_features(stack, features, f"lpips {net}")
-        self._layers = stack.requires_grad_(False).eval().to(device)
+        # published files also have a classifier
+        own = {key.removeprefix("features."): value.float() for key, value in features.items()}
+        own = {key: value for key, value in own.items() if key in stack.state_dict()}
+        load_into(stack, own, f"of lpips {net}")
+        self._layers = stack.to(device)
         self._heads = []  # [C] each
         for index, channels in enumerate(widths):
             weight = heads.get(f"lin{index}.model.1.weight")
@@ -218,26 +219,9 @@ def load_lpips(
     Raises ``MissingWeightsError`` if they are not found.
     """
     backbone = BACKBONES[net]
-    features = find_first_weights(backbone.features, folder, download)
+    features = find_weights(backbone.features, folder, download)
     heads = find_weights(backbone.heads, folder, download)
     return Lpips(net, load_state(features), load_state(heads), device)
-
-
-def find_first_weights(specs: tuple[WeightsFile, ...], folder: Path | None, download: bool) -> Path:
-    """Find one of the alternatives ``specs`` on this machine, or download the first if allowed.
-
-    Raises ``MissingWeightsError``, which names all of them, if there is none.
-    """
-    for spec in specs[1:]:
-        try:
-            return find_weights(spec, folder, download=False)
-        except MissingWeightsError:
-            continue
-    try:
-        return find_weights(specs[0], folder, download)
-    except MissingWeightsError as error:
-        others = [f"or {spec.names[0]}, from {spec.source}" for spec in specs[1:]]
-        raise MissingWeightsError("; ".join([str(error), *others])) from error
 
 
 def _feature_distance(
@@ -263,19 +247,3 @@ def _feature_distance(
         per_channel = (a - b).square().sum(dim=(1, 2))  # [C]
         total = total + (per_channel * head).sum()
     return total / (first.shape[2] * first.shape[3])
-
-
-def load_features(stack: nn.Sequential, state: Mapping[str, Tensor], who: str) -> None:
-    """Load published weights into a backbone.
-
-    Raises InputError naming ``who`` if they are for another network.
-    """
-    expected = stack.state_dict().keys()
-    renamed = {key.removeprefix("features."): value for key, value in state.items()}
-    missing = [key for key in expected if key not in renamed]
-    if missing:
-        raise InputError(
-            f"the weights of {who} lack {missing[0]!r} and {len(missing) - 1} more: not that "
-            "network"
-        )
-    stack.load_state_dict({key: renamed[key].float() for key in expected})

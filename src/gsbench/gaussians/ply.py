@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from plyfile import PlyData, PlyElement
+from plyfile import PlyData, PlyElement, PlyProperty
 
 from gsbench.errors import InputError
 from gsbench.files import DAMAGE, atomic, require_regular
@@ -52,10 +52,6 @@ MAX_LOGIT = 23 * math.log(2)
 # typical scale of a Gaussian over the size of its model; medians of trained models: 0.009 to 0.035
 TYPICAL_SCALE = 0.02
 MIN_TEXT_BYTES = 2  # minimum bytes of a value in an ASCII file: a digit and a space
-# bytes of PLY's types; all other types have 1
-SIZES = dict.fromkeys(["short", "ushort", "int16", "uint16"], 2)
-SIZES |= dict.fromkeys(["int", "uint", "int32", "uint32", "float", "float32"], 4)
-SIZES |= dict.fromkeys(("double", "float64"), 8)
 
 
 def write_ply(gaussians: Gaussians, path: Path, normalization: Normalization = IDENTITY) -> None:
@@ -123,9 +119,14 @@ def _check_length(path: Path) -> None:
             if count < 0:
                 raise ValueError("the count of an element is negative")
         elif words[:1] == ["property"]:
-            announced += count * (MIN_TEXT_BYTES if is_text else SIZES.get(words[1], 1))
+            announced += count * (MIN_TEXT_BYTES if is_text else _bytes_of(words[1]))
     if announced > path.stat().st_size:
         raise ValueError(f"it is cut short: its header promises {announced} bytes or more")
+
+
+def _bytes_of(kind: str) -> int:
+    """The bytes of a value of a PLY's type; of a list, those of its length at least."""
+    return 1 if kind == "list" else np.dtype(PlyProperty("", kind).dtype()).itemsize
 
 
 def _finite_logits(logits: Column, path: Path) -> Column:

@@ -101,10 +101,6 @@ class ColmapOptions(Initializer):
         """Return whether at least the intrinsics are taken from the reference, if there is one."""
         return self.poses == "shared" or self.intrinsics == "reference"
 
-    def takes_cameras_from(self, capture: Capture, reference: object | None) -> bool:
-        """Return whether the cameras come from ``reference`` or the capture's own model."""
-        return self.uses_reference_cameras and not (reference is None and capture.model is None)
-
     def ignores_test_photographs(self, reference: pycolmap.Reconstruction | None) -> bool:
         """Return whether test photographs are not read at all: given cameras do not need them."""
         return self.points_from != "all" and self.poses == "shared" and reference is not None

@@ -5,7 +5,6 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from gsbench.analysis.results import group_by
 from gsbench.config.compose import Trial
 from gsbench.config.groups import options
 from gsbench.config.schema import COMPONENTS
@@ -14,13 +13,12 @@ from gsbench.files import FORBIDDEN, checked_runs_folder, make_runs_folder, stor
 from gsbench.launch.dry_run import unavailable_now
 from gsbench.launch.jobs import run_local, run_serial
 from gsbench.launch.outcomes import Outcome, outcome_of_results
-from gsbench.launch.record import asked_metrics, record, remove
+from gsbench.launch.record import asked_metrics, record
 from gsbench.launch.slurm import run_slurm
 from gsbench.runs.freshness import Change
 from gsbench.runs.keys import STAGES, VIEWS
 from gsbench.runs.layout import STORE
 from gsbench.runs.store import Store
-from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.user_code import PERMISSIONS
 from gsbench.system.stopping import stop_on_signals
 from gsbench.tracking import Mirror
@@ -32,8 +30,7 @@ log = logging.getLogger(__name__)
 def run_batch(trials: Sequence[Trial], asks: bool = True) -> list[Outcome]:
     """Run the unfinished trials by their launcher, and return the outcomes of all.
 
-    With ``asks``, their questions are written down first. If nothing but bad input came out of the
-    trials that began now, they are forgotten, as if the command had been refused before.
+    With ``asks``, their questions are written down first.
     """
     launcher = trials[0].values["launch"]["name"]
     with storage_errors(checked_runs_folder(trials[0].values["runs"])), stop_on_signals():
@@ -46,16 +43,12 @@ def run_batch(trials: Sequence[Trial], asks: bool = True) -> list[Outcome]:
         outcomes = [outcome_of_results(folder, one.files.record()) for folder, one in done.items()]
         for outcome in outcomes:
             log.info("%s: already done  %s", outcome.label, outcome.message)
-        new = [folder for folder in left if not folder.exists()]
         if unfinished and launcher == "slurm":
             outcomes += run_slurm(unfinished)
         elif unfinished:
             run = run_serial if launcher == "serial" else run_local
             with Mirror() as mirror:
                 outcomes += run(unfinished, mirror)
-        if all(outcome.status == "failed" and outcome.bad_input for outcome in outcomes):
-            for home, own in group_by(new, lambda folder: TrialFolder(folder).home).items():
-                remove(home, own)
         return outcomes
 
 

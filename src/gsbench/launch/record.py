@@ -16,7 +16,6 @@ from gsbench.analysis.quantities import COSTS, TEXTURED, askable_names
 from gsbench.analysis.questions import (
     FIRST_LOOK,
     Asked,
-    LeastEffect,
     NamedQuestion,
     announce,
     ask,
@@ -41,7 +40,7 @@ from gsbench.runs.commands import (
     read_history,
 )
 from gsbench.runs.experiments import DEFAULT_METRIC, QUESTIONS, metric_and_question
-from gsbench.runs.layout import RESULTS, SEED, TUNING
+from gsbench.runs.layout import ASKED, RESULTS, SEED, TUNING
 from gsbench.runs.nested import flatten
 from gsbench.settings import check_values
 from gsbench.words import did_you_mean
@@ -157,7 +156,7 @@ def asked_of(trials: Sequence[Trial], rows: Sequence[Planned]) -> Asked | None:
 
 def _named(
     values: Mapping[str, Any], metric: str, rows: Sequence[Planned]
-) -> tuple[tuple[NamedQuestion, int, LeastEffect | None], ...]:
+) -> tuple[tuple[NamedQuestion, int, tuple[float | None, bool]], ...]:
     """The questions that the experiment's file names; raises InputError for a wrong one."""
     found = []
     for number, entry in enumerate(values.get("questions") or (), 1):
@@ -175,8 +174,8 @@ def _named(
         sign = DIRECTIONS.get(named.direction, facts.direction if facts else -1)
         usual = facts.worthwhile if facts else None
         least = usual if named.least is None else named.least
-        effect = None if least is None else read_least(least, f"{where}.least")
-        if effect is None and named.direction == "same":
+        effect = (None, False) if least is None else read_least(least, f"{where}.least")
+        if effect[0] is None and named.direction == "same":
             raise InputError(f"{where}.least is needed: a difference below which both are the same")
         found.append((named, sign, effect))
     return tuple(found)
@@ -201,6 +200,14 @@ def check_looks(trials: Sequence[Trial], rows: Sequence[Planned]) -> tuple[int, 
             f"{what} needs at least {FIRST_LOOK} seeds, as seed=0,1,2,3: the most it adds"
         )
     return first
+
+
+def forget_refused(trials: Sequence[Trial]) -> None:
+    """Remove the trials of a command of which all were refused, unless their training has begun."""
+    for home, own in group_by(trials, lambda trial: trial.files.home).items():
+        begun = (RESULTS, ASKED)
+        folders = {trial.folder for trial in own}
+        remove(home, [one for one in folders if not any((one / name).exists() for name in begun)])
 
 
 def remove(home: Path, folders: Iterable[Path]) -> None:

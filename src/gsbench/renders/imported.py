@@ -89,7 +89,7 @@ def find_destination(
     typed_arm = ArmName.read(typed)
     arm = typed_arm.name
     scene_name = scene or truth.scene
-    if not is_folder_name(experiment) or not is_folder_name(arm):
+    if not (is_folder_name(experiment) and is_folder_name(arm)):
         raise InputError(f"--as {word} is not EXPERIMENT:ARM, such as table1:sfm-mine")
     # on file systems without capitals, "Store" is "store"
     if experiment.casefold() in IN_RUNS:

@@ -103,11 +103,9 @@ def scene_trial(words: Sequence[str]) -> TrialSteps:
 def _scene(name: str, settings: Sequence[str]) -> ReferenceImages:
     """The test views of a scene as a trial with these settings sees them."""
     trial = scene_trial([f"scene={name}", *settings])
-    for step in trial.steps():
-        if step.stage in (keys.CAPTURE, keys.INIT, keys.GROUND_TRUTH):
-            entry = trial.store.get(step)
-            if step.stage is keys.GROUND_TRUTH:
-                folder = entry.path
+    wanted = (keys.CAPTURE, keys.INIT, keys.GROUND_TRUTH)
+    entries = [trial.store.get(step) for step in trial.steps() if step.stage in wanted]
+    folder = entries[-1].path
     config = trial.parts.values
     scene = trial.views.scene
     photographs = {view.name: folder / png_name(view.name) for view in scene.test}

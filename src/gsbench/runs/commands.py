@@ -11,7 +11,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from hashlib import sha256
@@ -355,35 +355,28 @@ def read_history(home: Path) -> History:
     except DamagedError as error:
         unread.append(f"{PLAN} {error.reason}")
     try:
-        content = _content(home / COMMANDS)
+        lines = _lines(home)
     except DamagedError as error:
-        content = b""
+        lines = []
         unread.append(f"{COMMANDS} {error.reason}")
-    for number, text in enumerate(content.splitlines(), 1):
-        try:
-            line = _parsed(text, home / COMMANDS)
-        except DamagedError as error:
-            damaged.append(f"line {number} of {COMMANDS} {error.reason}")
-        else:
-            if line.previous != before:
-                unlinked.append(
-                    f"line {number} of {COMMANDS} does not follow the one before it: a line was "
-                    "changed, added or removed"
-                )
-            if isinstance(line, Command):
-                commands.append(line)
-            else:
-                results.add((line.digest, line.place))
+    for number, (text, line) in enumerate(lines, 1):
+        if isinstance(line, DamagedError):
+            damaged.append(f"line {number} of {COMMANDS} {line.reason}")
+        elif line.previous != before:
+            unlinked.append(
+                f"line {number} of {COMMANDS} does not follow the one before it: a line was "
+                "changed, added or removed"
+            )
+        if isinstance(line, Command):
+            commands.append(line)
+        elif isinstance(line, Finished):
+            results.add((line.digest, line.place))
         before = _link(text)
     # a file of garbage has many lines, of which the first says enough
-    found = [*unread, *(_first_of(lines) for lines in (damaged, unlinked) if lines)]
-    faults = tuple(f"{home.name}: {fault}" for fault in found)
+    for first, *others in filter(None, (damaged, unlinked)):
+        unread.append(f"{first} (and {counted(len(others), 'more line')})" if others else first)
+    faults = tuple(f"{home.name}: {fault}" for fault in unread)
     return History(home, tuple(commands), frozenset(results), faults, before)
-
-
-def _first_of(lines: Sequence[str]) -> str:
-    first, *others = lines
-    return f"{first} (and {counted(len(others), 'more line')})" if others else first
 
 
 def _of_old_plan(home: Path) -> list[Command]:
@@ -394,22 +387,30 @@ def _of_old_plan(home: Path) -> list[Command]:
         return []
     return [
         Command(
-            words=trial.overrides,
-            cwd=trial.cwd,
-            time=trial.time,
-            trials={name: PlannedTrial(words=trial.overrides)},
+            words=one.overrides,
+            cwd=one.cwd,
+            time=one.time,
+            trials={name: PlannedTrial(words=one.overrides)},
         )
-        for name, trial in planned.items()
+        for name, one in planned.items()
     ]
+
+
+def _lines(home: Path) -> list[tuple[bytes, Line | DamagedError]]:
+    """The lines of the file, each as text and read, or with what is wrong with it."""
+    found = list[tuple[bytes, Line | DamagedError]]()
+    for text in _content(home / COMMANDS).splitlines():
+        kind: type[Line] = Finished if text.startswith(b'{"finished"') else Command
+        try:
+            found.append((text, parse_typed(text, kind, home / COMMANDS)))
+        except DamagedError as error:
+            found.append((text, error))
+    return found
 
 
 def read_lines(home: Path) -> list[Line]:
     """The sound lines of the file, in order."""
-    lines = list[Line]()
-    for text in _content(home / COMMANDS).splitlines():
-        with suppress(DamagedError):
-            lines.append(_parsed(text, home / COMMANDS))
-    return lines
+    return [line for _, line in _lines(home) if not isinstance(line, DamagedError)]
 
 
 def append(home: Path, make: Callable[[History], Command | None]) -> Command | None:
@@ -475,12 +476,6 @@ def _content(path: Path) -> bytes:
         return read_bytes(path)
     except FileNotFoundError:
         return b""
-
-
-def _parsed(text: bytes, path: Path) -> Line:
-    if text.startswith(b'{"finished"'):
-        return parse_typed(text, Finished, path)
-    return parse_typed(text, Command, path)
 
 
 def _text(line: Line) -> str:

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.files import DAMAGE, file_sha256
 from gsbench.scene.images import open_image
 from gsbench.scene.types import Camera, CameraModel, Capture
+from gsbench.scene.undistortion import as_colmap
 from gsbench.words import listed
 
 DEPTH = "depth"
@@ -53,16 +53,16 @@ def read_beside(path: Path, kind: str, depth_scale: float | None = None) -> Pixe
     0, which means that the depth is not known. Raises InputError for a file that cannot be read.
     """
     if kind != DEPTH:
-        with open_image(path) as image:
-            return np.atleast_3d(_decoded(path, image))
+        with open_image(path, decode=True) as image:
+            return np.atleast_3d(np.asarray(image))
     if path.suffix.lower() == ".npy":
         try:
             values: Pixels = np.load(path, allow_pickle=False)
         except DAMAGE as error:
             raise InputError(f"{path}: is no array of numpy ({error}): save it again") from error
     else:
-        with open_image(path) as image:
-            values = _decoded(path, image)
+        with open_image(path, decode=True) as image:
+            values = np.asarray(image)
     if values.ndim == 3 and values.shape[2] == 1:
         values = values[..., 0]
     if values.ndim != 2 or values.dtype.kind not in "uif":
@@ -75,13 +75,6 @@ def read_beside(path: Path, kind: str, depth_scale: float | None = None) -> Pixe
     depth = values.astype(np.float32) * np.float32(step)
     known = np.isfinite(depth) & (depth > 0)
     return np.where(known, depth, 0).astype(np.float32)
-
-
-def _decoded(path: Path, image: Image.Image) -> Pixels:
-    try:
-        return np.asarray(image)
-    except Exception as error:  # Pillow's readers may raise any exception on a damaged file
-        raise InputError(f"{path}: the picture is damaged ({error}): replace it") from error
 
 
 def resized(picture: Pixels, width: int, height: int) -> Pixels:
@@ -110,14 +103,10 @@ def pixels_of_view(picture: Pixels, lens: CameraModel, view: Camera, source: Pat
         )
     if not lens.distorted:
         return resized(picture, view.width, view.height)
-    import pycolmap  # slow to load, and not needed for pinhole images
-
-    size = {"width": lens.width, "height": lens.height}
-    camera = pycolmap.Camera(model=lens.name, params=list(lens.params), **size)
     columns, rows = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
     x, y = (columns - view.cx) / view.fx, (rows - view.cy) / view.fy  # [H, W]
     rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
-    places = camera.img_from_cam(rays) / (lens.width, lens.height)  # [H W, 2], in 0..1
+    places = as_colmap(lens).img_from_cam(rays) / (lens.width, lens.height)  # [H W, 2], in 0..1
     inside = ((places >= 0) & (places < 1)).all(axis=1)  # False for a ray without a place
     pixels = np.where(inside[:, None], places, 0) * picture.shape[1::-1]
     across, down = pixels.astype(int).T

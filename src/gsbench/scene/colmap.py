@@ -1,6 +1,6 @@
 """COLMAP models: fitting them to image files, and writing them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,13 +9,13 @@ import pycolmap
 from numpy.typing import NDArray
 
 from gsbench.errors import InputError
-from gsbench.normalization import IDENTITY, Normalization
+from gsbench.normalization import Normalization
 from gsbench.scene.colmap_read import read_model as read_model
 from gsbench.scene.images import check_size, image_size
 from gsbench.scene.names import match_anywhere
 from gsbench.scene.types import Array, Camera, CameraModel, Capture, to_pinhole
+from gsbench.scene.undistortion import as_colmap, as_values, without_distortion
 from gsbench.scene.undistortion import plain_camera as plain_camera
-from gsbench.scene.undistortion import without_distortion
 
 Cloud = tuple[Array, NDArray[np.uint8]]  # positions [P, 3] in world units, colours [P, 3]
 MIN_TRACK = 2  # images that must see a 3D point, as in COLMAP
@@ -25,12 +25,7 @@ def posed_by_name(
     model: pycolmap.Reconstruction,
 ) -> dict[str, tuple[CameraModel, Array, Array]]:
     """Camera, rotation [3, 3] and translation [3] of the images that have a pose, by name."""
-    cameras = {
-        number: CameraModel(
-            camera.model_name, camera.width, camera.height, tuple(map(float, camera.params))
-        )
-        for number, camera in model.cameras.items()
-    }
+    cameras = {number: as_values(camera) for number, camera in model.cameras.items()}
     found = {}
     for image in model.images.values():
         if image.has_pose:
@@ -46,20 +41,12 @@ def camera_centers(model: pycolmap.Reconstruction) -> Array:
     return np.array([image.projection_center() for image in posed], dtype=np.float64).reshape(-1, 3)
 
 
-def normalize_capture(capture: Capture, folder: Path) -> Capture:
-    """Move a capture to its advised normalisation, and write the moved model to ``folder``.
-
-    Returns the same capture if no normalisation is advised.
-    """
-    normalization = capture.advised_normalization
-    if normalization.is_identity or capture.model is None:
-        return capture
+def normalize_capture(capture: Capture, folder: Path) -> None:
+    """Move a capture's model to its advised normalisation, and write it to ``folder``."""
+    assert capture.model is not None
     model = read_model(capture.model)
-    normalize_model(model, normalization)
+    normalize_model(model, capture.advised_normalization)
     save_model(model, folder)
-    return replace(
-        capture, model=folder, normalization=normalization, advised_normalization=IDENTITY
-    )
 
 
 def save_model(model: pycolmap.Reconstruction, folder: Path) -> None:
@@ -140,29 +127,15 @@ def rescaled_camera(
     the mean of both scales, as COLMAP does.
     """
     camera = without_distortion(camera)
-    params = list(camera.params)
-    model = camera.model
-    if model == pycolmap.CameraModelId.SIMPLE_PINHOLE:
-        model, params = pycolmap.CameraModelId.PINHOLE, [params[0], *params]
+    values = as_values(camera)
+    if values.name == "SIMPLE_PINHOLE":
+        values = replace(values, name="PINHOLE", params=(values.params[0], *values.params))
     # Copied because a Camera object taken from a Reconstruction is a view into it.
-    copy = new_camera(camera_id, model, camera.width, camera.height, params)
+    copy = as_colmap(values, camera_id)
     copy.has_prior_focal_length = camera.has_prior_focal_length
     if (width, height) != (camera.width, camera.height):
         copy.rescale(width, height)
     return copy
-
-
-def new_camera(
-    camera_id: int,
-    model: pycolmap.CameraModelId | str,
-    width: int,
-    height: int,
-    params: Sequence[float],
-) -> pycolmap.Camera:
-    """A COLMAP camera of a size in px, with parameters in COLMAP's order."""
-    return pycolmap.Camera(
-        camera_id=camera_id, model=model, width=width, height=height, params=list(params)
-    )
 
 
 def pinhole_camera(camera: pycolmap.Camera, cam_from_world: pycolmap.Rigid3d) -> Camera:
@@ -212,8 +185,7 @@ def write_frames(
         camera, rotation, translation = frames[name]
         if camera not in ids:
             ids[camera] = len(ids) + 1
-            own = new_camera(ids[camera], camera.name, camera.width, camera.height, camera.params)
-            model.add_camera_with_trivial_rig(own)
+            model.add_camera_with_trivial_rig(as_colmap(camera, ids[camera]))
         image = pycolmap.Image(name=name, camera_id=ids[camera], image_id=image_id)
         pose = pycolmap.Rigid3d(np.column_stack([rotation, translation]))
         model.add_image_with_trivial_frame(image, pose)

@@ -37,12 +37,6 @@ def model_files(folder: Path) -> list[Path]:
     )
 
 
-def has_both_forms(folder: Path) -> bool:
-    """Return whether a complete binary model has a text model beside it, which is not read."""
-    is_text = (folder / "images.txt").is_file()
-    return is_text and model_files(folder)[0].suffix == ".bin"
-
-
 def text_lines(file: Path) -> list[str]:
     """The lines of a model's text file, each without blanks around it, without comments."""
     lines = without_byte_order_mark(file.read_bytes()).decode().split("\n")

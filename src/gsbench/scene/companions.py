@@ -6,8 +6,9 @@ A capture of bare photographs has no list of its files, so the names of files an
 import logging
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path, PurePosixPath
 
 from gsbench.errors import InputError
@@ -50,22 +51,17 @@ def photographs_among(folder: Path, names: Sequence[str], report: bool = True) -
     raised if none is left.
     """
     reasons = _reasons(folder, names)
-    if not reasons or not report:
-        return [name for name in names if name not in reasons]
-    counts = Counter(reasons.values())
-    listed = ", ".join(f"{place} ({count})" for place, count in sorted(counts.items()))
-    files = counted(len(reasons), "file")
-    if len(reasons) == len(names):
-        raise InputError(
-            f"{folder}: by their names, all {files} are masks, thumbnails or the like: {listed}: "
-            "scene.images=FOLDER reads a folder"
-        )
-    log.warning(
-        "%s: %s left out, no photographs: %s; scene.images=FOLDER reads one folder alone",
-        folder,
-        files,
-        listed,
-    )
+    if reasons and report:
+        counts = Counter(reasons.values())
+        listed = ", ".join(f"{place} ({count})" for place, count in sorted(counts.items()))
+        files = counted(len(reasons), "file")
+        if len(reasons) == len(names):
+            raise InputError(
+                f"{folder}: by their names, all {files} are masks, thumbnails or the like: "
+                f"{listed}: scene.images=FOLDER reads a folder"
+            )
+        way = "scene.images=FOLDER reads one folder alone"
+        log.warning("%s: %s left out, no photographs: %s; %s", folder, files, listed, way)
     return [name for name in names if name not in reasons]
 
 
@@ -102,21 +98,12 @@ def companions_beside(raw: RawCapture, root: Path) -> RawCapture:
 def _reasons(folder: Path, names: Sequence[str]) -> dict[str, str]:
     """Map each name that is no photograph to the folder or the kind of file that says so."""
     reasons: dict[str, str] = {}
-    verdicts: dict[str, bool] = {}
-    for name in names:
-        for parent in _parents(name):
-            if parent not in verdicts:
-                verdicts[parent] = _is_side_folder(folder / parent)
-            if verdicts[parent]:
-                reasons[name] = f"{parent}/"
-                break
+    is_side = cache(_is_side_folder)
+    for name in names:  # folders from the outermost inwards: a and a/b for a/b/c.png
+        parents = reversed(PurePosixPath(name).parents[:-1])
+        if side := next((parent for parent in parents if is_side(folder / parent)), None):
+            reasons[name] = f"{side}/"
     return reasons | _companions([name for name in names if name not in reasons])
-
-
-def _parents(name: str) -> Iterator[str]:
-    """The folders of a name from the outermost inwards: ``a`` and ``a/b`` for ``a/b/c.png``."""
-    for parent in reversed(PurePosixPath(name).parents[:-1]):
-        yield parent.as_posix()
 
 
 def _is_side_folder(folder: Path) -> bool:

@@ -87,13 +87,9 @@ def along_principal_axis(centers: Array) -> Array:
     return -coordinates if coordinates[np.argmax(off_center)] > 0.0 else coordinates
 
 
-def _forwards(cameras: Sequence[Camera]) -> Array:
-    return np.array([camera.rotation[2] for camera in cameras])
-
-
 def point_looked_at(cameras: Sequence[Camera], centers: Array) -> Array | None:
     """The point [3] nearest to all viewing axes in least squares; None if they are parallel."""
-    forwards = _forwards(cameras)  # [V, 3]
+    forwards = np.array([camera.rotation[2] for camera in cameras])  # [V, 3]
     across = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]  # [V, 3, 3]
     normal = across.mean(axis=0)
     if float(np.linalg.eigvalsh(normal)[0]) < PARALLEL:
@@ -121,7 +117,7 @@ def _azimuths(cameras: Sequence[Camera], centers: Array) -> tuple[Array | None, 
     center = point_looked_at(cameras, centers)
     if center is None:
         return None, "the cameras look in one direction"
-    forwards = _forwards(cameras)  # [V, 3]
+    forwards = np.array([camera.rotation[2] for camera in cameras])  # [V, 3]
     facing = float((((center - centers) * forwards).sum(axis=1) > 0).mean())
     if facing < FACING:
         return None, f"the cameras do not look at one place; {facing:.0%} do"

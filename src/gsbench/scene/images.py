@@ -133,15 +133,6 @@ def image_size(path: Path) -> tuple[int, int]:
         return image.size
 
 
-def exif_orientation(path: Path) -> int:
-    """The EXIF orientation tag, or 1 (upright) if there is none or it cannot be read."""
-    with open_image(path) as image:
-        try:
-            return int(image.getexif().get(EXIF_ORIENTATION, 1))
-        except Exception:  # noqa: BLE001 - as in `open_image`; the pixels may still be intact
-            return 1
-
-
 def read_image(path: Path, backdrop: Backdrop = "black") -> NDArray[np.uint8]:
     """The image as [H, W, 3] uint8 RGB.
 
@@ -149,18 +140,12 @@ def read_image(path: Path, backdrop: Backdrop = "black") -> NDArray[np.uint8]:
     are blended over ``backdrop`` (black is the default background of 3DGS). Raises `InputError` if
     the file is missing, truncated, not an image, or holds 32-bit or float pixels.
     """
-    with open_image(path) as image:
+    with open_image(path, decode=True) as image:
         if image.mode in _WIDE_MODES:
             raise InputError(
                 f"{path}: pixels of type {image.mode!r} have no defined white: convert it to "
                 "8-bit RGB"
             )
-        try:
-            image.load()
-        except Exception as error:  # as in `open_image`
-            raise InputError(
-                f"{path}: the image is damaged ({error}): replace or remove it"
-            ) from error
         if image.mode in _SIXTEEN_BIT_MODES:
             grey = (np.asarray(image).astype(np.uint16) >> 8).astype(np.uint8)  # [H, W]
             return np.repeat(grey[..., None], 3, axis=2)
@@ -195,8 +180,8 @@ def check_size(path: Path, size: tuple[int, int], camera_size: tuple[int, int]) 
     )
     if same_up_to_rounding((height, width), camera_size):
         raise InputError(
-            f"{message}: it is stored on its side (EXIF orientation {exif_orientation(path)}, "
-            "which COLMAP ignores); use the files that the model was made from"
+            f"{message}: it is stored on its side, and COLMAP ignores EXIF orientations; use the "
+            "files that the model was made from"
         )
     raise InputError(
         f"{message}: use the files that the model was made from, or an evenly scaled copy"
@@ -211,15 +196,22 @@ def same_up_to_rounding(size: tuple[int, int], reference: tuple[int, int]) -> bo
     return lowest <= highest
 
 
-def open_image(path: Path) -> Image.Image:
-    """Open an image without reading pixels; raises `InputError` if it is missing or no image."""
+def open_image(path: Path, decode: bool = False) -> Image.Image:
+    """Open an image; raises `InputError` if it is missing or no image.
+
+    With ``decode``, all pixels are read, and the error is raised for a damaged one, too.
+    """
     require_regular(path)
     try:
-        return Image.open(path, formats=FORMATS)
+        image = Image.open(path, formats=FORMATS)
+        if decode:
+            image.load()
+        return image
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such image") from error
     except Exception as error:  # Pillow's readers may raise any exception on a damaged file
-        reason = "not a readable image" if isinstance(error, UnidentifiedImageError) else str(error)
+        is_none = isinstance(error, UnidentifiedImageError)
+        reason = "not a readable image" if is_none else f"the image is damaged ({error})"
         with path.open("rb") as stream:
             if stream.read(len(GIT_LFS)) == GIT_LFS:
                 reason += f", but {LFS_REMEDY}"

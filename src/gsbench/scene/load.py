@@ -11,14 +11,13 @@ length. It runs on pixels in memory, so images are not compressed as JPEG again.
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from gsbench.errors import InputError
@@ -38,7 +37,7 @@ from gsbench.scene.images import (
     resize_image,
     write_png,
 )
-from gsbench.scene.masks import WHITE, Mask, read_mask, resize_mask, write_mask
+from gsbench.scene.masks import WHITE, read_mask, resize_mask, write_mask
 from gsbench.scene.options import downscaled_size
 from gsbench.scene.rules import MIN_IMAGES, inspect, settle
 from gsbench.scene.types import Camera, CameraModel, Capture, Scene, View, to_pinhole
@@ -54,19 +53,6 @@ CAMERAS_FILE = "cameras.json"
 INTRINSICS = ("width", "height", "fx", "fy", "cx", "cy")
 # images per isolated process: limits what a crash loses, and progress is reported after each chunk
 _CHUNK = 16
-
-
-@dataclass(frozen=True)
-class Downscaling:
-    """Settings of shrinking images (see `downscaled_size`)."""
-
-    downscale: int
-    max_size: int | None
-    resample: Resample
-
-    def final_size(self, width: int, height: int) -> tuple[int, int]:
-        """The final size in px of an image of ``width`` x ``height`` px."""
-        return downscaled_size(width, height, self.downscale, self.max_size)
 
 
 Row = tuple[Number, Number, Number, Number]
@@ -122,45 +108,39 @@ def load_scene(
     Raises `InputError` if fewer than three views or no training view have a pose, or an image does
     not fit its camera.
     """
-    step = views_step(capture, model_dir, Downscaling(downscale, max_size, resample), progress)
-    folder = store.get(step).path
+    shrinking = {"downscale": downscale, "max_size": max_size, "resample": resample}
+    folder = store.get(views_step(capture, model_dir, shrinking, progress)).path
     prepared = read_typed(folder / CAMERAS_FILE, PreparedViews)
     entries = prepared.views
     oddities = settle(prepared.oddities, f"scene {capture.name}", capture.accept)
     oddities += _inspect_views(capture, entries)
 
-    def mask_of(name: str) -> Mask | None:
-        if name not in capture.masks:
-            return None
-        file = entries[name].file
-        mask = read_mask(folder / mask_file(file) if file else capture.masks[name])
-        return None if mask.all() else mask
-
     files = files_beside(capture, beside)
-    lenses = lenses_of(Path(model_dir)) if files else {}
-    scale = capture.normalization.scale
-
-    def beside_of(name: str, camera: Camera) -> dict[str, NDArray[Any]]:
-        found = {}
-        for kind, own in files.items():
-            if name in own:
-                found[kind] = view_of_file(own[name], kind, lenses[name], camera, depth_scale)
-        if DEPTH in found:
-            found[DEPTH] *= np.float32(scale)
-        return found
+    lenses = lenses_of(model_dir) if files else {}
 
     def view(name: str) -> View:
         entry = entries[name]
         image = read_image(folder / entry.file if entry.file else capture.images / name)
         camera = entry.camera
-        pictures = beside_of(name, camera)
+        pictures = {
+            kind: view_of_file(own[name], kind, lenses[name], camera, depth_scale)
+            for kind, own in files.items()
+            if name in own
+        }
+        if DEPTH in pictures:
+            pictures[DEPTH] *= np.float32(capture.normalization.scale)
         if image.shape[:2] != (camera.height, camera.width):
             raise InputError(
                 f"{folder}: {name} is not as it was prepared: delete this folder and run again"
             )
         if principal_point == "centred":
             camera = replace(camera, cx=camera.width / 2, cy=camera.height / 2)
-        return View(name, camera, image, mask_of(name), pictures)
+        mask = None
+        if name in capture.masks:
+            file = entry.file and folder / mask_file(entry.file)
+            mask = read_mask(file or capture.masks[name])
+            mask = None if mask.all() else mask
+        return View(name, camera, image, mask, pictures)
 
     names = [name for name in capture.image_names if name in entries]
     views = list(in_threads(view, names))
@@ -186,9 +166,11 @@ def load_scene(
 
 
 def views_step(
-    capture: Capture, model_dir: Path, downscaling: Downscaling, progress: Progress = no_progress
+    capture: Capture, model_dir: Path, shrinking: Mapping[str, Any], progress: Progress
 ) -> Step:
     """The step that prepares all posed images of the capture; no pixel depends on points.
+
+    ``shrinking`` are the last three fields of `ImageToPrepare`.
 
     Pillow reads and shrinks images, pycolmap undistorts them.
     """
@@ -197,28 +179,34 @@ def views_step(
         "capture": capture.fingerprint,
         "names": list(capture.image_names),
         "cameras": {file.name: file_sha256(file) for file in files},
-        **vars(downscaling),
+        **shrinking,
         **{package: version_of(package) for package in ("pycolmap", "pillow")},
     }
 
     def build(folder: Path) -> None:
-        entries: dict[str, dict[str, object]] = {}
+        cameras: dict[str, Camera] = {}
         changes: dict[str, ImageToPrepare] = {}
-        for index, (name, (model, pose)) in enumerate(_model_cameras(capture, model_dir).items()):
-            size = (model.width, model.height)
-            changed = model.distorted or downscaling.final_size(*size) != size
-            file = f"{index:05d}.png" if changed else ""
-            entries[name] = {"file": file, "pose": pose}
-            if changed:
-                source, mask = capture.images / name, capture.masks.get(name)
-                changes[name] = ImageToPrepare(source, model, folder / file, downscaling, mask)
+        models = _model_cameras(capture, model_dir)
+        for index, (name, (model, _)) in enumerate(models.items()):
+            target, mask = folder / f"{index:05d}.png", capture.masks.get(name)
+            image = ImageToPrepare(capture.images / name, model, target, mask, **shrinking)
+            size = model.width, model.height
+            if model.distorted or image.final_size(*size) != size:
+                changes[name] = image
             else:
-                entries[name] |= _intrinsics(to_pinhole(model))
+                cameras[name] = to_pinhole(model)
         lenses = {name: image.camera for name, image in changes.items() if image.camera.distorted}
         odd = inspect("lens", lens_findings(lenses), f"scene {capture.name}", capture.accept)
         prepared = prepare_all(list(changes.values()), progress)
-        for name, camera in zip(changes, prepared, strict=True):
-            entries[name] |= _intrinsics(camera)
+        cameras |= zip(changes, prepared, strict=True)
+        entries = {
+            name: {
+                "file": changes[name].target.name if name in changes else "",
+                "pose": pose,
+                **{key: getattr(cameras[name], key) for key in INTRINSICS},
+            }
+            for name, (_, pose) in models.items()
+        }
         found = {"oddities": [one.to_json() for one in odd]} if odd else {}
         write_json(folder / CAMERAS_FILE, {"views": entries} | found)
 
@@ -270,10 +258,6 @@ def _inspect_views(capture: Capture, placed: Collection[str]) -> tuple[Oddity, .
     return inspect("views", views, f"scene {capture.name}", capture.accept)
 
 
-def _intrinsics(camera: Camera) -> dict[str, float]:
-    return {key: getattr(camera, key) for key in INTRINSICS}
-
-
 @dataclass(frozen=True)
 class ImageToPrepare:
     """An image file, its camera at the file's size, and the PNG file to write.
@@ -284,8 +268,14 @@ class ImageToPrepare:
     source: Path
     camera: CameraModel
     target: Path
-    downscaling: Downscaling
     mask: Path | None = None
+    downscale: int = 1
+    max_size: int | None = None
+    resample: Resample = "lanczos"
+
+    def final_size(self, width: int, height: int) -> tuple[int, int]:
+        """The final size in px of an image of ``width`` x ``height`` px."""
+        return downscaled_size(width, height, self.downscale, self.max_size)
 
 
 def mask_file(image_file: str) -> str:
@@ -331,24 +321,21 @@ def prepare_image(image: ImageToPrepare) -> Camera:
         pixels, camera = undistort(pixels, image.camera)
     else:
         camera = to_pinhole(image.camera)
-    width, height = image.downscaling.final_size(camera.width, camera.height)
-    pixels = resize_image(pixels, width, height, image.downscaling.resample)
+    width, height = image.final_size(camera.width, camera.height)
+    pixels = resize_image(pixels, width, height, image.resample)
     image.target.parent.mkdir(parents=True, exist_ok=True)
     write_png(pixels, image.target)
     if image.mask is not None:
-        _prepare_mask(image.mask, image, width, height)
+        # Treated as the image: a pixel counts if no ignored pixel contributes to its area.
+        mask = read_mask(image.mask)
+        if image.camera.distorted:
+            levels = np.repeat(mask[..., None].astype(np.uint8) * WHITE, 3, axis=2)  # [H, W, 3]
+            mask = (undistort(levels, image.camera)[0] == WHITE).all(axis=2)
+        mask = resize_mask(mask, width, height)
+        if not mask.any():
+            raise InputError(
+                f"{image.mask}: no pixel is left that counts at {width}x{height} px: leave its "
+                "image out"
+            )
+        write_mask(mask, image.target.with_name(mask_file(image.target.name)))
     return camera.resized(width, height)
-
-
-def _prepare_mask(source: Path, image: ImageToPrepare, width: int, height: int) -> None:
-    """Treat the mask as the image: a pixel counts if no ignored pixel contributes to its area."""
-    mask = read_mask(source)
-    if image.camera.distorted:
-        levels = np.repeat(mask[..., None].astype(np.uint8) * WHITE, 3, axis=2)  # [H, W, 3]
-        mask = (undistort(levels, image.camera)[0] == WHITE).all(axis=2)
-    mask = resize_mask(mask, width, height)
-    if not mask.any():
-        raise InputError(
-            f"{source}: no pixel is left that counts at {width}x{height} px: leave its image out"
-        )
-    write_mask(mask, image.target.with_name(mask_file(image.target.name)))

@@ -61,21 +61,15 @@ def read_mask(path: Path, may_be_black: bool = False) -> Mask:
     Raises InputError for a file that is no mask: with colours, with many greys, or black
     everywhere unless it ``may_be_black``.
     """
-    with open_image(path) as image:
-        try:
-            image.load()
-            transparent = image.has_transparency_data
-            if transparent and np.asarray(image.convert("RGBA"))[..., 3].min() < 255:
-                raise InputError(
-                    f"{path}: a mask says by black what is ignored, not by transparency: save it "
-                    "as grey"
-                )
-            in_colors = image.mode in ("P", "CMYK", "YCbCr", "RGBA", "LA")
-            pixels = np.asarray(image.convert("RGB") if in_colors else image)
-        except InputError:
-            raise
-        except Exception as error:  # Pillow's readers may raise any exception on a damaged file
-            raise InputError(f"{path}: the mask is damaged ({error}): replace it") from error
+    with open_image(path, decode=True) as image:
+        transparent = image.has_transparency_data
+        if transparent and np.asarray(image.convert("RGBA"))[..., 3].min() < 255:
+            raise InputError(
+                f"{path}: a mask says by black what is ignored, not by transparency: save it as "
+                "grey"
+            )
+        in_colors = image.mode in ("P", "CMYK", "YCbCr", "RGBA", "LA")
+        pixels = np.asarray(image.convert("RGB") if in_colors else image)
     if pixels.ndim == 3:
         if (pixels != pixels[..., :1]).any():
             raise InputError(

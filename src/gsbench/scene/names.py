@@ -9,6 +9,7 @@ import unicodedata
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from os.path import commonprefix
 from pathlib import PurePosixPath
 
 from gsbench.errors import InputError
@@ -137,11 +138,14 @@ def match_pictures(
     rule gives a photograph several pictures, or if no rule gives each a picture. ``by_order`` is
     the option that error messages suggest for `match_by_order`.
     """
+    missing = photographs  # by the rule that leaves the fewest
     for rule, make_keys in PICTURE_RULES.items():
         keys = make_keys(photographs)
         by_key = grouped(pictures, make_keys(pictures).__getitem__)
-        if len({*keys.values()}) < len(photographs) or not {*keys.values()} <= by_key.keys():
-            continue  # it gives two photographs one key, or one no picture
+        lacking = [name for name in photographs if keys[name] not in by_key]
+        missing = min(missing, lacking, key=len)
+        if lacking or len({*keys.values()}) < len(photographs):
+            continue  # it gives a photograph no picture, or two one key
         for photograph, key in keys.items():
             if len(by_key[key]) > 1:
                 raise InputError(
@@ -150,7 +154,13 @@ def match_pictures(
                 )
         pairs = {photograph: by_key[key][0] for photograph, key in keys.items()}
         return Matching(pairs, rule, tuple(sorted(set(pictures) - set(pairs.values()))))
-    raise InputError(_no_match(photographs, pictures, by_order))
+    called = some_of(sorted(pictures)) or "there are none"
+    is_paired = len(pictures) == len(photographs)
+    hint = f"; {by_order} takes them as they are sorted" if is_paired else ""
+    raise InputError(
+        f"{len(missing)} of {counted(len(photographs), 'photograph')} have no picture of their "
+        f"name ({some_of(missing)}); the pictures are {called}: rename them{hint}"
+    )
 
 
 def match_by_order(photographs: Sequence[str], pictures: Sequence[str]) -> Matching:
@@ -175,22 +185,6 @@ def match_by_order(photographs: Sequence[str], pictures: Sequence[str]) -> Match
         )
     pairs = dict(zip(in_order, sorted(pictures, key=_by_value), strict=True))
     return Matching({photograph: pairs[photograph] for photograph in photographs}, BY_ORDER, ())
-
-
-def _no_match(photographs: Sequence[str], pictures: Sequence[str], by_order: str) -> str:
-    without = []  # by each rule, the photographs without a picture
-    for make_keys in PICTURE_RULES.values():
-        found, keys = {*make_keys(pictures).values()}, make_keys(photographs)
-        without.append([name for name in photographs if keys[name] not in found])
-    missing = min(without, key=len)
-    called = some_of(sorted(pictures)) or "there are none"
-    hint = (
-        f"; {by_order} takes them as they are sorted" if len(pictures) == len(photographs) else ""
-    )
-    return (
-        f"{len(missing)} of {counted(len(photographs), 'photograph')} have no picture of their "
-        f"name ({some_of(missing)}); the pictures are {called}: rename them{hint}"
-    )
 
 
 def _stem(name: str) -> str:
@@ -220,15 +214,11 @@ def _stripped(words: Words) -> Words:
     if len(words) < 2:
         return words
     texts = list(words.values())
-    start = len(_common_start(texts).rstrip("0123456789"))
-    end = len(_common_start([text[start:][::-1] for text in texts]).rstrip("0123456789"))
+    # Letters are compared, not parts of paths.
+    start = len(commonprefix(texts).rstrip("0123456789"))  # noqa: RUF071
+    ends = [text[start:][::-1] for text in texts]
+    end = len(commonprefix(ends).rstrip("0123456789"))  # noqa: RUF071
     return {name: text[start : len(text) - end] for name, text in words.items()}
-
-
-def _common_start(texts: Sequence[str]) -> str:
-    first, last = min(texts), max(texts)
-    different = (index for index, letter in enumerate(first) if last[index : index + 1] != letter)
-    return first[: next(different, len(first))]
 
 
 def _unpadded(words: Words) -> Words:

@@ -138,12 +138,6 @@ READ_BY = {
 }
 
 
-def folder_name(path: str | None) -> str:
-    """The last part of ``path`` as the scene's name, or ``scene`` if it names no folder."""
-    name = Path(path or "").expanduser().absolute().name
-    return name if is_folder_name(name) else "scene"
-
-
 @dataclass
 class SceneConfig(SplitRule):
     name: FolderName | None = MISSING  # null: the name of the folder `path`
@@ -178,7 +172,8 @@ class SceneConfig(SplitRule):
 
     def __post_init__(self) -> None:
         if self.name is None:
-            self.name = folder_name(self.path)
+            name = Path(self.path or "").expanduser().absolute().name
+            self.name = name if is_folder_name(name) else "scene"
         check_settings(self, "scene")
         if self.kind != "courtyard" and not self.path:
             raise InputError(

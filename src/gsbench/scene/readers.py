@@ -6,7 +6,7 @@ from pathlib import Path
 
 from gsbench.datasets.catalog import how_to_get
 from gsbench.errors import InputError
-from gsbench.scene.colmap_files import find_model, has_both_forms, require_subfolder
+from gsbench.scene.colmap_files import find_model, require_subfolder
 from gsbench.scene.companions import companions_beside, photographs_among
 from gsbench.scene.images import list_images
 from gsbench.scene.names import IMAGE_SUFFIXES, match, match_anywhere, same_folder, stem_of
@@ -37,8 +37,6 @@ def read_colmap(root: Path, options: SceneConfig) -> RawCapture:
         chosen = model_folder.relative_to(root)
         log.warning("%s has %s; %s %s; scene.sparse chooses another", root, found, chosen, why)
     folder = require_subfolder(root, options.images or "images", "scene.images")
-    if has_both_forms(model_folder):
-        log.warning("%s: the binary model is read, and not the text beside it", model_folder)
     model = read_model(model_folder)
     files = _images_outside_masks(root, folder, options.masks)
     posed = posed_by_name(model)
@@ -90,18 +88,11 @@ def read_photos(root: Path, options: SceneConfig) -> RawCapture:
     return RawCapture(folder, tuple(Photograph(name, folder / name) for name in names))
 
 
-def read_nerf(root: Path, options: SceneConfig) -> RawCapture:
-    """Read the photographs and cameras that ``transforms.json`` names."""
-    if options.images is not None:
-        require_subfolder(root, options.images, "scene.images")
-    return read_transforms(root, options.transparent, options.images)
-
-
 READERS: Mapping[str, Reader] = {
     "colmap": read_colmap,
     "courtyard": read_colmap,  # of the folder that gsbench has made
     "photos": read_photos,
-    "transforms": read_nerf,
+    "transforms": lambda root, options: read_transforms(root, options.transparent, options.images),
 }
 
 
@@ -128,10 +119,8 @@ def _images_outside_masks(root: Path, folder: Path, masks: str | None) -> list[s
 
 
 def existing_folder(name: str, path: Path | str | None) -> Path:
-    """The folder ``path`` of the scene ``name``; raises `InputError` if missing or not set."""
-    if path is None or str(path) == "":
-        raise InputError(f"scene {name}: scene.path is not set: give the folder of the photos")
-    root = Path(path).expanduser()
+    """The folder ``path`` of the scene ``name``; raises `InputError` if it is missing."""
+    root = Path(path or "").expanduser()
     if not root.is_dir():
         raise InputError(f"{missing_folder(name, root)}: {how_to_get([(name, root)])}")
     return root

@@ -14,6 +14,7 @@ from gsbench.errors import InputError
 from gsbench.scene.images import open_image
 from gsbench.scene.rules import Finding
 from gsbench.scene.types import Array, CameraModel, nearest_rotation
+from gsbench.scene.undistortion import as_colmap
 
 if TYPE_CHECKING:
     from gsbench.scene.colmap import Cloud
@@ -168,8 +169,6 @@ def _checked(folder: Path, photograph: Photograph) -> Photograph:
     """The photograph with plain values; raises InputError or ValueError for unusable ones."""
     import pycolmap
 
-    from gsbench.scene.colmap import new_camera
-
     name = str(photograph.name)
     place = PurePath(name)
     if place.is_absolute() or ".." in place.parts or not (folder / place).is_file():
@@ -182,7 +181,8 @@ def _checked(folder: Path, photograph: Photograph) -> Photograph:
     params = tuple(map(float, camera.params))
     if not np.isfinite(params).all():
         raise InputError("the camera's parameters must be finite")
-    made = new_camera(1, camera.name, camera.width, camera.height, params)
+    camera = CameraModel(camera.name, int(camera.width), int(camera.height), params)
+    made = as_colmap(camera)
     if not made.verify_params() or min(made.focal_length_x, made.focal_length_y) <= 0:
         raise InputError(f"{camera} is not a camera of COLMAP: it has {made.params_info}")
     turned = np.asarray(photograph.rotation, float)
@@ -195,7 +195,7 @@ def _checked(folder: Path, photograph: Photograph) -> Photograph:
         photograph,
         name=name,
         file=folder / place,
-        camera=CameraModel(camera.name, int(camera.width), int(camera.height), params),
+        camera=camera,
         rotation=nearest_rotation(turned, "the rotation"),
         translation=moved,
     )

@@ -11,7 +11,6 @@ of NeRF (Mildenhall et al. 2020).
 from __future__ import annotations
 
 import logging
-from collections import Counter
 from collections.abc import Collection
 from dataclasses import fields, replace
 from functools import cached_property
@@ -29,8 +28,9 @@ from gsbench.parsing import (
     resolved,
     text_of,
 )
+from gsbench.scene.colmap_files import require_subfolder
 from gsbench.scene.images import list_images
-from gsbench.scene.names import IMAGE_SUFFIXES, match, stem_of
+from gsbench.scene.names import IMAGE_SUFFIXES, match
 from gsbench.scene.options import Backdrop, require_enough
 from gsbench.scene.record import Photograph, PointsFile, RawCapture, Role
 from gsbench.scene.rules import Finding
@@ -48,12 +48,8 @@ from gsbench.words import counted, some_of
 log = logging.getLogger(__name__)
 
 ONE_FILE = "transforms.json"
-SPLIT_FILES = {
-    "train": "transforms_train.json",
-    "test": "transforms_test.json",
-    "val": "transforms_val.json",
-}
-SPLIT_ROLES: dict[str, Role] = {"": "", "train": "train", "test": "test", "val": "test"}
+# of the one file and of a Blender scene's files, transforms_train.json and so on
+ROLES: dict[str, Role] = {"": "", "train": "train", "test": "test", "val": "test"}
 
 
 def find_files(folder: Path) -> dict[str, Path]:
@@ -61,9 +57,8 @@ def find_files(folder: Path) -> dict[str, Path]:
 
     Raises InputError if the folder has neither.
     """
-    files = {
-        split: folder / name for split, name in SPLIT_FILES.items() if (folder / name).is_file()
-    }
+    files = {split: folder / f"transforms_{split}.json" for split in ROLES if split}
+    files = {split: path for split, path in files.items() if path.is_file()}
     if (folder / ONE_FILE).is_file():
         if files:
             others = ", ".join(path.name for path in files.values())
@@ -71,7 +66,7 @@ def find_files(folder: Path) -> dict[str, Path]:
         return {"": folder / ONE_FILE}
     if "train" not in files:
         raise InputError(
-            f"{folder}: neither {ONE_FILE} nor {SPLIT_FILES['train']} is here: give the folder "
+            f"{folder}: neither {ONE_FILE} nor transforms_train.json is here: give the folder "
             "that holds it, or take scene=colmap or scene=photos"
         )
     if "test" in files:
@@ -89,6 +84,8 @@ def read_transforms(
     the files name, as nerfstudio replaces ``images`` by ``images_4``: ``images_4/a.png`` is read
     for ``images/a.png``.
     """
+    if image_folder is not None:
+        require_subfolder(folder, image_folder, "scene.images")
     files = find_files(folder)
     records = {split: _read_record(path, backdrop) for split, path in files.items()}
     find = _FileFinder(folder, image_folder)
@@ -107,8 +104,7 @@ def read_transforms(
             if name in rows:
                 raise InputError(f"{path}: {name} is there twice: name each image once")
             camera = camera_of(folder / name, path, record, frame)
-            if not any(row.role == SPLIT_ROLES[split] for row in rows.values()):
-                ratios += focal_ratios(record, camera)
+            ratios += focal_ratios(record, frame, camera)
             rows[name] = Photograph(
                 name,
                 folder / name,
@@ -116,7 +112,7 @@ def read_transforms(
                 *pose_of(path, frame, applied),
                 mask=_beside(path, frame.mask_path),
                 depth=_beside(path, frame.depth_file_path),
-                role=SPLIT_ROLES[split],
+                role=ROLES[split] if len(files) > 1 else "",
             )
         all_missing += missing
         points = _points(path, record, applied, points)
@@ -126,13 +122,11 @@ def read_transforms(
         len(rows),
         folder,
         f"with a file and a camera in {first.name}{lacking}",
-        find.remedy(all_missing),
+        "set scene.images to the folder of the photographs" if all_missing else "",
     )
     if "" in files:
         roles = _named_split(files[""], records[""], rows, find)
         rows = {name: replace(row, role=roles.get(name, row.role)) for name, row in rows.items()}
-    elif len(files) == 1:
-        rows = {name: replace(row, role="") for name, row in rows.items()}
     read_from = (*files.values(), *(() if points is None else (points.path,)))
     ordered = tuple(rows[name] for name in sorted(rows))
     noted = {
@@ -184,15 +178,8 @@ def _read_record(path: Path, backdrop: Backdrop) -> TransformsRecord:
     except InputError as error:
         raise DamagedError(path, f"cannot be read: {error}") from error
     record = parse_typed(content, TransformsRecord, path)
-    check_keys(
-        path, from_json(content), names_of(TransformsRecord), names_of(FrameRecord), backdrop
-    )
+    check_keys(path, from_json(content), backdrop)
     return record
-
-
-def names_of(kind: Any) -> frozenset[str]:
-    """The keys of a record, which gsbench uses."""
-    return frozenset(field.name for field in fields(kind))
 
 
 class _FileFinder:
@@ -221,19 +208,6 @@ class _FileFinder:
             return match([relative.as_posix()], self._files).get(relative.as_posix())
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
-
-    def remedy(self, missing: Collection[str]) -> str:
-        """Advice, if one folder has files with the last parts of the ``missing`` names; else ""."""
-        wanted = {stem_of(PurePosixPath(name).name).casefold() for name in missing}
-        folders = Counter(
-            file.rpartition("/")[0]
-            for file in (self._files if wanted else ())
-            if stem_of(PurePosixPath(file).name).casefold() in wanted
-        )
-        if not folders:
-            return ""
-        folder, count = folders.most_common(1)[0]
-        return f"{folder or '.'} has {count} of the names: set scene.images={folder or '.'}"
 
 
 def _named_split(
@@ -266,42 +240,35 @@ def _named_split(
 
 
 # Keys that change no photograph, camera or initial point: how another program frames, thins or
-# samples the scene. The box, axes and scale in which instant-ngp and nerfstudio train; gsbench
-# keeps the coordinates of the file.
-BOX = ("aabb", "aabb_scale", "render_aabb", "near", "far")
-AXES = ("scale", "offset", "up", "from_na", "orientation_override")
-# Data besides photographs, which gsbench does not train on.
-DEPTH = (
-    "depth_path",
-    "integer_depth_scale",
-    "enable_depth_loading",
-    "depth_unit_scale_factor",
+# samples the scene; data besides photographs, on which gsbench does not train; notes.
+HARMLESS = frozenset(
+    (
+        # The box, axes and scale in which instant-ngp and nerfstudio train; gsbench keeps the
+        # coordinates of the file.
+        *("aabb", "aabb_scale", "render_aabb", "near", "far"),
+        *("scale", "offset", "up", "from_na", "orientation_override"),
+        *("depth_path", "integer_depth_scale", "enable_depth_loading", "depth_unit_scale_factor"),
+        *(
+            "enable_ray_loading",
+            "normal_file_path",
+            "envmap",
+            "importance_sampling",
+            "n_extra_learnable_dims",
+        ),
+        "black_transparent",  # black pixels are: harmless where these are blended over black
+        *("sharpness", "blur_score", "colmap_im_id", "camera_id"),
+        *("rotation", "timestamp", "camera_label"),
+    )
 )
-OTHER_DATA = ("enable_ray_loading", "normal_file_path", "envmap")
-# `black_transparent` makes black pixels transparent: harmless where these are blended over black.
-TRAINING = ("importance_sampling", "n_extra_learnable_dims", "black_transparent")
-NOTES = (
-    "sharpness",
-    "blur_score",
-    "colmap_im_id",
-    "camera_id",
-    "rotation",
-    "timestamp",
-    "camera_label",
-)
-HARMLESS = frozenset((*BOX, *AXES, *DEPTH, *OTHER_DATA, *TRAINING, *NOTES))
 # Keys that change pixels, cameras or the choice of frames, and why a file that uses them is
 # refused.
 REFUSED = {
     "rolling_shutter": "photographs with a rolling shutter have no single pose",
-    "transform_matrix_start": "a frame that moves has no single pose",
-    "transform_matrix_end": "a frame that moves has no single pose",
     **dict.fromkeys(
-        ("ftheta_p0", "ftheta_p1", "ftheta_p2", "ftheta_p3", "ftheta_p4"),
-        "the F-theta lens is not known",
+        ("transform_matrix_start", "transform_matrix_end"), "a frame that moves has no single pose"
     ),
-    "latlong": "a panorama is no pinhole image",
-    "equirectangular": "a panorama is no pinhole image",
+    **{f"ftheta_p{power}": "the F-theta lens is not known" for power in range(5)},
+    **dict.fromkeys(("latlong", "equirectangular"), "a panorama is no pinhole image"),
     **dict.fromkeys(("s1", "s2", "s3", "s4"), "thin-prism distortion is not read"),
     "distortion_params": "write its numbers as k1, k2, k3, k4, p1 and p2",
     "normal_mts_args": "Mitsuba's axes are not known",
@@ -318,37 +285,25 @@ BLACK_BECOMES_WHITE = {
 }
 
 
-def check_keys(
-    path: Path,
-    document: Any,
-    file_keys: Collection[str],
-    frame_keys: Collection[str],
-    backdrop: Backdrop,
-) -> None:
+def check_keys(path: Path, document: Any, backdrop: Backdrop) -> None:
     """Check the keys of a file that gsbench does not use.
 
-    ``file_keys`` are the used keys of the file, ``frame_keys`` those of a frame; ``backdrop`` is
-    the colour under transparent pixels. Raises InputError for a key of `REFUSED` whose value has an
-    effect (`says_something`). Logs one line that names unknown keys.
+    ``backdrop`` is the colour under transparent pixels. Raises InputError for a key of `REFUSED`
+    whose value has an effect (`says_something`). Logs one line that names unknown keys.
     """
     refused = REFUSED if backdrop == "black" else REFUSED | BLACK_BECOMES_WHITE
     unknown: set[str] = set()
-    records = [("", document, file_keys)]
-    for number, frame in enumerate(document["frames"]):
-        records.append((f" (frame {number})", frame, frame_keys))
-    for place, record, used in records:
+    frames = [(f" (frame {number})", frame) for number, frame in enumerate(document["frames"])]
+    for place, record in [("", document), *frames]:
+        used = {entry.name for entry in fields(FrameRecord if place else TransformsRecord)}
         for key, value in record.items():
             if key in refused and says_something(key, value):
                 raise InputError(f"{path}: {key}{place}: {refused[key]}")
-            if key not in used and key not in HARMLESS and key not in REFUSED:
+            if not (key in used or key in HARMLESS or key in REFUSED):
                 unknown.add(key)
     if unknown:
-        log.warning(
-            "%s: %s not known and not used: %s",
-            path,
-            _are(len(unknown)),
-            ", ".join(sorted(unknown)),
-        )
+        are = f"{counted(len(unknown), 'key')} {'is' if len(unknown) == 1 else 'are'}"
+        log.warning("%s: %s not known and not used: %s", path, are, ", ".join(sorted(unknown)))
 
 
 def says_something(key: str, value: Any) -> bool:
@@ -361,7 +316,3 @@ def says_something(key: str, value: Any) -> bool:
     if isinstance(value, list):
         return any(says_something(key, item) for item in value)
     return bool(value)
-
-
-def _are(count: int) -> str:
-    return f"{counted(count, 'key')} {'is' if count == 1 else 'are'}"

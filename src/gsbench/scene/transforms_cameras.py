@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from annotated_types import Len
@@ -24,11 +24,18 @@ LAST_ROW = [0.0, 0.0, 0.0, 1.0]
 OPENGL = np.diag([1.0, -1.0, -1.0])  # from OpenCV's camera axes to OpenGL's, and back
 PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 FISHEYE = "OPENCV_FISHEYE"
+RATIONAL = "FULL_OPENCV"  # OpenCV's: a polynomial of k1, k2, k3 divided by one of k4, k5, k6
+# the coefficients of each camera model, in COLMAP's order
+MODELS = {
+    **dict.fromkeys(PERSPECTIVE, ("k1", "k2", "p1", "p2")),
+    RATIONAL: ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    FISHEYE: ("k1", "k2", "k3", "k4"),
+}
 FOCAL_KEYS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov")
+OTHER_KEYS = ("w", "h", "cx", "cy", "camera_model", "is_fisheye")
 # A principal point may be the centre of a copy of another size if it is off by one factor along
 # both sides, up to a tenth.
 SAME_SCALE = 0.1
-RATIONAL = "FULL_OPENCV"  # OpenCV's: a polynomial of k1, k2, k3 divided by one of k4, k5, k6
 
 
 class Intrinsics(Record):
@@ -81,21 +88,16 @@ class TransformsRecord(Intrinsics):
 class AppliedTransform:
     """The transform and scale that were applied to the original data before it was saved."""
 
-    rotation: Array = field(default_factory=lambda: np.eye(3))  # [3, 3]
-    translation: Array = field(default_factory=lambda: np.zeros(3))  # [3]
+    matrix: Array = field(default_factory=lambda: np.eye(3, 4))  # rotation and translation
     scale: float = 1.0
 
     def equals(self, other: AppliedTransform) -> bool:
         """Return whether both are the same, to the last bit."""
-        return (
-            np.array_equal(self.rotation, other.rotation)
-            and np.array_equal(self.translation, other.translation)
-            and self.scale == other.scale
-        )
+        return self.scale == other.scale and np.array_equal(self.matrix, other.matrix)
 
     def undo(self, saved: Array) -> Array:
         """Convert saved points [P, 3] to the coordinates of the original data."""
-        original: Array = (saved / self.scale - self.translation) @ self.rotation
+        original: Array = (saved / self.scale - self.matrix[:, 3]) @ self.matrix[:, :3]
         return original
 
 
@@ -105,67 +107,62 @@ def applied_transform_of(path: Path, record: TransformsRecord) -> AppliedTransfo
         raise InputError(f"{path}: applied_scale must be positive, got {scale}")
     if record.applied_transform is None:
         return AppliedTransform(scale=scale)
-    what = f"{path}: applied_transform"
-    matrix = _three_rows(record.applied_transform, what)
-    return AppliedTransform(nearest_rotation(matrix[:, :3], what), matrix[:, 3], scale)
+    return AppliedTransform(_rigid(record.applied_transform, f"{path}: applied_transform"), scale)
 
 
-def _three_rows(matrix: Matrix, what: str) -> Array:
-    """The first three rows [3, 4]; raises InputError if a fourth one is not `LAST_ROW`."""
+def _rigid(matrix: Matrix, what: str) -> Array:
+    """The nearest rotation and the translation [3, 4].
+
+    Raises InputError if a fourth row is not `LAST_ROW`, or the matrix does not only rotate.
+    """
     if matrix[3:] and not np.allclose(matrix[3], LAST_ROW, atol=ROTATION_TOLERANCE):
         raise InputError(f"{what} must end with the row 0, 0, 0, 1: transpose it if it has columns")
     rows: Array = np.array(matrix[:3])
+    rows[:, :3] = nearest_rotation(rows[:, :3], what)
     return rows
 
 
 def pose_of(path: Path, frame: FrameRecord, applied: AppliedTransform) -> tuple[Array, Array]:
-    what = f"{path}: transform_matrix of {frame.file_path}"
-    matrix = _three_rows(frame.transform_matrix, what)
-    saved = nearest_rotation(matrix[:, :3], what)
-    world_from_camera = applied.rotation.T @ saved @ OPENGL
-    center = applied.undo(matrix[None, :, 3])[0]
-    rotation = world_from_camera.T
-    return rotation, -rotation @ center
+    saved = _rigid(frame.transform_matrix, f"{path}: transform_matrix of {frame.file_path}")
+    rotation = (applied.matrix[:, :3].T @ saved[:, :3] @ OPENGL).T
+    return rotation, -rotation @ applied.undo(saved[None, :, 3])[0]
+
+
+def intrinsics_of(record: TransformsRecord, frame: FrameRecord) -> dict[str, Any]:
+    """A frame's own intrinsics, else the file's.
+
+    Focal lengths come from one of both, and so do coefficients: never a mix.
+    """
+    found: dict[str, Any] = {}
+    for keys in (FOCAL_KEYS, MODELS[RATIONAL], *((key,) for key in OTHER_KEYS)):
+        source = frame if any(getattr(frame, key) is not None for key in keys) else record
+        found |= {key: getattr(source, key) for key in keys}
+    return found
 
 
 def camera_of(image: Path, path: Path, record: TransformsRecord, frame: FrameRecord) -> CameraModel:
-    """The camera of a frame, by the frame's own intrinsics, else by those of the file."""
-
-    def value(name: str) -> float | None:
-        own = getattr(frame, name)
-        intrinsic: float | None = getattr(record, name) if own is None else own
-        return intrinsic
-
-    where = f"{path}: {frame.file_path}"
+    """The camera of a frame."""
+    where, given = f"{path}: {frame.file_path}", intrinsics_of(record, frame)
     _check_own_size(where, record, frame)
-    width, height = value("w"), value("h")
+    width, height, cx, cy = (given[key] for key in ("w", "h", "cx", "cy"))
     if width is None or height is None:
         width, height = image_size(image)
-        _check_center(where, (width, height), (value("cx"), value("cy")))
+        _check_center(where, width, height, cx, cy)
     if width != int(width) or height != int(height) or min(width, height) < 1:
         raise InputError(f"{where}: w and h must be whole numbers of px, got {width} and {height}")
-    source = _source(record, frame, FOCAL_KEYS)
-    focal_x = _focal_length(width, source.fl_x, source.camera_angle_x, source.x_fov)
-    focal_y = _focal_length(height, source.fl_y, source.camera_angle_y, source.y_fov)
+    sides = _focal_lengths(given, width, height)
+    focals = [meant if written is None else written for written, meant in sides]
     # Pixels are square if only one of both is given, as in instant-ngp and nerfstudio.
-    focal_x, focal_y = (
-        focal_y if focal_x is None else focal_x,
-        focal_x if focal_y is None else focal_y,
-    )
-    if focal_x is None or focal_y is None or min(focal_x, focal_y) <= 0.0:
+    known = [focal for focal in focals if focal is not None]
+    if not known or min(known) <= 0.0:
         raise InputError(
             f"{where}: no focal length: fl_x, camera_angle_x (between 0 and pi) or x_fov (between "
             "0 and 180) must be given, or the same for y"
         )
-    cx, cy = value("cx"), value("cy")
     center = (width / 2 if cx is None else cx, height / 2 if cy is None else cy)
-    model, distortion = _distortion(where, record, frame)
-    return CameraModel(model, int(width), int(height), (focal_x, focal_y, *center, *distortion))
-
-
-def _source(record: TransformsRecord, frame: FrameRecord, keys: Collection[str]) -> Intrinsics:
-    """The frame, if it has a value of its own for one of ``keys``, else the file; never a mix."""
-    return frame if any(getattr(frame, key) is not None for key in keys) else record
+    model, distortion = _distortion(where, given)
+    params = known[0], known[-1], *center, *distortion
+    return CameraModel(model, int(width), int(height), params)
 
 
 def _check_own_size(where: str, record: TransformsRecord, frame: FrameRecord) -> None:
@@ -184,82 +181,64 @@ def _check_own_size(where: str, record: TransformsRecord, frame: FrameRecord) ->
 
 
 def _check_center(
-    where: str, size: tuple[float, float], center: tuple[float | None, float | None]
+    where: str, width: float, height: float, cx: float | None, cy: float | None
 ) -> None:
     """Raise InputError if the principal point is the centre of a copy of another size."""
-    cx, cy = center
-    if cx is None or cy is None:
+    if cx is None or cy is None or min(cx, cy) <= 0:
         return
-    ratios = [2 * cx / size[0], 2 * cy / size[1]]  # 1 at the centre
-    if min(ratios) <= 0 or abs(math.log(ratios[0] / ratios[1])) > math.log(1 + SAME_SCALE):
-        return
-    facts = {"cx": cx, "cy": cy, "width": size[0], "height": size[1]}
-    given("principal-point-of-other-size", ratios[0], where, **facts)
+    across, down = 2 * cx / width, 2 * cy / height  # 1 at the centre
+    if abs(math.log(across / down)) <= math.log(1 + SAME_SCALE):
+        facts = {"cx": cx, "cy": cy, "width": width, "height": height}
+        given("principal-point-of-other-size", across, where, **facts)
 
 
-def _distortion(
-    where: str, record: TransformsRecord, frame: FrameRecord
-) -> tuple[str, tuple[float, ...]]:
+def _distortion(where: str, intrinsics: Mapping[str, Any]) -> tuple[str, tuple[float, ...]]:
     """COLMAP's name of the camera model, and its parameters after the principal point."""
-    names = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-    source = _source(record, frame, names)
-    k1, k2, k3, k4, k5, k6, p1, p2 = (getattr(source, name) or 0.0 for name in names)
-    fisheye = record.is_fisheye if frame.is_fisheye is None else frame.is_fisheye
-    model = frame.camera_model or record.camera_model or (FISHEYE if fisheye else "OPENCV")
-    if model == FISHEYE:
-        if any((k5, k6, p1, p2)):
-            raise InputError(
-                f"{where}: {FISHEYE} has k1 to k4 alone, but k5, k6, p1 or p2 is not 0"
-            )
-        return model, (k1, k2, k3, k4)
-    if model == RATIONAL:
-        return model, (k1, k2, p1, p2, k3, k4, k5, k6)
-    if model not in PERSPECTIVE:
+    given = {name: intrinsics[name] or 0.0 for name in MODELS[RATIONAL]}
+    model = intrinsics["camera_model"] or (FISHEYE if intrinsics["is_fisheye"] else "OPENCV")
+    if model not in MODELS:
+        raise InputError(f"{where}: camera_model {model} is not known here ({', '.join(MODELS)})")
+    if model in PERSPECTIVE:
+        # k4 is a coefficient of r^8 in nerfstudio and Metashape, but a divisor in OpenCV; only
+        # RATIONAL says which.
+        needs_k3 = given["k3"] and not any(given[name] for name in ("k4", "k5", "k6"))
+        model = RATIONAL if needs_k3 else "OPENCV"
+    if unread := [name for name in given if given[name] and name not in MODELS[model]]:
         raise InputError(
-            f"{where}: camera_model {model} is not known here "
-            f"({', '.join((*PERSPECTIVE, RATIONAL, FISHEYE))})"
+            f"{where}: {', '.join(unread)} must be 0 with {model}; of the models that are read, "
+            f"only {FISHEYE} has k4, and {RATIONAL} has k4, k5 and k6: make a COLMAP model"
         )
-    # k4 is a coefficient of r^8 in nerfstudio and Metashape, but a divisor in OpenCV; only RATIONAL
-    # says which.
-    if any((k4, k5, k6)):
-        raise InputError(
-            f"{where}: k4, k5 and k6 are read of {FISHEYE} and {RATIONAL} alone: make a COLMAP "
-            "model"
-        )
-    if k3:
-        return RATIONAL, (k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
-    return ("OPENCV", (k1, k2, p1, p2)) if any((k1, k2, p1, p2)) else ("PINHOLE", ())
+    params = tuple(given[name] for name in MODELS[model])
+    return (model, params) if any(params) or model != "OPENCV" else ("PINHOLE", ())
 
 
-def _focal_length(
-    side: float, given: float | None, angle: float | None, degrees: float | None
-) -> float | None:
-    """The focal length in px along a side, given or from the field of view (radians or degrees).
+def _focal_lengths(
+    given: Mapping[str, Any], width: float, height: float
+) -> list[tuple[float | None, float | None]]:
+    """For x and for y the focal length in px that is given, and that which the field of view means.
 
-    None if nothing is given, and 0 if the field of view is not between 0 and 180 degrees.
+    The latter is 0 if the field of view is not between 0 and 180 degrees.
     """
-    if given is not None:
-        return given
-    if angle is None and degrees is not None:
-        angle = math.radians(degrees)
-    if angle is None:
-        return None
-    return side / (2 * math.tan(angle / 2)) if 0 < angle < math.pi else 0.0
-
-
-def focal_ratios(record: TransformsRecord, camera: CameraModel) -> list[Finding]:
-    """Focal lengths over those that fields of view mean, where a record gives both."""
     found = []
-    for source in (record, *record.frames):
-        width = camera.width if source.w is None else source.w
-        height = camera.height if source.h is None else source.h
-        given = (source.fl_x, source.fl_y)
-        meant = (
-            _focal_length(width, None, source.camera_angle_x, source.x_fov),
-            _focal_length(height, None, source.camera_angle_y, source.y_fov),
-        )
-        for length, other in zip(given, meant, strict=True):
-            if length and other:
-                name = [source.file_path] if isinstance(source, FrameRecord) else ["the file"]
-                found.append(Finding(length / other, name, {"given": length, "meant": other}))
+    for side, axis in ((width, "x"), (height, "y")):
+        angle, degrees = given[f"camera_angle_{axis}"], given[f"{axis}_fov"]
+        if angle is None and degrees is not None:
+            angle = math.radians(degrees)
+        meant = None
+        if angle is not None:
+            meant = side / (2 * math.tan(angle / 2)) if 0 < angle < math.pi else 0.0
+        found.append((given[f"fl_{axis}"], meant))
     return found
+
+
+def focal_ratios(
+    record: TransformsRecord, frame: FrameRecord, camera: CameraModel
+) -> list[Finding]:
+    """Focal lengths over those that fields of view mean, where both are given."""
+    return [
+        Finding(written / meant, [frame.file_path], {"given": written, "meant": meant})
+        for written, meant in _focal_lengths(
+            intrinsics_of(record, frame), camera.width, camera.height
+        )
+        if written and meant
+    ]

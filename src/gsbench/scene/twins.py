@@ -15,14 +15,9 @@ from PIL import Image
 
 from gsbench.files import file_sha256
 from gsbench.scene.masks import resize_mask
-from gsbench.scene.names import stem_of
+from gsbench.scene.names import grouped, stem_of
 from gsbench.scene.rules import given
 from gsbench.scene.types import Scene, Twins, View
-
-# Formats in the order of preference between equally frequent ones: a JPEG usually has a focal
-# length in its EXIF data.
-FORMATS = (".jpg", ".png", ".tif", ".webp", ".bmp")
-SAME_FORMAT = {".jpeg": ".jpg", ".tiff": ".tif"}
 
 # Near twins are compared as grey pictures of 24 x 24 cells, whatever their sizes and shapes,
 # because a copy may be shrunk, rounded or cut. In 16 captures, a second shot that is moved by half
@@ -37,29 +32,28 @@ LEAST_DEVIATION = 1.0  # of 255 grey values; a small picture that varies less ha
 def copies_by_name(names: Sequence[str], wanted: Collection[str] = ()) -> dict[str, str]:
     """Map each unused copy to the photograph used instead; their paths differ by the extension.
 
-    Of such photographs, a name in ``wanted`` is used first; then the format that more of the
+    Of such photographs, a name in ``wanted`` is used first; then the extension that more of the
     ``names`` have, so that a folder which has all photographs in one format is read in that format;
-    then a JPEG.
+    then the first name (a.jpg before a.png).
 
     Examples:
         >>> copies_by_name(["a.jpg", "a.png", "b.jpg"])
         {'a.png': 'a.jpg'}
     """
-    frequency = Counter(_format(name) for name in names)
+    frequency = Counter(_suffix(name) for name in names)
 
-    def rank(name: str) -> tuple[bool, int, int, str]:
-        return name not in wanted, -frequency[_format(name)], FORMATS.index(_format(name)), name
+    def rank(name: str) -> tuple[bool, int, str]:
+        return name not in wanted, -frequency[_suffix(name)], name
 
-    by_stem: dict[str, list[str]] = defaultdict(list)
-    for name in names:
-        by_stem[stem_of(name)].append(name)
-    used = {stem: min(group, key=rank) for stem, group in by_stem.items()}
-    return {name: used[stem_of(name)] for name in names if used[stem_of(name)] != name}
+    copies: dict[str, str] = {}
+    for group in grouped(names, stem_of).values():
+        used = min(group, key=rank)
+        copies |= {name: used for name in group if name != used}
+    return copies
 
 
-def _format(name: str) -> str:
-    suffix = PurePosixPath(name).suffix.lower()
-    return SAME_FORMAT.get(suffix, suffix)
+def _suffix(name: str) -> str:
+    return PurePosixPath(name).suffix.lower()
 
 
 def copies_of_test_views(folder: Path, train: Sequence[str], test: Sequence[str]) -> dict[str, str]:
@@ -67,17 +61,17 @@ def copies_of_test_views(folder: Path, train: Sequence[str], test: Sequence[str]
 
     Only files of equal size are read, so a capture without copies costs no reading.
     """
-    by_size: dict[int, list[str]] = defaultdict(list)
-    for name in test:
-        if (folder / name).is_file():
-            by_size[(folder / name).stat().st_size].append(name)
-    copies = {}
-    for name in train:
+
+    def size(name: str) -> str:
         file = folder / name
-        alike = by_size.get(file.stat().st_size, []) if file.is_file() else []
-        same = [other for other in alike if file_sha256(folder / other) == file_sha256(file)]
-        if same:
-            copies[name] = same[0]
+        return str(file.stat().st_size) if file.is_file() else name
+
+    by_size = grouped(test, size)
+    copies: dict[str, str] = {}
+    for name in train:
+        for other in by_size.get(size(name), ()):
+            if file_sha256(folder / other) == file_sha256(folder / name):
+                copies.setdefault(name, other)
     return copies
 
 

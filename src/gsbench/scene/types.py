@@ -50,12 +50,11 @@ class Camera:
             raise ValueError(
                 f"camera: width and height must be at least 1 px, got {self.width}x{self.height}"
             )
-        if not (np.isfinite(self.fx) and np.isfinite(self.fy) and self.fx > 0 and self.fy > 0):
+        in_px = self.fx, self.fy, self.cx, self.cy
+        if not np.isfinite(in_px).all() or min(self.fx, self.fy) <= 0:
             raise ValueError(
-                f"camera: fx and fy must be finite and positive, got fx={self.fx}, fy={self.fy}"
+                f"camera: fx, fy, cx and cy must be finite, and fx and fy positive, got {in_px}"
             )
-        if not (np.isfinite(self.cx) and np.isfinite(self.cy)):
-            raise ValueError(f"camera: cx and cy must be finite, got cx={self.cx}, cy={self.cy}")
         rotation = np.asarray(self.rotation, dtype=np.float64)
         translation = np.asarray(self.translation, dtype=np.float64)
         # 1e-4: quaternions are written with few digits, and pycolmap accepts any length
@@ -228,13 +227,6 @@ ANGLE, DISTANCE = "angle_to_nearest", "distance_to_nearest"
 COUNTED = "counted"
 
 
-def angles_between(directions: Array, references: Array) -> Array:
-    """Angles [V, W] in degrees between unit vectors [V, 3] and [W, 3]."""
-    # The chord is accurate near an angle of 0, the arc cosine is not.
-    chords = np.linalg.norm(directions[:, None] - references[None], axis=-1)
-    return 2 * np.degrees(np.arcsin(np.clip(chords / 2, 0.0, 1.0)))
-
-
 def nearest_training_cameras(
     cameras: Sequence[Camera], training: Sequence[Camera], extent: float
 ) -> list[dict[str, float]]:
@@ -247,17 +239,16 @@ def nearest_training_cameras(
     if not cameras or not training:
         return [{} for _ in cameras]
 
-    def directions(group: Sequence[Camera]) -> Array:
-        return np.array([camera.rotation[2] for camera in group])
-
-    def centers(group: Sequence[Camera]) -> Array:
-        return np.array([camera.center for camera in group])
-
-    angles = angles_between(directions(cameras), directions(training)).min(axis=1)  # [V]
+    (ahead, references), (centers, places) = (
+        [np.array([value(camera) for camera in group]) for group in (cameras, training)]
+        for value in (lambda camera: camera.rotation[2], lambda camera: camera.center)
+    )
+    # The chord is accurate near an angle of 0, the arc cosine is not.
+    chords = np.linalg.norm(ahead[:, None] - references, axis=-1).min(axis=1)  # [V]
+    angles = 2 * np.degrees(np.arcsin(np.clip(chords / 2, 0.0, 1.0)))
     measured = [{ANGLE: float(angle)} for angle in angles]
     if extent > 0:
-        offsets = centers(cameras)[:, None] - centers(training)[None]  # [V, W, 3]
-        apart = np.linalg.norm(offsets, axis=-1)  # [V, W]
+        apart = np.linalg.norm(centers[:, None] - places, axis=-1)  # [V, W]
         for values, distance in zip(measured, apart.min(axis=1), strict=True):
             values[DISTANCE] = float(distance) / extent
     return measured

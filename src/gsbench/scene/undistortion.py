@@ -6,7 +6,8 @@ coefficients are zero. Undistorting these again would resample every pixel for n
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from gsbench.errors import InputError
 from gsbench.scene.rules import Finding
-from gsbench.scene.types import Camera, CameraModel, to_pinhole
+from gsbench.scene.types import PINHOLE_NAMES, Camera, CameraModel, to_pinhole
 from gsbench.system.isolate import CrashError, run_isolated
 from gsbench.words import some_of
 
@@ -64,7 +65,7 @@ def flatten(cameras: Sequence[CameraModel]) -> list[Flattened]:
     """
     found = []
     for camera in cameras:
-        source, pinhole = _colmap_camera(camera), _pinhole_of(camera)
+        source, pinhole = as_colmap(camera), _pinhole_of(camera)
         found.append((folded_share(source, pinhole), pinhole.width, pinhole.height))
     return found
 
@@ -73,29 +74,44 @@ def _pinhole_of(camera: CameraModel) -> pycolmap.Camera:
     """COLMAP's camera of the undistorted photograph; raises InputError if there is none."""
     import pycolmap
 
-    try:
+    with _refusing(camera):
         options = pycolmap.UndistortCameraOptions()
-        return pycolmap.undistort_camera(options, _colmap_camera(camera))
-    except (ValueError, RuntimeError) as error:
-        raise InputError(_no_pinhole(camera)) from error
+        return pycolmap.undistort_camera(options, _perspective(camera))
 
 
-def _colmap_camera(camera: CameraModel) -> pycolmap.Camera:
-    """The camera as COLMAP's; raises `InputError` for a full panorama."""
+def as_colmap(camera: CameraModel, camera_id: int = 1) -> pycolmap.Camera:
+    """The camera as an object of COLMAP's."""
     import pycolmap  # slow to load, and not needed for pinhole images
 
     size = {"width": camera.width, "height": camera.height}
-    source = pycolmap.Camera(model=camera.name, params=list(camera.params), **size)
+    params = list(camera.params)
+    return pycolmap.Camera(camera_id=camera_id, model=camera.name, params=params, **size)
+
+
+def as_values(camera: pycolmap.Camera) -> CameraModel:
+    """A COLMAP camera as plain values."""
+    params = tuple(map(float, camera.params))
+    return CameraModel(camera.model_name, camera.width, camera.height, params)
+
+
+def _perspective(camera: CameraModel) -> pycolmap.Camera:
+    """The camera as COLMAP's; raises ValueError for a full panorama."""
+    source = as_colmap(camera)
     if source.is_spherical():
-        raise InputError(_no_pinhole(camera))
+        raise ValueError(camera.name)
     return source
 
 
-def _no_pinhole(camera: CameraModel) -> str:
-    return (
-        f"images of the camera model {camera.name} with parameters {camera.params} cannot be made "
-        "pinhole images: use another camera model"
-    )
+@contextmanager
+def _refusing(camera: CameraModel) -> Iterator[None]:
+    """Raise InputError for what COLMAP cannot undistort."""
+    try:
+        yield
+    except (ValueError, RuntimeError) as error:
+        raise InputError(
+            f"images of the camera model {camera.name} with parameters {camera.params} cannot be "
+            "made pinhole images: use another camera model"
+        ) from error
 
 
 def flat_camera(camera: CameraModel) -> Camera:
@@ -111,12 +127,10 @@ def undistort(image: NDArray[np.uint8], camera: CameraModel) -> tuple[NDArray[np
     """
     import pycolmap
 
-    source = _colmap_camera(camera)
     bitmap = pycolmap.Bitmap.from_array(np.ascontiguousarray(image))
-    try:
-        flat, pinhole = pycolmap.undistort_image(pycolmap.UndistortCameraOptions(), bitmap, source)
-    except (ValueError, RuntimeError) as error:
-        raise InputError(_no_pinhole(camera)) from error
+    with _refusing(camera):
+        options = pycolmap.UndistortCameraOptions()
+        flat, pinhole = pycolmap.undistort_image(options, bitmap, _perspective(camera))
     return np.array(flat.to_array()), to_pinhole(plain_camera(pinhole))
 
 
@@ -127,33 +141,21 @@ def without_distortion(camera: pycolmap.Camera) -> pycolmap.Camera:
     while FULL_OPENCV with coefficients that cancel, FOV with an angle near 0 and EUCM with alpha =
     0 are. SIMPLE_PINHOLE stays as it is.
     """
-    import pycolmap
-
     # pycolmap's focal lengths of a panorama are not defined; asking for them ends the process.
-    if (
-        camera.model in (pycolmap.CameraModelId.PINHOLE, pycolmap.CameraModelId.SIMPLE_PINHOLE)
-        or camera.is_spherical()
-    ):
+    if camera.model_name in PINHOLE_NAMES or camera.is_spherical():
         return camera
     if not largest_distortion(camera) <= MAX_IGNORED_DISTORTION:  # also for NaN
         return camera
-    pinhole = pycolmap.Camera(
-        camera_id=camera.camera_id,
-        model=pycolmap.CameraModelId.PINHOLE,
-        width=camera.width,
-        height=camera.height,
-        params=_pinhole_parameters(camera),
-    )
+    params = tuple(_pinhole_parameters(camera))
+    values = CameraModel("PINHOLE", camera.width, camera.height, params)
+    pinhole = as_colmap(values, camera.camera_id)
     pinhole.has_prior_focal_length = camera.has_prior_focal_length
     return pinhole
 
 
 def plain_camera(camera: pycolmap.Camera) -> CameraModel:
     """A COLMAP camera as plain values, as PINHOLE if it has no distortion."""
-    camera = without_distortion(camera)
-    return CameraModel(
-        camera.model_name, camera.width, camera.height, tuple(map(float, camera.params))
-    )
+    return as_values(without_distortion(camera))
 
 
 def largest_distortion(camera: pycolmap.Camera) -> float:

@@ -28,7 +28,7 @@ VERBS = {  # their modules, with their purposes as `gsbench --help` lists them
     "bench": ("machine", "time rasterizers and the training step"),
     "clean": ("clean", "what the store holds, and removing what no trial refers to"),
     "sync": ("trials", "send to MLflow the trials that it lacks"),
-    "ui": ("servers", "compare the arms of an experiment in MLflow, in the browser"),
+    "ui": ("servers", "compare the arms of an experiment in MLflow, in a browser"),
     "export": (
         "exchange",
         "copy a trained model, an initial cloud or an experiment's results for others",

@@ -28,7 +28,15 @@ def ablate(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 0; raises InputError for bad input."""
     from gsbench.pipeline.parts import Parts  # here, for a quick answer to --help
 
-    options = _parser().parse_args(argv)
+    options = ArgumentParser(
+        "ablate",
+        "It writes an experiment with a grid for each combination (docs/claims.md).",
+        {
+            "settings* KEY=VALUE": "as of a sweep: densify=volumetric seed=0,1,2 …",
+            "--switches A,B": ("only these; default: all declared", names, ()),
+            "--out FILE": ("such as conf/experiment/parts.yaml; default: print it", path),
+        },
+    ).parse_args(argv)
     words = list(options.settings)
     if strange := [word for word in words if word.startswith(("~", "hydra.", "+experiment="))]:
         raise InputError(f"{strange[0]}: ablate writes an experiment, so give it plain KEY=VALUE")
@@ -71,32 +79,6 @@ def ablate(argv: Sequence[str], runs: Path) -> int:
         write_text(options.out, text)
     print(f"{options.out}: {counted(trials, 'trial')} of {command(f'+experiment={name}')}")
     return 0
-
-
-def _parser() -> ArgumentParser:
-    parser = ArgumentParser(
-        "ablate", "It writes an experiment with a grid for each combination (docs/claims.md)."
-    )
-    parser.add_argument(
-        "settings",
-        nargs="*",
-        metavar="KEY=VALUE",
-        help="as of a sweep: densify=volumetric seed=0,1,2 …",
-    )
-    parser.add_argument(
-        "--switches",
-        type=names,
-        default=(),
-        metavar="A,B",
-        help="only these; default: all declared",
-    )
-    parser.add_argument(
-        "--out",
-        type=path,
-        metavar="FILE",
-        help="such as conf/experiment/parts.yaml; default: print it",
-    )
-    return parser
 
 
 def _only_densifier(trials: Sequence[Trial]) -> str:

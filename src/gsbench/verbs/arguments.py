@@ -1,7 +1,7 @@
 """Parsing of a verb's words by argparse, with gsbench's errors of one line."""
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
@@ -13,22 +13,43 @@ from gsbench.settings import CONFIG, describe
 from gsbench.verbs import VERBS
 from gsbench.words import did_you_mean, is_path, split_outside_brackets
 
+Rows = Mapping[str, str | tuple[Any, ...]]
+
 
 class ArgumentParser(argparse.ArgumentParser):
     """An argparse parser that raises InputError for what it does not understand.
 
-    ``gsbench VERB --help`` prints the verb's purpose and the text ``more``, and exits.
+    ``gsbench VERB --help`` prints the verb's purpose and the text ``more``, and exits. ``rows``
+    give each word its meaning, or its meaning, a function that reads the text (or a list of
+    choices) and a default: ``--name VALUE``, a flag ``--name``, and ``name SHOWN`` for a word
+    without a flag. ``name?`` may lack, there may be many of ``name*``, and ``--name=own`` is called
+    ``own``.
     """
 
-    def __init__(self, verb: str = "", more: str = "", **options: Any) -> None:
+    def __init__(self, verb: str = "", more: str = "", rows: Rows | None = None, **options: Any):
         purpose = VERBS[verb][1] if verb else ""
         stop = "" if purpose.endswith("?") else "."
         description = f"{purpose[:1].upper()}{purpose[1:]}{stop} {more}"
         super().__init__(prog=f"gsbench {verb}".strip(), description=description, **options)
+        for words, row in (rows or {}).items():
+            self._add(words, *((row,) if isinstance(row, str) else row))
 
-    def flag(self, name: str, meaning: str) -> None:
-        """Add an option without a value, False unless given."""
-        self.add_argument(name, action="store_true", help=meaning)
+    def _add(self, words: str, meaning: str, read: Any = str, default: Any = None) -> None:
+        name, _, shown = words.partition(" ")
+        name, own = name.rstrip("?*+"), name[-1]
+        how: dict[str, Any] = {"help": meaning}
+        if name.startswith("-"):
+            name, _, dest = name.partition("=")
+            how |= {"dest": dest} if dest else {}
+            how |= {"action": "append"} if own == "*" else {}
+        elif own in "?*+":
+            how["nargs"] = own
+        if name.startswith("-") and not shown:
+            how["action"] = "store_true"
+        else:
+            how |= {"default": [] if own == "*" else default}
+            how |= {"type": read, "metavar": shown or name} if callable(read) else {"choices": read}
+        self.add_argument(name, **how)
 
     def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
         # Settings may stand anywhere on the line, and permissions also before the first positional
@@ -80,36 +101,16 @@ def path(text: str) -> Path:
     return Path(text).expanduser()
 
 
-def add_question(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments that say what is trained, and which metric decides."""
-    parser.add_argument(
-        "settings", nargs="*", metavar="KEY=VALUE", help="of the trials, as of a sweep; no seeds"
-    )
-    parser.add_argument(
-        "--metric", default="psnr", help="decides: psnr (the default), lpips_squeeze, gaussians, …"
-    )
-    parser.add_argument(
-        "--least", help="the least difference that matters, as 0.1 or 10%%; default: the metric's"
-    )
-
-
-def add_where(parser: argparse.ArgumentParser) -> None:
-    """Add ``--where KEY=VALUE``; `gsbench.analysis.cells.select_trials` takes a dict of them."""
-    parser.add_argument(
-        "--where",
-        type=_condition,
-        action="append",
-        default=[],
-        metavar="KEY=A,B",
-        help="only trials with one of these values (repeatable)",
-    )
-
-
 def _condition(text: str) -> tuple[str, str]:
     key, sign, value = text.partition("=")
     if not sign:
         raise argparse.ArgumentTypeError(f"{text!r} is not KEY=VALUE, such as iterations=30000")
     return key, value
+
+
+WHERE = {  # `gsbench.analysis.cells.select_trials` takes a dict of them
+    "--where* KEY=A,B": ("only trials with one of these values (repeatable)", _condition)
+}
 
 
 def names(text: str) -> tuple[str, ...]:

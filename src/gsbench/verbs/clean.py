@@ -11,7 +11,7 @@ from gsbench.runs.cleaning import Stored, free, stored
 from gsbench.runs.experiments import experiment_home, list_experiments, trial_folders
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import is_held
-from gsbench.verbs.arguments import ArgumentParser
+from gsbench.verbs.arguments import ArgumentParser, Rows
 from gsbench.words import counted, readable_bytes
 
 UNITS = {"h": 3600.0, "d": 86_400.0, "w": 7 * 86_400.0}
@@ -19,22 +19,19 @@ UNITS = {"h": 3600.0, "d": 86_400.0, "w": 7 * 86_400.0}
 
 def clean(argv: Sequence[str], runs: Path) -> int:
     """Run the verb; what a finished trial needs always stays."""
-    parser = ArgumentParser("clean")
-    parser.add_argument(
-        "experiment",
-        nargs="?",
-        help="also free what only its failed, stopped and superseded trials have in the store",
-    )
-    parser.add_argument(
-        "--older-than",
-        type=_age,
-        default="30d",
-        metavar="AGE",
-        help="such as 12h, 30d or 0d; younger results stay, since a stopped sweep continues from "
-        "them (30d)",
-    )
-    parser.flag("--dry-run", "only show what would be freed")
-    options = parser.parse_args(argv)
+    rows: Rows = {
+        "experiment?": (
+            "also free what only its failed, stopped and superseded trials have in the store"
+        ),
+        "--older-than AGE": (
+            "such as 12h, 30d or 0d; younger results stay, since a stopped sweep continues from "
+            "them (30d)",
+            _age,
+            "30d",
+        ),
+        "--dry-run": "only show what would be freed",
+    }
+    options = ArgumentParser("clean", rows=rows).parse_args(argv)
     trials = [
         Path(place) for name in list_experiments(runs) for place in trial_folders(runs / name)
     ]

@@ -16,8 +16,8 @@ def declare(argv: Sequence[str], runs: Path) -> int:
         "declare",
         "It writes the questions of a sweep and trains nothing: for loops and arrays of jobs that "
         "train its trials one by one. Each of these commands then asks nothing more.",
+        {"settings* KEY=VALUE": "as of a sweep"},
     )
-    parser.add_argument("settings", nargs="*", metavar="KEY=VALUE", help="as of a sweep")
     parser.add_argument("-m", "--multirun", action="store_true", help="is understood")
     trials = compose_trials(parser.parse_args(argv).settings, multirun=True)
     if any(trial.values["launch"]["stop_when_decided"] for trial in trials):

@@ -19,7 +19,6 @@ from gsbench.words import readable_bytes
 
 DONE, LEFT_OUT = 0, 1
 PAGE = ".html"
-BETTER = {1: ", more is better", -1: ", less is better", 0: ""}
 
 log = logging.getLogger(__name__)
 
@@ -28,49 +27,48 @@ def evaluate(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 0 if every photograph was measured."""
     from gsbench.renders.measure import measure_renders
 
-    measure_renders(_evaluate_parser().parse_args(argv), runs)
+    parser = ArgumentParser(
+        "evaluate",
+        "Names are matched, never guessed. Sizes must be equal.",
+        {
+            "renders RENDERS": (
+                "folder of pictures, or predictions of nerfbaselines (.zip, .tar.gz)"
+            ),
+            "settings* KEY=VALUE": "settings of the scene, and eval.…",
+            "--truth PLACE": "the photographs: a folder, a trial (folder or EXPERIMENT:SCENE:ARM), "
+            "or a scene's name, whose test views are taken as a trial sees them; not needed for "
+            "predictions",
+            "--protocol NAME": ("default: that of the trial, or paper", list(PROTOCOLS)),
+            "--by-order": "match sorted pictures with sorted photographs",
+            "--as=place EXPERIMENT:ARM": "enter them as a trial; ARM: a name or INIT-NAME",
+            "--seed K": ("which repetition of the arm they are (0)", int, 0),
+            "--scene NAME": "with --as, where PLACE is a folder: what to call the scene",
+            "--json": "print a JSON object instead of a table",
+        },
+    )
+    measure_renders(parser.parse_args(argv), runs)
     return 0
-
-
-def _evaluate_parser() -> ArgumentParser:
-    parser = ArgumentParser("evaluate", "Names are matched, never guessed. Sizes must be equal.")
-    parser.add_argument(
-        "renders",
-        metavar="RENDERS",
-        help="folder of pictures, or predictions of nerfbaselines (.zip, .tar.gz)",
-    )
-    parser.add_argument(
-        "settings", nargs="*", metavar="KEY=VALUE", help="settings of the scene, and eval.…"
-    )
-    parser.add_argument(
-        "--truth",
-        metavar="PLACE",
-        help="the photographs: a folder, a trial (folder or EXPERIMENT:SCENE:ARM), or a "
-        "scene's name, whose test views are taken as a trial sees them; not needed for predictions",
-    )
-    parser.add_argument(
-        "--protocol", choices=list(PROTOCOLS), help="default: that of the trial, or paper"
-    )
-    parser.flag("--by-order", "match sorted pictures with sorted photographs")
-    parser.add_argument(
-        "--as",
-        dest="place",
-        metavar="EXPERIMENT:ARM",
-        help="enter them as a trial; ARM: a name or INIT-NAME",
-    )
-    parser.add_argument(
-        "--seed", type=int, default=0, help="which repetition of the arm they are (0)"
-    )
-    parser.add_argument(
-        "--scene", metavar="NAME", help="with --as, where PLACE is a folder: what to call the scene"
-    )
-    parser.flag("--json", "print a JSON object instead of a table")
-    return parser
 
 
 def export(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 0 if the file, or folder, was written."""
-    options = _export_parser().parse_args(argv)
+    options = ArgumentParser(
+        "export",
+        "A .html file is a page with the model and the test cameras, made by npx "
+        "(docs/other_models.md). `gsbench export init TRIAL --out DIR` copies the COLMAP model "
+        "that the trial started from. `gsbench export --results EXPERIMENT` writes results, "
+        "configurations and hashes as one small archive, without pixels unless --pictures is "
+        "given.",
+        {
+            "--results EXPERIMENT": "the archive of its results (default: EXPERIMENT.zip)",
+            "trial* TRIAL": f"{TRIAL}; after the word init: its initial model",
+            "--out PATH": (
+                "the .ply or .html file to write, for init the folder; a TRIAL needs it",
+                path,
+            ),
+            "--pictures": "with --results: the pictures of the test views, too",
+        },
+    ).parse_args(argv)
     if options.results is not None:
         if options.trial:
             raise InputError("export --results takes an experiment, --out and --pictures alone")
@@ -93,36 +91,6 @@ def export(argv: Sequence[str], runs: Path) -> int:
 
     export_model(find_trial(address, runs), options.out, is_init=bool(before))
     return 0
-
-
-def _export_parser() -> ArgumentParser:
-    parser = ArgumentParser(
-        "export",
-        "A .html file is a page with the model and the test cameras, made by npx "
-        "(docs/other_models.md). `gsbench export init TRIAL --out DIR` copies the COLMAP model "
-        "that the trial started from. `gsbench export --results EXPERIMENT` writes results, "
-        "configurations and hashes as one small archive, without pixels unless --pictures is "
-        "given.",
-    )
-    parser.add_argument(
-        "--results",
-        metavar="EXPERIMENT",
-        help="the archive of its results (default: EXPERIMENT.zip)",
-    )
-    parser.add_argument(
-        "trial",
-        nargs="*",
-        metavar="TRIAL",
-        help=f"{TRIAL}; after the word init: its initial model",
-    )
-    parser.add_argument(
-        "--out",
-        type=path,
-        metavar="PATH",
-        help="the .ply or .html file to write, for init the folder; a TRIAL needs it",
-    )
-    parser.flag("--pictures", "with --results: the pictures of the test views, too")
-    return parser
 
 
 def export_model(trial: TrialResult, out: Path, is_init: bool) -> None:
@@ -199,15 +167,17 @@ def site(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 0, or 1 if an archive was left out; raises InputError if none can be read."""
     from gsbench.claims.site import INDEX, write_site  # here, for a quick answer to --help
 
-    parser = ArgumentParser(
-        "site", "It needs no server, and has pictures if the archives have them."
-    )
-    parser.add_argument("archives", nargs="+", type=path, metavar="ARCHIVE")
-    parser.add_argument(
-        "--out", type=path, required=True, metavar="DIR", help="the folder to write into"
-    )
-    parser.add_argument("--title", default="Results of gsbench", help="of its first page")
-    options = parser.parse_args(argv)
+    options = ArgumentParser(
+        "site",
+        "It needs no server, and has pictures if the archives have them.",
+        {
+            "archives+ ARCHIVE": ("of results", path),
+            "--out DIR": ("the folder to write into", path),
+            "--title TEXT": ("of its first page", str, "Results of gsbench"),
+        },
+    ).parse_args(argv)
+    if options.out is None:
+        raise InputError("site needs --out DIR, the folder to write into")
     page = options.out / INDEX
     with tempfile.TemporaryDirectory() as scratch, writable_output(page):
         left_out = write_site(options.archives, options.out, options.title, Path(scratch))

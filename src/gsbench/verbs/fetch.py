@@ -30,7 +30,20 @@ PATIENCE = RetryPolicy()
 def fetch(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 0 if all requested scenes are here."""
     catalog = read_catalog()
-    options = _parser(list(catalog)).parse_args(argv)
+    options = ArgumentParser(
+        "fetch",
+        f"They come into the data folder (${DATA_VARIABLE}, else ./data), where scene=NAME finds "
+        "them: only the wanted scenes and image folders out of the archives. Stopped, the same "
+        "command goes on.",
+        {
+            "dataset? DATASET": ", ".join(catalog),
+            "scenes* SCENE": "the scenes wanted; none: all of the data set",
+            "--list": "list all scenes, and which ones are here",
+            "--images FOLDER": "another image folder than the scene file's, such as images",
+            "--mirror PLACE": "where the archives lie instead: the start of an address, or a "
+            f"folder with them (${MIRROR_VARIABLE})",
+        },
+    ).parse_args(argv)
     data = data_dir()
     if options.list or options.dataset is None:
         chosen = [_dataset(catalog, options.dataset)] if options.dataset else list(catalog.values())
@@ -138,29 +151,3 @@ def _mirror(mirror: str | None) -> str | None:
     if is_path(mirror) and Path(mirror).expanduser().is_dir():
         return mirror
     raise InputError(f"--mirror {mirror} is neither an http(s) address nor a folder")
-
-
-def _parser(names: Sequence[str]) -> ArgumentParser:
-    parser = ArgumentParser(
-        "fetch",
-        f"They come into the data folder (${DATA_VARIABLE}, else ./data), where scene=NAME finds "
-        "them: only the wanted scenes and image folders out of the archives. Stopped, the same "
-        "command goes on.",
-    )
-    parser.add_argument("dataset", nargs="?", metavar="DATASET", help=", ".join(names))
-    parser.add_argument(
-        "scenes", nargs="*", metavar="SCENE", help="the scenes wanted; none: all of the data set"
-    )
-    parser.flag("--list", "list all scenes, and which ones are here")
-    parser.add_argument(
-        "--images",
-        metavar="FOLDER",
-        help="another image folder than the scene file's, such as images",
-    )
-    parser.add_argument(
-        "--mirror",
-        metavar="PLACE",
-        help="where the archives lie instead: the start of an address, or a folder with them "
-        f"(${MIRROR_VARIABLE})",
-    )
-    return parser

@@ -16,7 +16,7 @@ from gsbench.claims.stopping import Needed, finished_trials
 from gsbench.config.compose import Trial, with_seed
 from gsbench.errors import GsbenchError, InputError, TrainingError
 from gsbench.files import checked_runs_folder, make_runs_folder
-from gsbench.verbs.arguments import ArgumentParser, add_question, add_where, path
+from gsbench.verbs.arguments import WHERE, ArgumentParser, path
 from gsbench.words import listed, printable
 
 EXIT_CODES = {gates.PASSED: 0, gates.WORSE: 1, gates.NOT_DECIDED: 3}
@@ -35,17 +35,18 @@ def gate(argv: Sequence[str], runs: Path) -> int:
         "It trains this version on scenes and seeds of an archive (gsbench export --results), seed "
         "by seed until it is decided. Exit code 0: not worse by --least; 1: worse, or a trial "
         "failed; 3: undecided; 2: bad input (docs/gate.md).",
-    )
-    parser.add_argument("archive", type=path, help="the results of the version that you trust")
-    add_question(parser)
-    parser.add_argument(
-        "--seeds", type=int, help="the largest number of seeds; default: all that the archive has"
-    )
-    add_where(parser)
-    parser.flag(
-        "--bisect",
-        "for `git bisect run gsbench gate …`: exit code 125 if it is undecided or does not train, "
-        "128 for bad input",
+        {
+            "archive": ("the results of the version that you trust", path),
+            "settings* KEY=VALUE": "of the trials, as of a sweep; no seeds",
+            "--metric NAME": ("decides, such as lpips_squeeze or gaussians (psnr)", str, "psnr"),
+            "--least SIZE": (
+                "the least difference that matters, as 0.1 or 10%%; default: the metric's"
+            ),
+            "--seeds N": ("the largest number of seeds; default: all that the archive has", int),
+            "--bisect": "for `git bisect run gsbench gate …`: exit code 125 if it is undecided or "
+            "does not train, 128 for bad input",
+            **WHERE,
+        },
     )
     if "--bisect" not in argv:
         return EXIT_CODES[_result(parser.parse_args(argv))]

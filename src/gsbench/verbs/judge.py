@@ -18,18 +18,46 @@ from gsbench.analysis.frames import (
 )
 from gsbench.errors import InputError
 from gsbench.files import require_regular, writable_output, write_text
-from gsbench.verbs.arguments import ArgumentParser, comma_separated, names, path, whole_number
+from gsbench.verbs.arguments import ArgumentParser, Rows, comma_separated, names, path, whole_number
 from gsbench.words import counted, listed, printable
 
 if TYPE_CHECKING:
     import pandas as pd
 
 MOST_SEED = 10**9
+ROWS: Rows = {
+    "results? RESULTS": ("a table or a folder", path),
+    "settings* KEY=VALUE": "eval.… for a folder of renders",
+    "--baseline NAME": "the method to compare with",
+    "--metric NAME": ("a column that decides (psnr)", str, "psnr"),
+    "--better WHAT": (
+        "which values are better, for a metric that gsbench does not know",
+        [name for name in DIRECTIONS if name],
+    ),
+    "--least SIZE": "the least difference that matters, as 0.1 or 10%%; default: the metric's",
+    "--truth DIR": ("of a folder of renders: photographs by scene", path),
+    "--out FILE.html": ("write the report, too", path),
+    "--json": "print a JSON object instead of the table",
+    "--declared FILE": ("the question that --declare wrote", path),
+    "--declare FILE": ("before the training: write the question, and judge nothing", path),
+    "--methods A,B": ("with --declare: all but the baseline", names),
+    "--scenes A,B": ("with --declare", names),
+    "--seeds 0,1": (
+        "with --declare",
+        comma_separated(lambda text: whole_number(MOST_SEED)(text) if text != "0" else 0),
+    ),
+}
 
 
 def judge(argv: Sequence[str], runs: Path) -> int:
     """Run the verb; raises InputError for bad input."""
-    options = _parser().parse_args(argv)
+    options = ArgumentParser(
+        "judge",
+        "RESULTS is a table with the columns method, scene, seed and metrics, or a folder of "
+        "renders {arm}/{scene}/{seed} (docs/other_trainers.md). A missing value is a training that "
+        "failed. The verdict has 5 %; it holds if metric, scenes and seeds were chosen before.",
+        ROWS,
+    ).parse_args(argv)
     if options.declare is not None:
         return _declare(options)
     if options.results is None:
@@ -57,49 +85,6 @@ def judge(argv: Sequence[str], runs: Path) -> int:
             write_text(options.out, build_report(comparison.experiment))
         print(options.out, file=sys.stderr)
     return 0
-
-
-def _parser() -> ArgumentParser:
-    parser = ArgumentParser(
-        "judge",
-        "RESULTS is a table with the columns method, scene, seed and metrics, or a folder of "
-        "renders {arm}/{scene}/{seed} (docs/other_trainers.md). A missing value is a training that "
-        "failed. The verdict has 5 %; it holds if metric, scenes and seeds were chosen before.",
-    )
-    parser.add_argument("results", nargs="?", type=path, metavar="RESULTS")
-    parser.add_argument(
-        "settings", nargs="*", metavar="KEY=VALUE", help="eval.… for a folder of renders"
-    )
-    parser.add_argument("--baseline", metavar="NAME", help="the method to compare with")
-    parser.add_argument("--metric", default="psnr", help="a column that decides (psnr)")
-    parser.add_argument(
-        "--better",
-        choices=[name for name in DIRECTIONS if name],
-        help="which values are better, for a metric that gsbench does not know",
-    )
-    parser.add_argument(
-        "--least", help="the least difference that matters, as 0.1 or 10%%; default: the metric's"
-    )
-    parser.add_argument(
-        "--truth", type=path, metavar="DIR", help="of a folder of renders: photographs by scene"
-    )
-    parser.add_argument("--out", type=path, metavar="FILE.html", help="write the report, too")
-    parser.flag("--json", "print a JSON object instead of the table")
-    parser.add_argument(
-        "--declared", type=path, metavar="FILE", help="the question that --declare wrote"
-    )
-    before = parser.add_argument_group("before the training")
-    before.add_argument(
-        "--declare", type=path, metavar="FILE", help="write the question, and judge nothing"
-    )
-    before.add_argument("--methods", type=names, metavar="A,B", help="all but the baseline")
-    before.add_argument("--scenes", type=names, metavar="A,B")
-    before.add_argument(
-        "--seeds",
-        type=comma_separated(lambda text: whole_number(MOST_SEED)(text) if text != "0" else 0),
-        metavar="0,1",
-    )
-    return parser
 
 
 def _declare(options: argparse.Namespace) -> int:

@@ -18,7 +18,7 @@ from gsbench.scene.rules import MIN_SIZE
 from gsbench.system.install import install_command, version_of
 from gsbench.system.programs import allow_modules
 from gsbench.system.resources import available_threads, installed_gpus
-from gsbench.verbs.arguments import ArgumentParser, comma_separated, path, whole_number
+from gsbench.verbs.arguments import ArgumentParser, Rows, comma_separated, path, whole_number
 from gsbench.words import counted, readable_bytes
 
 LITTLE_SPACE = 5_000_000_000  # bytes
@@ -34,6 +34,7 @@ OPTIONAL = {  # module -> what needs it, and the extra that brings it
 }
 NOT_SHOWN = ("scene", "threads", "device")  # columns that only the JSON of `bench` has
 MAX_SIDE = 16_384  # px
+SCENES = ("trained", "skewed", "crowded")
 # the errors of a proof that its line shows
 SHOWN_ERRORS = ("image", "gradient of means", "gradient of log_scales", "trained image")
 MAX_COUNT = 1_000_000_000
@@ -52,22 +53,15 @@ class Finding(NamedTuple):
 
 def doctor(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 1 if something is bad, or if a proof fails."""
-    parser = ArgumentParser("doctor")
-    parser.add_argument(
-        "words",
-        nargs="*",
-        metavar="SETTING",
-        help="of a scene, such as scene=photos scene.path=/my/photos: what is odd about it",
-    )
-    parser.flag("--prove", "compare a rasterizer with the float64 reference on this machine")
-    parser.add_argument(
-        "--raster", default=AUTO, choices=names(), help="the rasterizer to prove (auto)"
-    )
-    parser.add_argument(
-        "--device", default="auto", help="where to prove it: auto, cpu, cuda or cuda:1"
-    )
-    parser.flag("--json", "print the proof as JSON")
-    options = parser.parse_args(argv)
+    rows: Rows = {
+        "words* SETTING": "of a scene, such as scene=photos scene.path=/my/photos: what is odd "
+        "about it",
+        "--prove": "compare a rasterizer with the float64 reference on this machine",
+        "--raster NAME": ("the rasterizer to prove (auto)", names(), AUTO),
+        "--device NAME": ("where to prove it: auto, cpu, cuda or cuda:1", str, "auto"),
+        "--json": "print the proof as JSON",
+    }
+    options = ArgumentParser("doctor", rows=rows).parse_args(argv)
     if options.prove:
         return _prove(options.raster, options.device, options.json)
     if options.json or options.raster != AUTO or options.device != "auto":
@@ -243,27 +237,20 @@ def check_triton() -> Iterator[Finding]:
 
 def check_weights() -> Iterator[Finding]:
     """Findings about the weights of networks that are here; nothing is downloaded."""
-    from gsbench.eval.lpips import BACKBONES, find_first_weights
+    from gsbench.eval.lpips import BACKBONES
     from gsbench.init.networks.options import EXTRACTOR_WEIGHTS, LIGHTGLUE_WEIGHTS
-    from gsbench.weights import WEIGHTS_VARIABLE, MissingWeightsError, hub_cache
+    from gsbench.weights import MissingWeightsError, find_weights
 
     wanted = {f"LPIPS {name}": backbone.features for name, backbone in BACKBONES.items()}
-    wanted |= {f"LPIPS {name} heads": (backbone.heads,) for name, backbone in BACKBONES.items()}
-    wanted |= {f"init=dim {name}": (spec,) for name, spec in EXTRACTOR_WEIGHTS.items()}
-    wanted |= {f"LightGlue for {name}": (spec,) for name, spec in LIGHTGLUE_WEIGHTS.items()}
-    for purpose, specs in wanted.items():
+    wanted |= {f"LPIPS {name} heads": backbone.heads for name, backbone in BACKBONES.items()}
+    wanted |= {f"init=dim {name}": spec for name, spec in EXTRACTOR_WEIGHTS.items()}
+    wanted |= {f"LightGlue for {name}": spec for name, spec in LIGHTGLUE_WEIGHTS.items()}
+    for purpose, spec in wanted.items():
         try:
-            text = str(find_first_weights(specs, None, download=False))
+            text = str(find_weights(spec, download=False))
             verdict: Verdict = "ok"
         except MissingWeightsError as error:
             verdict, text = "note", str(error)
-            if "not found" in text:
-                others = "".join(f" or {spec.names[0]} (from {spec.source})" for spec in specs[1:])
-                text = (
-                    f"{specs[0].names[0]} is not here; gsbench downloads it when needed from "
-                    f"{specs[0].url or specs[0].source}; or put it{others} into "
-                    f"${WEIGHTS_VARIABLE} or {hub_cache()}"
-                )
         yield Finding(verdict, "weights", f"{purpose}: {text}")
 
 
@@ -280,48 +267,29 @@ def check_runs(runs: Path) -> Iterator[Finding]:
         yield Finding(verdict, "runs", f"{runs}, {readable_bytes(free)} free")
 
 
-def _bench_parser() -> ArgumentParser:
-    names = ", ".join(executor.name for executor in EXECUTORS)
-    count = whole_number(MAX_COUNT)
-    parser = ArgumentParser("bench", "Times are medians of steps that take turns.")
-    parser.add_argument(
-        "--raster", default="cpu", help=f"names, comma between: {names} or your own, mine.MyRaster"
-    )
-    parser.add_argument(
-        "--size",
-        type=comma_separated(_size),
-        default="500x375",
-        metavar="WIDTHxHEIGHT,…",
-        help="image sizes",
-    )
-    parser.add_argument(
-        "--count",
-        type=comma_separated(count),
-        default="100000",
-        metavar="N,…",
-        help="numbers of Gaussians",
-    )
-    parser.add_argument(
-        "--scene",
-        default="trained",
-        choices=("trained", "random", "skewed", "crowded"),
-        help="like a trained model (default), like one at the start, like one with its detail at "
-        "few places, or with a twentieth of it over one tile",
-    )
-    parser.add_argument("--ply", type=path, help="time this model instead of a synthetic scene")
-    parser.add_argument("--repeats", type=count, default=5, help="turns that count (default 5)")
-    parser.add_argument(
-        "--threads", type=count, help="CPU threads (default: as many as torch takes)"
-    )
-    parser.flag("--json", "print JSON")
-    parser.flag("--kernels", "with --json: add the time of each kernel, and of waits for the GPU")
-    parser.flag("--no-memory", "do not measure peak memory, in processes of their own")
-    return parser
-
-
 def bench(argv: Sequence[str], _runs: Path | None = None) -> int:
     """Print the table, or with ``--json`` the list of results."""
-    options = _bench_parser().parse_args(argv)
+    own = ", ".join(executor.name for executor in EXECUTORS)
+    count = whole_number(MAX_COUNT)
+    rows: Rows = {
+        "--raster A,B": (f"names: {own} or your own, mine.MyRaster", str, "cpu"),
+        "--size WIDTHxHEIGHT,…": ("image sizes", comma_separated(_size), "500x375"),
+        "--count N,…": ("numbers of Gaussians", comma_separated(count), "100000"),
+        "--scene NAME": (
+            "like a trained model (default), like one with its detail at few places, or with a "
+            "twentieth of it over one tile",
+            SCENES,
+            "trained",
+        ),
+        "--ply FILE": ("time this model instead of a synthetic scene", path),
+        "--repeats N": ("turns that count (default 5)", count, 5),
+        "--threads N": ("CPU threads (default: as many as torch takes)", count),
+        "--json": "print JSON",
+        "--kernels": "with --json: add the time of each kernel, and of waits for the GPU",
+        "--no-memory": "do not measure peak memory, in processes of their own",
+    }
+    parser = ArgumentParser("bench", "Times are medians of steps that take turns.", rows)
+    options = parser.parse_args(argv)
     if options.ply is not None and not options.ply.is_file():
         raise InputError(f"--ply: {options.ply} does not exist")
     if options.kernels and not options.json:
@@ -332,20 +300,16 @@ def bench(argv: Sequence[str], _runs: Path | None = None) -> int:
     # the user typed them, which allows them
     allow_modules([raster for raster in rasters if "." in raster])
 
-    from gsbench.bench.measure import run_bench
+    from gsbench.bench.measure import Setting, run_bench
 
-    rows = run_bench(
-        rasters,
-        options.size,
-        options.count,
-        ply=options.ply,
-        repeats=options.repeats,
-        threads=options.threads,
-        memory=not options.no_memory,
-        scene=options.scene,
-        kernels=options.kernels,
-    )
-    print(json.dumps(rows, indent=2) if options.json else table(rows))
+    ply = options.ply and options.ply.absolute()
+    settings = [
+        Setting(options.scene, width, height, count, ply, options.threads)
+        for width, height in options.size
+        for count in (options.count if ply is None else [0])
+    ]
+    found = run_bench(rasters, settings, options.repeats, not options.no_memory, options.kernels)
+    print(json.dumps(found, indent=2) if options.json else table(found))
     return 0
 
 

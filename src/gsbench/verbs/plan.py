@@ -47,45 +47,34 @@ NEW_TRIALS = (
 )
 
 
-def _parser() -> ArgumentParser:
-    parser = ArgumentParser(
+def plan(argv: Sequence[str], runs: Path) -> int:
+    """Run the verb; raises InputError for bad input."""
+    options = ArgumentParser(
         "plan",
         "It estimates from an experiment's trials how many scenes and seeds show a difference of "
         "one arm in 80 of 100 cases. The seeds are new ones: those of the trials are seen "
         "(docs/verdict.md). How many ideas will be found, it cannot say.",
-    )
-    parser.add_argument("experiment")
-    parser.add_argument(
-        "--for",
-        dest="command",
-        choices=COMMANDS,
-        default=COMMANDS[0],
-        help="what is planned: a sweep (the default), a sweep that stops when decided (looks), "
-        "a gate, or a ledger of ideas",
-    )
-    parser.add_argument(
-        "--questions",
-        type=whole_number(MOST_QUESTIONS),
-        help="pairs of arms, claims, or planned ideas that share the error rate (1; ledger: 40)",
-    )
-    parser.add_argument(
-        "--metric", default="psnr", help="such as psnr (the default), ssim, lpips_squeeze"
-    )
-    parser.add_argument(
-        "--difference",
-        type=number(PositiveFloat),
-        help="to be seen; default: what papers count as an improvement",
-    )
-    parser.add_argument(
-        "--baseline", default=BASELINE, help=f"the densifier to compare with ({BASELINE})"
-    )
-    parser.flag("--json", "print JSON")
-    return parser
-
-
-def plan(argv: Sequence[str], runs: Path) -> int:
-    """Run the verb; raises InputError for bad input."""
-    options = _parser().parse_args(argv)
+        {
+            "experiment": "of the pilot trials",
+            "--for=command WHAT": (
+                "what is planned: a sweep (the default), a sweep that stops when decided (looks), "
+                "a gate, or a ledger of ideas",
+                COMMANDS,
+                COMMANDS[0],
+            ),
+            "--questions N": (
+                "pairs of arms, claims, or planned ideas that share the error rate (1; ledger: 40)",
+                whole_number(MOST_QUESTIONS),
+            ),
+            "--metric NAME": ("such as psnr (the default), ssim, lpips_squeeze", str, "psnr"),
+            "--difference SIZE": (
+                "to be seen; default: what papers count as an improvement",
+                number(PositiveFloat),
+            ),
+            "--baseline NAME": (f"the densifier to compare with ({BASELINE})", str, BASELINE),
+            "--json": "print JSON",
+        },
+    ).parse_args(argv)
     experiment = load_experiment(runs, options.experiment)
     comparison = compare(experiment, None if options.baseline == BASELINE else options.baseline)
     trials = comparison.trials

@@ -72,14 +72,16 @@ def _check_typed(line: str) -> None:
 
 
 def _parser() -> ArgumentParser:
-    parser = ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE")
+    rows = {
+        "overrides* KEY=VALUE": "settings",
+        "--resolve": "with --cfg: show values instead of ${…}",
+        "--hydra-help": "Hydra's own options",
+    }
+    parser = ArgumentParser(rows=rows, add_help=False, allow_abbrev=False)
     parser.add_argument("--cfg", "-c", choices=["job", "hydra", "all"])
-    parser.flag("--resolve", "with --cfg: show values instead of ${…}")
     parser.add_argument("--package", "-p")
     info = ["all", "config", "defaults", "defaults-tree", "plugins", "searchpath"]
     parser.add_argument("--info", "-i", nargs="?", const="all", choices=info)
-    parser.flag("--hydra-help", "Hydra's own options")
     parser.add_argument("--shell-completion", "-sc", action="store_true")
     parser.add_argument("--config-dir", "-cd", type=Path)
     return parser

@@ -35,12 +35,12 @@ from gsbench.analysis.results import (
     load_experiment,
 )
 from gsbench.analysis.table_formats import FORMATS, csv_of
-from gsbench.analysis.tables import DEFAULT_ROWS, build_table, format_cell, with_agreement
+from gsbench.analysis.tables import DEFAULT_ROWS, build_table, format_cell
 from gsbench.errors import InputError
 from gsbench.files import own_output, writable_output, write_text
 from gsbench.runs.experiments import list_experiments
 from gsbench.runs.package_code import edited
-from gsbench.verbs.arguments import ArgumentParser, add_where, names, path
+from gsbench.verbs.arguments import WHERE, ArgumentParser, Rows, names, path
 from gsbench.words import some_of, split_outside_brackets
 
 if TYPE_CHECKING:
@@ -54,7 +54,30 @@ REPORT_NAME = "report.html"
 
 def tables(argv: Sequence[str], runs: Path) -> int:
     """Run the verb; raises InputError for bad input."""
-    options = _tables_parser().parse_args(argv)
+    options = ArgumentParser(
+        "tables",
+        "`gsbench tables paper` lists where the paper contradicts itself.",
+        {
+            "experiment?": "its name (without one: lists them); table1, table2 and their _own look "
+            "as in the paper, with its values",
+            "other?": "another one, beside it on the same scenes",
+            "--format NAME": (
+                f"default: md; {TRIALS}: CSV with one row a trial; {JSON}: the verdicts",
+                [*FORMATS, TRIALS, JSON],
+            ),
+            "--out PATH": ("a folder, or a file whose ending says the format", path),
+            "--rows A,B": (f"fields or settings (default {','.join(DEFAULT_ROWS)})", names),
+            "--columns A,B": ("fields or settings, crossed with all metrics", names),
+            "--metrics A,B": ("such as psnr,lpips_squeeze,gaussians,train_time", names),
+            "--paper NAME": f"published numbers, too: {', '.join(published_names())}",
+            "--layout NAME": (
+                f"the paper's layout for any experiment; {FAIRNESS}: for each pair of arms in what "
+                "they differ, what was tuned, and whose defaults those are",
+                [*load_published().tables, "plain", FAIRNESS],
+            ),
+            **WHERE,
+        },
+    ).parse_args(argv)
     options.format = options.format or _format_of(options.out)
     if options.experiment is None:
         print("\n".join(list_experiments(runs)) or f"no experiment in {runs} yet")
@@ -70,12 +93,15 @@ def tables(argv: Sequence[str], runs: Path) -> int:
         print(f"left out: {warning}", file=sys.stderr)
     where = dict(options.where)
     trials = select_trials([*experiment.trials, *(other.trials if other else ())], where)
+    if options.format in (TRIALS, JSON):
+        for name in ("rows", "columns", "metrics", "layout", "paper"):
+            if getattr(options, name) is not None:
+                raise InputError(f"--format {options.format} shows all, and takes no --{name}")
     if options.format == TRIALS:
-        texts = _trials(trials, options)
+        texts = {"-trials.csv": csv_of(to_frame(trials))}
     else:
         comparison = _comparison([experiment, *([other] if other else [])], trials, where)
         if options.format == JSON:
-            _refuse_options_of_tables(options, f"--format {JSON} shows the verdicts")
             texts = {f".{JSON}": json.dumps(comparison.to_json(), indent=1) + "\n"}
         else:
             texts = _tables(comparison, trials, options)
@@ -103,18 +129,6 @@ def _comparison(
     return chosen(comparison, trials, where_words(where)) if where else comparison
 
 
-def _refuse_options_of_tables(options: argparse.Namespace, what: str) -> None:
-    for name in ("rows", "columns", "metrics", "layout", "paper"):
-        if getattr(options, name) is not None:
-            raise InputError(f"{what}, and takes no --{name}")
-
-
-def _trials(trials: Sequence[TrialResult], options: argparse.Namespace) -> dict[str, str]:
-    """A CSV with one row per trial. Raises InputError for options that only a table has."""
-    _refuse_options_of_tables(options, f"--format {TRIALS} shows every column of every trial")
-    return {"-trials.csv": csv_of(to_frame(trials))}
-
-
 def _tables(
     comparison: "Comparison", trials: Sequence[TrialResult], options: argparse.Namespace
 ) -> dict[str, str]:
@@ -132,7 +146,7 @@ def _tables(
     else:
         tables = paper_tables(experiment, layout, trials, metrics, comparison)
     suffix, writer = FORMATS[options.format]
-    named = dict(zip(("", "-difference"), with_agreement(tables), strict=False))
+    named = dict(zip(("", "-difference"), tables, strict=False))
     if options.paper is not None:
         named[f"-{options.paper}"] = published_table(with_variants(trials), options.paper)
     return {f"{end}.{suffix}": writer(table) for end, table in named.items()}
@@ -149,60 +163,13 @@ def _fairness_sheets(comparison: "Comparison", format_name: str) -> dict[str, st
     sheets = {}
     for first, second in comparison.pairs:
         end = f"-{FAIRNESS}-{_as_file(second)}-{_as_file(first)}.{suffix}"
-        sheets[end] = writer(fairness_table(comparison.trials, first, second, experiment.older))
+        sheets[end] = writer(fairness_table(comparison.trials, first, second))
     return sheets
 
 
 def _as_file(arm: Arm) -> str:
     """An arm, with its variant, as part of a file's name."""
     return re.sub(r"[^\w.=-]+", "_", str(arm))
-
-
-def _tables_parser() -> ArgumentParser:
-    parser = ArgumentParser(
-        "tables", "`gsbench tables paper` lists where the paper contradicts itself."
-    )
-    parser.add_argument(
-        "experiment",
-        nargs="?",
-        help="its name (without one: lists them); table1, table2 and their _own look as in the "
-        "paper, with its values",
-    )
-    parser.add_argument("other", nargs="?", help="another one, beside it on the same scenes")
-    parser.add_argument(
-        "--format",
-        choices=[*FORMATS, TRIALS, JSON],
-        help=f"default: md; {TRIALS}: CSV with one row a trial; {JSON}: the verdicts",
-    )
-    parser.add_argument(
-        "--out", type=path, metavar="PATH", help="a folder, or a file whose ending says the format"
-    )
-    parser.add_argument(
-        "--rows",
-        type=names,
-        metavar="A,B",
-        help=f"fields or settings (default {','.join(DEFAULT_ROWS)})",
-    )
-    parser.add_argument(
-        "--columns", type=names, metavar="A,B", help="fields or settings, crossed with all metrics"
-    )
-    parser.add_argument(
-        "--metrics",
-        type=names,
-        metavar="A,B",
-        help="such as psnr,lpips_squeeze,gaussians,train_time",
-    )
-    add_where(parser)
-    parser.add_argument(
-        "--paper", metavar="NAME", help=f"published numbers, too: {', '.join(published_names())}"
-    )
-    parser.add_argument(
-        "--layout",
-        choices=[*load_published().tables, "plain", FAIRNESS],
-        help=f"the paper's layout for any experiment; {FAIRNESS}: for each pair of arms in what "
-        "they differ, what was tuned, and whose defaults those are",
-    )
-    return parser
 
 
 def _write(texts: Mapping[str, str], out: Path | None, name: str) -> None:
@@ -231,17 +198,12 @@ def report(argv: Sequence[str], runs: Path) -> int:
     """Run the verb; raises InputError for bad input."""
     from gsbench.analysis.report.build import build_report  # here, for a quick answer to --help
 
-    parser = ArgumentParser("report")
-    parser.add_argument("experiment")
-    parser.add_argument(
-        "--out",
-        type=path,
-        metavar="PATH",
-        help=f"folder or .html file; default: the experiment's {REPORT_NAME}",
-    )
-    parser.add_argument("--baseline", help=f"the densifier to compare with ({BASELINE})")
-    add_where(parser)
-    options = parser.parse_args(argv)
+    rows: Rows = {
+        "experiment": "its name",
+        "--out PATH": (f"folder or .html file; default: the experiment's {REPORT_NAME}", path),
+        "--baseline NAME": f"the densifier to compare with ({BASELINE})",
+    }
+    options = ArgumentParser("report", rows={**rows, **WHERE}).parse_args(argv)
     experiment = load_experiment(runs, options.experiment)
     densifiers = sorted({trial.densify for trial in experiment.trials})
     if options.baseline is not None and options.baseline not in densifiers:
@@ -258,8 +220,7 @@ def report(argv: Sequence[str], runs: Path) -> int:
 
 def explain(argv: Sequence[str], runs: Path) -> int:
     """Run the verb; raises InputError for bad input."""
-    parser = ArgumentParser("explain")
-    parser.add_argument("cell", metavar="CELL", help=f"a number of a table: {CELL}")
+    parser = ArgumentParser("explain", rows={"cell CELL": f"a number of a table: {CELL}"})
     print(explain_cell(parser.parse_args(argv).cell, runs))
     return 0
 
@@ -330,35 +291,28 @@ def _trials_lines(trials: Sequence[TrialResult], shown: Quantity) -> list[str]:
 
 def _origin(trial: TrialResult) -> dict[str, str]:
     """The folder of a trial, its counts, hashes, and the programs that made it, by label."""
-    record = trial.record
+    record, code = trial.record, trial.record.code
     if not trial.from_renders:
         counts = f"{record.num_gaussians or 0:,} from {record.num_init_points or 0:,} points"
-    elif trial.program:
-        counts = "its own renders"
     else:
-        counts = _listed(record.renders)
-    views = "?" if record.test_views is None else record.test_views
+        counts = "its own renders" if trial.program else _listed(record.renders)
+    views, by = record.test_views, record.trained_by
+    differing = list(edited(code.packages))
+    if len(differing) == len(code.packages):  # before the first release all count as edited
+        differing = []
     origin = {
         "folder": str(trial.path),
         "Gaussians": counts,
-        "views": f"{views} for testing",
+        "views": f"{'?' if views is None else views} for testing",
         **{name: sha for name, sha in record.hashes.items() if name not in trial.conditions},
+        "program": by and f"{by.version}: {' '.join(by.command)}",
+        "machine": trial.machine,
+        "code": ", ".join(trial.code_texts),
+        "commit": code.commit and f"{code.commit}{', edited' if code.edited else ''}",
+        "edited": differing and f"since the last release: {some_of(differing)}",
+        "versions": _listed(record.versions),
     }
-    if record.trained_by is not None:
-        origin["program"] = f"{record.trained_by.version}: {' '.join(record.trained_by.command)}"
-    if machine := trial.machine:
-        origin["machine"] = machine
-    if code := trial.code_texts:
-        origin["code"] = ", ".join(code)
-    if record.code.commit:
-        origin["commit"] = f"{record.code.commit}{', edited' if record.code.edited else ''}"
-    packages = record.code.packages
-    differing = list(edited(packages))
-    # before the first release all packages count as edited
-    if differing and len(differing) < len(packages):
-        origin["edited"] = f"since the last release: {some_of(differing)}"
-    origin["versions"] = _listed(record.versions)
-    return origin
+    return {label: str(text) for label, text in origin.items() if text}
 
 
 def _listed(facts: Mapping[str, str]) -> str:

@@ -2,12 +2,10 @@
 
 import importlib.util
 import itertools
-import os
 import shlex
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -20,7 +18,7 @@ from gsbench.runs.experiments import experiment_home, list_experiments
 from gsbench.runs.layout import DATABASE
 from gsbench.system.install import require_package
 from gsbench.system.isolate import end_descendants
-from gsbench.system.programs import NEUTRAL, own_folder, safe_environment
+from gsbench.system.programs import own_folder, safe_environment
 from gsbench.system.stopping import stop_on_signals
 from gsbench.tracking.ideas import addresses, show_ideas
 from gsbench.tracking.mlflow_sink import (
@@ -30,23 +28,22 @@ from gsbench.tracking.mlflow_sink import (
     require_own_journal,
     tracker_uri,
 )
-from gsbench.verbs.arguments import ArgumentParser, port
+from gsbench.verbs.arguments import ArgumentParser, Rows, port
 
 VIEWER_PORT, DASHBOARD_PORT = 8080, 5000
-SECONDS_TO_ANSWER, SECONDS_TO_START = 5.0, 60
+SECONDS_TO_ANSWER = 5.0
 # MLflow's defaults take eight processes and 2 GB
 LEAN = {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}
 
 
 def view(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: serves the viewer until Ctrl-C."""
-    parser = ArgumentParser("view")
-    parser.add_argument("trial", nargs="+", metavar="TRIAL", help=TRIAL)
-    parser.add_argument(
-        "--port", type=port, default=VIEWER_PORT, help=f"on this machine; 0: any ({VIEWER_PORT})"
-    )
-    parser.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:1")
-    options = parser.parse_args(argv)
+    rows: Rows = {
+        "trial+ TRIAL": TRIAL,
+        "--port N": (f"on this machine; 0: any ({VIEWER_PORT})", port, VIEWER_PORT),
+        "--device NAME": ("auto, cpu, cuda or cuda:1", str, "auto"),
+    }
+    options = ArgumentParser("view", rows=rows).parse_args(argv)
     if len(options.trial) > 2:
         raise InputError(f"one or two trials can be viewed, not {len(options.trial)}")
     require_package("viser", "view", "the viewer")
@@ -54,15 +51,13 @@ def view(argv: Sequence[str], runs: Path) -> int:
     from gsbench.system.device import select_device
     from gsbench.train.proof import create_proven
     from gsbench.view.server import Viewer, check_port
-    from gsbench.view.trials import TrialPainter, find_trial, load_viewed
+    from gsbench.view.trials import find_trial, load_viewed
 
     check_port(options.port)
     device = select_device(options.device)
     trials = [find_trial(address, runs) for address in options.trial]
     rasterizer = create_proven("auto", device).rasterizer
-    viewer = Viewer(
-        [TrialPainter(load_viewed(trial, device), rasterizer) for trial in trials], options.port
-    )
+    viewer = Viewer([load_viewed(trial, rasterizer, device) for trial in trials], options.port)
     with stop_on_signals():
         try:
             print(f"{viewer.url}  (Ctrl+C ends it)", flush=True)
@@ -76,18 +71,12 @@ def view(argv: Sequence[str], runs: Path) -> int:
 
 def ui(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: serves the dashboard until Ctrl-C, if no server does already."""
-    parser = ArgumentParser("ui")
-    parser.add_argument(
-        "experiment",
-        nargs="?",
-        help="open the comparison of its arms; default: the only experiment",
-    )
-    parser.add_argument(
-        "--uri", help="the tracker's address; default: $MLFLOW_TRACKING_URI, or the runs folder's"
-    )
-    parser.add_argument("--port", type=port, default=DASHBOARD_PORT)
-    parser.flag("--no-browser", "only print the addresses")
-    options = parser.parse_args(argv)
+    rows: Rows = {
+        "experiment?": "open the comparison of its arms; default: the only experiment",
+        "--uri ADDRESS": "the tracker's; default: $MLFLOW_TRACKING_URI, or the runs folder's",
+        "--port N": (f"of the server ({DASHBOARD_PORT})", port, DASHBOARD_PORT),
+    }
+    options = ArgumentParser("ui", rows=rows).parse_args(argv)
     if options.uri is not None and "://" not in options.uri:
         raise InputError(f"--uri {options.uri} is not an address such as sqlite:///FILE")
     uri = tracker_uri(options.uri, runs)
@@ -109,14 +98,12 @@ def ui(argv: Sequence[str], runs: Path) -> int:
             raise InputError(
                 f"{home.name} could not be sent to {uri} ({type(error).__name__}: {error})"
             ) from error
-    lines = "\n".join(f"{name:<10} {address}" for name, address in pages.items())
-    first = next(iter(pages.values()))
-    is_served = is_served or (home is not None and _serves(server, home.name, first))
-    opens = not options.no_browser and sys.stdout.isatty() and _has_screen()
-    threading.Thread(
-        target=_announce, args=(server, lines, first if opens else ""), daemon=not is_served
-    ).start()
-    return 0 if is_served else serve(uri, options.port)
+    for name, address in pages.items():
+        print(f"{name:<10} {address}", flush=True)
+    if is_served or (home is not None and _serves(server, home.name, next(iter(pages.values())))):
+        return 0
+    print("served in some seconds, until Ctrl+C", flush=True)
+    return serve(uri, options.port)
 
 
 def _serves(server: str, experiment: str, page: str) -> bool:
@@ -130,32 +117,6 @@ def _serves(server: str, experiment: str, page: str) -> bool:
     except (requests.RequestException, ValueError, KeyError, TypeError):
         return False
     return f"/experiments/{found}/" in f"{page}/"  # 1 is not the experiment 12
-
-
-def _has_screen() -> bool:
-    """Return whether a browser would open in a window, not within this terminal."""
-    return (
-        os.name == "nt"
-        or sys.platform == "darwin"
-        or bool({"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys())
-    )
-
-
-def _announce(server: str, lines: str, page: str) -> None:
-    """Print the addresses once the server answers, and open the page unless it is empty."""
-    for _ in range(SECONDS_TO_START):
-        try:
-            requests.get(server, timeout=SECONDS_TO_ANSWER)
-        except requests.RequestException:
-            time.sleep(1)
-            continue
-        print(lines, flush=True)
-        if not page:
-            return
-        # Its programs start in a folder that is not a stranger's.
-        command = [sys.executable, "-P", "-m", "webbrowser", page]
-        subprocess.run(command, cwd=NEUTRAL, env=safe_environment(), check=False)
-        return
 
 
 def serve(uri: str, port: int) -> int:

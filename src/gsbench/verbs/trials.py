@@ -9,14 +9,11 @@ import sys
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from rich.console import Group
 from rich.live import Live
-from rich.markup import escape
-from rich.table import Table
+from rich.text import Text
 
 from gsbench.config.command_words import makes_other_trials, typed_permissions
 from gsbench.config.compose import Trial, compose_one
@@ -43,38 +40,29 @@ from gsbench.system.programs import allow_modules
 from gsbench.tracking.beside import end_with
 from gsbench.tracking.sync import MirrorError
 from gsbench.tracking.sync import sync as send_missing
-from gsbench.verbs.arguments import ArgumentParser
+from gsbench.verbs.arguments import ArgumentParser, Rows
 from gsbench.words import counted, readable_time
 
-if TYPE_CHECKING:
-    import pandas as pd
-
 SECONDS_BETWEEN_LOOKS = 3.0
+SHOWN = ("folder", "state", "since", "note")  # facts of a trial in JSON
 
 log = logging.getLogger(__name__)
 
 
 def status(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 0 if all trials are done, running or queued, 1 if any failed or is missing."""
-    parser = ArgumentParser("status")
-    parser.add_argument(
-        "experiment", nargs="?", help="its name; without one, a line for each experiment"
-    )
-    parser.flag("--all", "list the finished trials too")
-    parser.flag("--watch", "a row for each arm, renewed until all trials have ended")
-    parser.flag(
-        "--verify",
-        "also compare by content what a look leaves to size and time: large files, and the results "
-        "of stages in the store",
-    )
-    parser.flag("--json", "print a JSON list instead of lines")
-    parser.flag("--forget", "remove trials from the plan that never started")
-    parser.flag(
-        "--forget-superseded",
-        "delete the folders of trials that older code made; what their stages computed stays in "
-        "the store, and verdicts still count them as versions of the code",
-    )
-    options = parser.parse_args(argv)
+    rows: Rows = {
+        "experiment?": "its name; without one, a line for each experiment",
+        "--all": "list the finished trials too",
+        "--watch": "a row for each arm, renewed until all trials have ended",
+        "--verify": "also compare by content what a look leaves to size and time: large files, and "
+        "the results of stages in the store",
+        "--json": "print a JSON list instead of lines",
+        "--forget": "remove trials from the plan that never started",
+        "--forget-superseded": "delete the folders of trials that older code made; what their "
+        "stages computed stays in the store, and verdicts still count them as versions of the code",
+    }
+    options = ArgumentParser("status", rows=rows).parse_args(argv)
     if options.experiment is None:
         if options.watch:
             raise InputError("--watch needs the name of an experiment")
@@ -99,10 +87,9 @@ def status(argv: Sequence[str], runs: Path) -> int:
         print(f"{counted(len(missing), 'trial')} removed from the plan")
         return 0
     if options.json:
-        shown = [asdict(replace(trial, planned=None)) for trial in trials]
-        for entry in shown:
-            del entry["planned"]  # the plan's own entry, for `retry`
-        print(json.dumps(shown, indent=1, default=str))  # `default` is for the folder, a Path
+        # without the plan's own entry; `default` is for the folder, a Path
+        shown = [{key: vars(one)[key] for key in SHOWN} for one in trials]
+        print(json.dumps(shown, indent=1, default=str))
     else:
         print("\n".join(lines_of(trials, options.all)))
     return int(any(STATES[trial.state].retried for trial in trials))
@@ -124,28 +111,16 @@ def _verified(trial: TrialState) -> TrialState:
 
 def _watch(runs: Path, experiment: str) -> None:
     """Show the progress of an experiment until its trials have ended, or Ctrl-C."""
-    frame = progress_frame(runs, experiment)
-    with (
-        suppress(KeyboardInterrupt),
-        Live(_progress_view(experiment, frame), auto_refresh=False) as live,
-    ):
-        while frame[["running", "waiting"]].to_numpy().any():
-            time.sleep(SECONDS_BETWEEN_LOOKS)
+    with suppress(KeyboardInterrupt), Live(auto_refresh=False) as live:
+        while True:
             frame = progress_frame(runs, experiment)
-            live.update(_progress_view(experiment, frame), refresh=True)
-
-
-def _progress_view(name: str, frame: pd.DataFrame) -> Group:
-    """A table of arms with the numbers of trials by state, and the time left."""
-    table = Table(title=escape(name))
-    # In a narrow terminal other columns are cut: arms often differ in their last letters only.
-    table.add_column("arm", no_wrap=True, min_width=max(map(len, frame.index), default=0))
-    for column in frame.columns:
-        table.add_column("it/s" if column == SPEED else column, justify="right")
-    for arm, row in frame.iterrows():
-        table.add_row(escape(str(arm)), *(f"{round(value, 2):g}" for value in row))
-    left = frame.attrs["seconds_left"]
-    return Group(table, f"about {readable_time(left)} left" if left else "")
+            shown = frame.rename(columns={SPEED: "it/s"}).to_string(float_format="{:.3g}".format)
+            left = frame.attrs["seconds_left"]
+            after = f"about {readable_time(left)} left\n" if left else ""
+            live.update(Text(f"{experiment}\n{shown}\n{after}", no_wrap=True), refresh=True)
+            if not frame[["running", "waiting"]].to_numpy().any():
+                break
+            time.sleep(SECONDS_BETWEEN_LOOKS)
 
 
 def lines_of(trials: list[TrialState], with_done: bool) -> list[str]:
@@ -182,18 +157,13 @@ def retry(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: the exit code says whether a trial failed, as that of a sweep does."""
     from gsbench.app.command import run_trials
 
-    parser = ArgumentParser("retry")
-    parser.add_argument("experiment")
-    parser.add_argument(
-        "changes",
-        nargs="*",
-        default=[],
-        metavar="KEY=VALUE",
-        help="settings that do not make a different trial: launch=slurm …; allow_targets=[mine] "
-        "for your own code",
-    )
-    parser.flag("--dry-run", "only list them")
-    options = parser.parse_args(argv)
+    rows: Rows = {
+        "experiment": "its name",
+        "changes* KEY=VALUE": "settings that do not make a different trial: launch=slurm …; "
+        "allow_targets=[mine] for your own code",
+        "--dry-run": "only list them",
+    }
+    options = ArgumentParser("retry", rows=rows).parse_args(argv)
     home = experiment_home(runs, options.experiment)
     if refused := [change for change in options.changes if makes_other_trials(key_of(change))]:
         raise InputError(
@@ -272,28 +242,15 @@ def recompose(
 
 def sync(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 1 if the tracker cannot be reached."""
-    parser = ArgumentParser("sync")
-    parser.add_argument("experiment", nargs="?", help="its name; without one, all")
-    parser.add_argument(
-        "permissions",
-        nargs="*",
-        metavar="allow_targets=[mine]",
-        help="for trials that a tracker of your own shows",
-    )
-    parser.add_argument(
-        "--uri",
-        help="such as http://127.0.0.1:5000; default: $MLFLOW_TRACKING_URI, or the runs folder's",
-    )
-    parser.add_argument(
-        "--trial",
-        action="append",
-        metavar="SCENE/ARM/FOLDER",
-        help="only this trial of the experiment (repeatable)",
-    )
-    parser.add_argument(
-        "--beside", type=int, metavar="PID", help="end soon after this process has ended"
-    )
-    options = parser.parse_args(argv)
+    rows: Rows = {
+        "experiment?": "its name; without one, all",
+        "permissions* allow_targets=[mine]": "for trials that a tracker of your own shows",
+        "--uri ADDRESS": "such as http://127.0.0.1:5000; default: $MLFLOW_TRACKING_URI, or the "
+        "runs folder's",
+        "--trial* SCENE/ARM/FOLDER": "only this trial of the experiment (repeatable)",
+        "--beside PID": ("end soon after this process has ended", int),
+    }
+    options = ArgumentParser("sync", rows=rows).parse_args(argv)
     words = [options.experiment or "", *options.permissions]
     experiment = "" if "=" in words[0] else words.pop(0)
     if unread := [word for word in words if key_of(word) != PERMISSIONS]:
@@ -307,7 +264,7 @@ def sync(argv: Sequence[str], runs: Path) -> int:
         folders: list[TrialFolder] = []
         for home in homes:
             places = [TrialFolder(Path(place)) for place in sorted(trial_folders(home))]
-            wanted = {str(home / trial) for trial in options.trial or ()}
+            wanted = {str(home / trial) for trial in options.trial}
             folders += [one for one in places if not wanted or str(one.path) in wanted]
         for line in send_missing(folders, options.uri, allowed):
             print(line, flush=True)

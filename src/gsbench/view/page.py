@@ -2,16 +2,13 @@
 
 The page is the SuperSplat viewer, written by ``@playcanvas/splat-transform`` (MIT), which npx
 downloads and starts. Its settings, in the viewer's version 2, hold each test view as an annotation
-(its buttons lead from one to the next), and a flight through all of them.
+(its buttons lead from one to the next).
 """
 
 import math
 import re
-import shlex
 import shutil
 import subprocess
-import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbench.analysis.results import TrialResult
-from gsbench.errors import GsbenchError, InputError
+from gsbench.errors import GsbenchError
 from gsbench.files import atomic, write_json
 from gsbench.normalization import Normalization
 from gsbench.scene.colmap import model_points, read_model
 from gsbench.scene.types import View
 from gsbench.system.programs import find_program, own_folder, safe_environment
-from gsbench.view.trials import model_file, model_folder, read_test_views
+from gsbench.view.trials import background_of, model_file, model_folder, read_test_views
 
 PACKAGE = "@playcanvas/splat-transform@2.7.1"
 # Without a GPU, the colours' spherical harmonics are sorted into groups by one step instead of ten:
@@ -37,32 +34,26 @@ POLICY = (
     "worker-src blob: data:; style-src 'unsafe-inline'; img-src blob: data:; font-src data:; "
     "connect-src blob: data:"
 )
-SECONDS_PER_VIEW = 4
 MIN_DEPTH = 0.2  # units: 3DGS's near plane
 
 
 def write_page(trial: TrialResult, out: Path) -> None:
     """Write the page of ``trial`` to the file ``out``.
 
-    Raises GsbenchError with the command to type if npx is missing or fails; then model and settings
-    lie in a new folder beside ``out``.
+    Raises GsbenchError with the commands to type elsewhere if npx is missing or fails.
     """
     # First, so that an error in the trial is raised before anything is downloaded.
-    settings = page_settings(trial)
-    npx = find_program("npx")
-    if npx is None:
-        raise GsbenchError(_by_hand(trial, settings, out, "Node.js (npx) is not installed"))
+    settings, model = page_settings(trial), model_file(trial)
+    npx, said = find_program("npx"), "Node.js (npx) is not installed"
     with own_folder("node_modules", "package.json", ".npmrc") as scratch:
-        model, page = scratch / "model.ply", scratch / "page.html"
+        page, extras = scratch / "page.html", scratch / "settings.json"
         write_json(scratch / "package.json", {})  # npm looks for the project's folder no higher
-        shutil.copyfile(model_file(trial), model)
-        write_json(model.with_suffix(".json"), settings)
-        words = [npx, "--yes", PACKAGE, "--overwrite"]
-        files = [str(model), "-E", str(model.with_suffix(".json")), str(page)]
-        said = ""
-        for device in ((), WITHOUT_GPU):
+        shutil.copyfile(model, scratch / "model.ply")
+        write_json(extras, settings)
+        files = [str(scratch / "model.ply"), "-E", str(extras), str(page)]
+        for device in ((), WITHOUT_GPU) if npx else ():
             done = subprocess.run(
-                [*words, *device, *files],
+                [str(npx), "--yes", PACKAGE, "--overwrite", *device, *files],
                 cwd=scratch,
                 env=safe_environment(),
                 stdin=subprocess.DEVNULL,
@@ -76,20 +67,11 @@ def write_page(trial: TrialResult, out: Path) -> None:
                 with atomic(out, sync=False) as temporary:
                     temporary.write_text(text, encoding="utf-8")
                 return
-            said = (done.stderr or done.stdout).strip().rpartition("\n")[2]
-    raise GsbenchError(_by_hand(trial, settings, out, f"npx {PACKAGE} failed ({said})"))
-
-
-def _by_hand(trial: TrialResult, settings: dict[str, Any], out: Path, cause: str) -> str:
-    # a new folder, since files of the user may have any name
-    folder = Path(tempfile.mkdtemp(prefix=f"{out.stem}-", dir=out.parent))
-    model, extras = folder / "model.ply", folder / "model.json"
-    shutil.copyfile(model_file(trial), model)
-    write_json(extras, settings)
-    words = ["npx", PACKAGE, str(model), "-E", str(extras), str(out)]
-    return (
-        f"{cause}: model and settings lie in {folder}; where it works, type, in a folder of your "
-        f"own: {shlex.join(words)}"
+            last = (done.stderr or done.stdout).strip().rpartition("\n")[2]
+            said = f"npx {PACKAGE} failed ({last})"
+    raise GsbenchError(
+        f"{said}: export --out model.ply, and where it works, type in a folder of your own: npx "
+        f"{PACKAGE} model.ply {out.name}"
     )
 
 
@@ -106,46 +88,21 @@ def page_settings(trial: TrialResult) -> dict[str, Any]:
     """The viewer's settings: the training's background, and a camera for each test view."""
     folder = model_folder(trial)
     points, _ = model_points(read_model(folder))
-    cameras = [
-        (view.name, _camera(view, points, trial.record.to_training))
+    views = [
+        _annotation(view.name, _camera(view, points, trial.record.to_training))
         for view in read_test_views(trial, folder)
     ]
     return {
         "version": 2,
         "tonemapping": "none",
         "highPrecisionRendering": False,
-        "background": {"color": _background(trial)},
+        "background": {"color": list(background_of(trial))},
         "postEffectSettings": {name: {"enabled": False, **EFFECTS[name]} for name in EFFECTS},
-        "animTracks": [_flight([camera for _, camera in cameras])],
-        "cameras": [{"initial": cameras[0][1]}],
-        "annotations": [_annotation(name, camera) for name, camera in cameras],
-        "startMode": "animTrack",
+        "animTracks": [],
+        "cameras": [views[0]["camera"]],
+        "annotations": views,
+        "startMode": "default",
     }
-
-
-def _flight(cameras: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """The path through the cameras and back, shown until the user takes the mouse."""
-    stops = [*cameras, cameras[0]]
-    # for each key, the numbers of all stops one after another
-    values = {key: np.ravel([stop[key] for stop in stops]).tolist() for key in cameras[0]}
-    times = [SECONDS_PER_VIEW * k for k in range(len(stops))]
-    return {
-        "name": "test views",
-        "duration": times[-1],
-        "frameRate": 1,
-        "loopMode": "repeat",
-        "interpolation": "spline",
-        "smoothness": 1,
-        "keyframes": {"times": times, "values": values},
-    }
-
-
-def _background(trial: TrialResult) -> list[float]:
-    """The training's background, three numbers; raises InputError for anything else."""
-    color = trial.config.get("train.background", (0.0, 0.0, 0.0))
-    if len(color) != 3 or any(type(channel) not in (int, float) for channel in color):
-        raise InputError(f"{trial.path}: train.background in its configuration is not a colour")
-    return [float(channel) for channel in color]
 
 
 def _annotation(name: str, camera: dict[str, Any]) -> dict[str, Any]:

@@ -25,11 +25,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from gsbench.errors import GsbenchError, InputError
-from gsbench.events import Cause
-from gsbench.gaussians.model import MAX_SH_DEGREE
-from gsbench.gaussians.paper_values import VOLUME_THRESHOLD
 from gsbench.scene.types import Camera, View
-from gsbench.view.trials import Layers, Picture, TrialPainter, photograph_at, side_by_side
+from gsbench.view.trials import Picture, ViewedTrial, photograph_at, side_by_side
 
 log = logging.getLogger(__name__)
 
@@ -37,31 +34,33 @@ HOST = "127.0.0.1"  # only this machine can connect
 LOOPBACK = (HOST, "localhost", "::1")
 SERVE = "websockets.asyncio.server.serve"  # the function with which viser starts its server
 FREE_VIEW = "free"
-MOVING_HEIGHT = 240  # px while the camera moves
-HEIGHTS = ("270", "540", "810")  # px when it rests
+MOVING_HEIGHT, RESTING_HEIGHT = 240, 540  # px of the picture while the camera moves, and at rest
 REST_SECONDS = 0.25  # without a change, after which the sharp picture is drawn
-DEFAULT_THRESHOLD = math.log10(VOLUME_THRESHOLD)
 MAX_ASPECT = 10.0  # of a page, whose width decides the size of the picture
 MIN_FOV = 1e-3  # radians
 MAX_DISTANCE = 1e9  # world units
 
 
 class Viewer:
-    """Serves ``painters`` (one or two) on a loopback port until ``stop``; port 0: a free one."""
+    """Serves ``trials`` (one or two) on a loopback port until ``stop``; port 0: a free one."""
 
-    def __init__(self, painters: Sequence[TrialPainter], port: int) -> None:
+    def __init__(self, trials: Sequence[ViewedTrial], port: int) -> None:
         import viser
 
-        self.painters = tuple(painters)
-        self.views: dict[str, View] = {view.name: view for view in painters[0].trial.views}
+        self.trials = tuple(trials)
+        self.views: dict[str, View] = {view.name: view for view in trials[0].views}
+        self.up = mean_up(trials[0].views)
         with refuse_other_pages():
             self.server: Any = viser.ViserServer(host=HOST, port=port, verbose=False)
         self.server.gui.configure_theme(
             control_layout="collapsible", show_logo=False, show_share_button=False
         )
-        self.server.scene.set_up_direction(mean_up(painters[0].trial.views))
+        self.server.scene.set_up_direction(self.up)
         self._sessions: dict[int, Session] = {}
-        self._add_controls()
+        self._view = self.server.gui.add_dropdown(
+            "Test view", (FREE_VIEW, *self.views), initial_value=next(iter(self.views))
+        )
+        self._view.on_update(self._go_to_view)
         self.server.on_client_connect(self._connect)
         self.server.on_client_disconnect(self._disconnect)
 
@@ -69,97 +68,40 @@ class Viewer:
     def url(self) -> str:
         return f"http://{HOST}:{self.server.get_port()}"
 
+    @property
+    def view(self) -> View | None:
+        """The test view whose photograph is shown, if any."""
+        return self.views.get(self._view.value)
+
+    @property
+    def panes(self) -> int:
+        return len(self.trials) + (self.view is not None)
+
     def stop(self) -> None:
         """Close the page and end all drawing."""
         for session in list(self._sessions.values()):
             session.stop()
         self.server.stop()
 
-    def draw(self, camera: Camera, layers: Layers, view: View | None) -> Picture:
-        """The page's picture from ``camera``: a pane for each trial, and a photograph."""
+    def draw(self, camera: Camera, view: View | None) -> Picture:
+        """The page's picture from ``camera``: the photograph of ``view``, and each trial."""
         panes = [] if view is None else [(f"photograph {view.name}", photograph_at(camera, view))]
-        for painter in self.painters:
-            label = f"{painter.trial.label}: {len(painter.trial.gaussians):,} Gaussians"
-            panes.append((label, painter.draw(camera, layers)))
+        for trial in self.trials:
+            label = f"{trial.label}: {len(trial.gaussians):,} Gaussians"
+            panes.append((label, trial.draw(camera)))
         return side_by_side(panes)
 
-    def layers(self) -> Layers:
-        """The layers selected by the controls."""
-        return Layers(
-            sh_degree=min(max(int(self._degree.value), 0), MAX_SH_DEGREE),
-            share=float(self._share.value),
-            causes=bool(self._causes.value),
-            log10_volume=float(self._threshold.value),
-            cloud=bool(self._cloud.value),
-        )
-
-    def photograph(self) -> View | None:
-        """The photograph to show beside the renders, if any."""
-        return self.views.get(self._view.value) if self._beside.value else None
-
-    @property
-    def resting_height(self) -> int:
-        return int(self._height.value) if self._height.value in HEIGHTS else int(HEIGHTS[0])
-
-    def _add_controls(self) -> None:
-        gui = self.server.gui
-        volumes = [painter.trial.log10_volumes for painter in self.painters]
-        volumes.append(np.array([DEFAULT_THRESHOLD]))
-        lowest = math.floor(min(part.min() for part in volumes))
-        highest = math.ceil(max(part.max() for part in volumes))
-        # Most folders start closed, because the panel covers the picture on a narrow page.
-        with gui.add_folder("Test views"):
-            self._view = gui.add_dropdown(
-                "View", (FREE_VIEW, *self.views), initial_value=next(iter(self.views))
-            )
-            self._beside = gui.add_checkbox("Photograph beside", True)
-        with gui.add_folder("Gaussians", expand_by_default=False):
-            self._degree = gui.add_slider("SH degree", 0, 3, 1, 3)
-            self._share = gui.add_slider("Most opaque, %", 1, 100, 1, 100)
-        with gui.add_folder("Growth", expand_by_default=False):
-            self._cloud = gui.add_checkbox("Initial cloud", False)
-            self._causes = gui.add_checkbox("Large ones by cause", False)
-            self._threshold = gui.add_slider(
-                "log10 volume >", lowest, highest, 0.001, round(DEFAULT_THRESHOLD, 3)
-            )
-            self._legend = gui.add_markdown(self._legend_text())
-        self._height = gui.add_dropdown("Picture height, px", HEIGHTS, initial_value=HEIGHTS[1])
-        for control in (self._degree, self._share, self._cloud, self._causes, self._height):
-            control.on_update(lambda _: self._redraw())
-        self._threshold.on_update(lambda _: self._update_threshold())
-        self._view.on_update(self._go_to_view)
-        self._beside.on_update(self._go_to_view)  # because the width of the panes changes
-
-    def _legend_text(self) -> str:
-        volume = 10 ** float(self._threshold.value)
-        counts = [painter.counts_above(float(self._threshold.value)) for painter in self.painters]
-        lines = [f"V > {volume:.3g}"]
-        for cause in Cause:
-            if any(count[cause] for count in counts):
-                color = "#{:02x}{:02x}{:02x}".format(*cause.color)
-                numbers = " | ".join(f"{count[cause]:,}" for count in counts)
-                lines.append(f"<span style='color:{color}'>&#9679;</span> {cause.words}: {numbers}")
-        return "<br>".join(lines)
-
-    def _update_threshold(self) -> None:
-        self._legend.content = self._legend_text()
-        self._redraw()
-
-    def _redraw(self) -> None:
-        for session in list(self._sessions.values()):
-            session.wake()
-
     def _go_to_view(self, event: Any) -> None:
-        view = self.views.get(self._view.value)
         session = None if event.client is None else self._sessions.get(event.client.client_id)
-        if view is not None and session is not None:
-            session.go_to(view)
-        self._redraw()
+        if self.view is not None and session is not None:
+            session.go_to(self.view)
+        for one in list(self._sessions.values()):
+            one.wake()
 
     def _connect(self, client: Any) -> None:
         session = Session(self, client)
         self._sessions[client.client_id] = session
-        session.go_to(self.views.get(self._view.value, next(iter(self.views.values()))))
+        session.go_to(self.view or next(iter(self.views.values())))
         session.start()
 
     def _disconnect(self, client: Any) -> None:
@@ -195,16 +137,13 @@ class Session:
     def go_to(self, view: View) -> None:
         """Move the page's camera to that of ``view``, so that the whole view is seen."""
         own, camera = view.camera, self.client.camera
-        aspect = float(camera.aspect or 1.0) / self._panes()
+        aspect = float(camera.aspect or 1.0) / self.viewer.panes
         forward = own.rotation[2]  # [3] world
         with self.client.atomic():
-            camera.up_direction = level_up(own, mean_up(self.viewer.painters[0].trial.views))
+            camera.up_direction = level_up(own, self.viewer.up)
             camera.position = own.center
             camera.look_at = own.center + forward * orbit_distance(list(self.viewer.views.values()))
             camera.fov = fitting_fov(own, aspect)
-
-    def _panes(self) -> int:
-        return len(self.viewer.painters) + (self.viewer.photograph() is not None)
 
     def _loop(self) -> None:
         while not self._stopped.is_set():
@@ -213,7 +152,7 @@ class Session:
             self._show(MOVING_HEIGHT)
             # A change within this time starts again with a coarse picture, which keeps up with it.
             if not self._changed.wait(REST_SECONDS):
-                self._show(self.viewer.resting_height)
+                self._show(RESTING_HEIGHT)
 
     def _show(self, height: int) -> None:
         if self._stopped.is_set():
@@ -221,8 +160,8 @@ class Session:
         page = self.client.camera
         try:
             seen = (page.wxyz, page.position, page.fov, page.aspect)
-            camera = page_camera(*seen, height, self._panes())
-            image = self.viewer.draw(camera, self.viewer.layers(), self.viewer.photograph())
+            camera = page_camera(*seen, height, self.viewer.panes)
+            image = self.viewer.draw(camera, self.viewer.view)
         except Exception as error:  # noqa: BLE001
             # A page may send any values, and they must not end this thread.
             log.debug("view: %r", error)

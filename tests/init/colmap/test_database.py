@@ -248,15 +248,6 @@ def test_images_that_colmap_cannot_read_become_png_under_the_same_name(images, t
     assert made.readable_images(images, names, tmp_path / "work") == folder  # made again
 
 
-def test_links_are_made_again_in_a_folder(images, tmp_path):
-    given = {"a.png.png": images / "b.png", "left/b.png.png": images / "c.png"}
-    for _ in range(2):
-        folder = made.linked(given, tmp_path / "masks")
-        for name, mask in given.items():
-            assert (folder / name).resolve() == mask
-        assert len([path for path in folder.rglob("*.png") if path.is_symlink()]) == 2
-
-
 def test_reference_cameras_are_marked_as_known_and_grouped_with_their_images():
     model = pycolmap.Reconstruction()
     for number, focal in ((1, 50.0), (2, 60.0)):
@@ -271,14 +262,6 @@ def test_reference_cameras_are_marked_as_known_and_grouped_with_their_images():
     assert known == [(60.0, 80), (50.0, 40)]
     assert all(camera.has_prior_focal_length for camera, _ in groups)
     assert not any(camera.has_prior_focal_length for camera in model.cameras.values())  # copies
-
-
-@pytest.mark.parametrize(
-    "count, processes, size", [(48, 2, 10), (10, 1, 3), (4, 8, 2), (200, 1, 16), (33, 3, 6)]
-)
-def test_parts_are_small_enough_for_six_per_process(count, processes, size):
-    """sqrt(12 processes) blocks, rounded up, with ``size`` images each, at least 2 and at most 16."""
-    assert matches._block_size(count, processes) == size
 
 
 def test_matching_is_divided_over_processes_and_reports_one_sum(database, monkeypatch):

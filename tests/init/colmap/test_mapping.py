@@ -121,6 +121,28 @@ class Model:
         return self.points
 
 
+@pytest.fixture
+def ten(tmp_path):
+    """A database of ten images."""
+    camera = pycolmap.Camera.create_from_model_name(1, "PINHOLE", 30.0, 40, 30)
+    create_database(tmp_path / "database.db", [(camera, [f"{k}.png" for k in range(10)])])
+    return tmp_path / "database.db"
+
+
+@pytest.fixture
+def ways(monkeypatch):
+    """The mapper's strategies, as names with the sizes of their models."""
+    made = []
+
+    def strategies(_):
+        for name, sizes in made:
+            yield name, lambda sizes=sizes: [Model(*size) for size in sizes]
+
+    monkeypatch.setattr(mapping, "measure_geometry", lambda model: model.geometry)
+    monkeypatch.setattr(mapping._Mapper, "strategies", strategies)
+    return made
+
+
 @pytest.mark.parametrize(
     "found, best, tried",
     [
@@ -132,19 +154,9 @@ class Model:
         ([[], [(3, 1)]], (3, 1), 2),
     ],
 )
-def test_strategies_are_tried_until_one_places_nine_of_ten_images(
-    tmp_path, monkeypatch, found, best, tried
-):
-    camera = pycolmap.Camera.create_from_model_name(1, "PINHOLE", 30.0, 40, 30)
-    create_database(tmp_path / "database.db", [(camera, [f"{k}.png" for k in range(10)])])
-    monkeypatch.setattr(mapping, "measure_geometry", lambda model: model.geometry)
-
-    def way(name, sizes):
-        return name, lambda: [Model(*size) for size in sizes]
-
-    ways = [way(f"way {k}", sizes) for k, sizes in enumerate(found)]
-    monkeypatch.setattr(mapping._Mapper, "strategies", lambda mapper: iter(ways))
-    result = mapped(tmp_path / "database.db", "auto")
+def test_strategies_are_tried_until_one_places_nine_of_ten_images(ten, ways, found, best, tried):
+    ways[:] = [(f"way {k}", sizes) for k, sizes in enumerate(found)]
+    result = mapped(ten, "auto")
     assert (result.model.num_reg_images(), result.model.num_points3D()) == best
     place = next(k for k, sizes in enumerate(found) if best in sizes)
     assert (result.strategy, result.models) == (f"way {place}", len(found[place]))
@@ -152,9 +164,9 @@ def test_strategies_are_tried_until_one_places_nine_of_ten_images(
     tries = ", ".join(f"way {k} {count}" for k, count in enumerate(most))
     assert [f"images: {tries})" in line for line in result.warnings] == [True] * (tried > 1)
     for sizes, said in (([], "found no pair of images"), ([(2, 99)], "placed only 2 of 10 images")):
-        ways[:] = [way("only", sizes)]
+        ways[:] = [("only", sizes)]
         with refusal(said):
-            mapped(tmp_path / "database.db", "auto")
+            mapped(ten, "auto")
 
 
 @pytest.mark.parametrize("prior", [True, False])
@@ -285,21 +297,17 @@ def test_only_a_collapsed_model_has_depths_that_differ_by_a_factor_of_thousands(
     assert geometry.depth_spread == pytest.approx(high / low)
 
 
-def test_a_smaller_sound_model_is_kept_and_the_setting_is_named(tmp_path, monkeypatch):
-    camera = pycolmap.Camera.create_from_model_name(1, "PINHOLE", 30.0, 40, 30)
-    create_database(tmp_path / "database.db", [(camera, [f"{k}.png" for k in range(10)])])
-    monkeypatch.setattr(mapping, "measure_geometry", lambda model: model.geometry)
-    ways = [("small", lambda: [Model(7)]), ("large", lambda: [Model(10, 99, 4000.0)])]
-    monkeypatch.setattr(mapping._Mapper, "strategies", lambda mapper: iter(ways))
-    result = mapped(tmp_path / "database.db", "auto", pairs="sequential")
+def test_a_smaller_sound_model_is_kept_and_the_setting_is_named(ten, ways):
+    ways[:] = [("small", [(7,)]), ("large", [(10, 99, 4000.0)])]
+    result = mapped(ten, "auto", pairs="sequential")
     assert (result.strategy, result.model.images) == ("small", 7)
     (line,) = result.warnings
     assert "small 7, large 10 (collapsed: depths of its images differ by a factor of 4,000)" in line
     assert "init.pairs=exhaustive may place more" in line
-    assert "init.pairs" not in mapped(tmp_path / "database.db", "auto").warnings[0]
+    assert "init.pairs" not in mapped(ten, "auto").warnings[0]
     ways[:] = ways[1:]
     with refusal("made no sound model of 10 images .large 10 .collapsed"):
-        mapped(tmp_path / "database.db", "auto")
+        mapped(ten, "auto")
 
 
 @pytest.mark.parametrize("intrinsics", ["estimate", "reference"])

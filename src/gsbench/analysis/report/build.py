@@ -12,7 +12,7 @@ from gsbench.analysis import sentences
 from gsbench.analysis.cells import select_trials, where_words
 from gsbench.analysis.comparison import Answer, chosen, compare
 from gsbench.analysis.differences import between_scenes_notes
-from gsbench.analysis.fairness import caveats, counts_notes, fairness_table, limit_notes
+from gsbench.analysis.fairness import caveats, counts_notes, fairness_table
 from gsbench.analysis.images import choose_views, png_uri
 from gsbench.analysis.notes import texts
 from gsbench.analysis.pairs import pair_trials
@@ -27,8 +27,8 @@ from gsbench.analysis.report.volumes import volume_charts
 from gsbench.analysis.report.where import region_maps
 from gsbench.analysis.results import Experiment, TrialResult, group_by, trials_of
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry, fill
-from gsbench.analysis.tables import build_table, with_agreement
-from gsbench.analysis.verdicts import SceneEstimate, Verdict
+from gsbench.analysis.tables import build_table
+from gsbench.analysis.verdicts import Verdict
 from gsbench.eval.facts import find_metric
 from gsbench.parsing import read_if_sound
 from gsbench.runs import layout
@@ -69,21 +69,20 @@ def build_report(
         script=files("gsbench.analysis.report").joinpath("script.js").read_text(encoding="utf-8"),
         name=experiment.name,
         explained=command("explain", f"{experiment.name}:SCENE:METRIC:ARM"),
-        arms=[str(arm) for arm in arms],
+        arms=arms,
         scenes=sorted({trial.scene for trial in trials}),
-        seeds=experiment.seeds,
         trials=trials,
         versus=[
-            compare_arms(trials, own, experiment.older)
-            | {"maps": maps.get((own.baseline, own.arm), [])}
+            compare_arms(trials, own) | {"maps": maps.get((own.baseline, own.arm), [])}
             for own in comparison.answers
         ],
         ledger=experiment.history.ledger and command("ledger", "show", experiment.name),
+        experiment=experiment,
         risk=comparison.risk,
         sweeps=sweep_charts(comparison),
         unused=texts(comparison.remarks),
         # the top of the page has the verdicts
-        tables=[replace(table, verdicts=()) for table in with_agreement(tables)],
+        tables=[replace(table, verdicts=()) for table in tables],
         contradictions=[] if paper_table is None else load_published().contradictions,
         search=search_summary(experiment.folder),
         say=sentences,
@@ -101,8 +100,6 @@ def build_report(
         volume_notes=volume_notes,
         figures=trial_figures(trials),
         provenance=provenance(trials),
-        warnings=experiment.warnings,
-        left_out=experiment.left_out,
     )
 
 
@@ -112,7 +109,7 @@ def trial_figures(trials: Sequence[TrialResult]) -> list[tuple[str, str]]:
     A picture that arms of a scene share, such as that of their initial cloud, appears once.
     """
     sources: dict[tuple[str, str, str], list[str]] = {}  # {(name, scene, data URI): arms and seeds}
-    for group in group_by(trials, lambda trial: (trial.scene, trial.arm)).values():
+    for group in group_by(trials, "scene", "arm").values():
         trial = group[0]
         for path in sorted((trial.path / layout.FIGURES).glob("*.png")):
             key = path.stem.replace("_", " "), trial.scene, png_uri(read_image(path))
@@ -122,13 +119,8 @@ def trial_figures(trials: Sequence[TrialResult]) -> list[tuple[str, str]]:
     ]
 
 
-def compare_arms(
-    trials: Sequence[TrialResult], judged: Answer, older: Sequence[TrialResult]
-) -> dict[str, Any]:
-    """Everything that the page shows of two arms; notes say what could not be compared or read.
-
-    ``older`` are the trials of earlier code.
-    """
+def compare_arms(trials: Sequence[TrialResult], judged: Answer) -> dict[str, Any]:
+    """Everything that the page shows of two arms; notes say what could not be compared or read."""
     first, second = judged.baseline, judged.arm
     verdicts = [judged.verdict, *judged.metrics]
     views, faults = choose_views(pair_trials(trials, first, second))
@@ -137,16 +129,14 @@ def compare_arms(
         "title": f"{second} against {first}",
         "verdicts": verdicts,
         "has_like_these": judged.verdict.like_these is not None,
-        **_settings_of_both(trials, first, second, older),
+        **_settings_of_both(trials, first, second),
         "forests": [_forest(verdict) for verdict in verdicts],
         "views": views,
         "notes": texts([*judged.verdict.notes, *faults]),
     }
 
 
-def _settings_of_both(
-    trials: Sequence[TrialResult], first: Arm, second: Arm, older: Sequence[TrialResult]
-) -> dict[str, Any]:
+def _settings_of_both(trials: Sequence[TrialResult], first: Arm, second: Arm) -> dict[str, Any]:
     """Differences between the settings and the costs of two arms; none while one is awaited."""
     baseline, other = trials_of(trials, first), trials_of(trials, second)
     if not (baseline and other):
@@ -157,11 +147,10 @@ def _settings_of_both(
                 [
                     *counts_notes(trials, [(first, second)]),
                     *caveats(trials, first, second),
-                    *limit_notes(trials, [(first, second)]),
                 ]
             )
         ),
-        "fairness": fairness_table(trials, first, second, older),
+        "fairness": fairness_table(trials, first, second),
         "facts": [*_costs(baseline, other), *between_scenes_notes(baseline, other)],
     }
 
@@ -190,9 +179,10 @@ def _costs(baseline: Sequence[TrialResult], other: Sequence[TrialResult]) -> lis
 
 def _spread_of_times(trials: Sequence[TrialResult]) -> str:
     """Say how far training times of equal trials differ: smaller changes mean nothing."""
-    cells = group_by(trials, lambda trial: (trial.arm, trial.scene)).values()
-    times = [[t for trial in cell if (t := COSTS["train_time"][1](trial))] for cell in cells]
-    spread = max((max(own) / min(own) - 1 for own in times if own), default=0.0)
+    spread = 0.0
+    for cell in group_by(trials, "arm", "scene").values():
+        times = [seconds for trial in cell if (seconds := COSTS["train_time"][1](trial))]
+        spread = max(spread, max(times, default=1.0) / min(times, default=1.0) - 1)
     return f"; times of equal trials differ by up to {spread:.0%}" if spread else ""
 
 
@@ -200,7 +190,7 @@ def _forest(verdict: Verdict) -> str:
     rows = [*verdict.scenes]
     if len(rows) > 1:
         mean, seeds = verdict.mean or 0.0, verdict.pairs.seeds
-        rows.append(SceneEstimate("mean of scenes", mean, seeds, verdict.interval))
+        rows.append(("mean of scenes", mean, seeds, verdict.interval))
     better = (
         "right of zero is better" if verdict.quantity.direction == 1 else "left of zero is better"
     )
@@ -239,24 +229,23 @@ def search_summary(home: Path) -> tuple[str, str] | None:
     record = read_if_sound(home / layout.TUNING, TuningRecord)
     if record is None:
         return None
-    done = [
-        (number, point, point.value)
-        for number, point in enumerate(record.points, 1)
-        if point.value is not None
-    ]
+    done = {
+        number: point for number, point in enumerate(record.points, 1) if point.value is not None
+    }
     failed = len(record.points) - len(done)
     count = (
         f"{len(record.points)} of {counted(record.wanted, 'point')}, each "
-        f"{counted(len(record.seeds), 'seed')}"
+        f"{counted(len(record.seeds), 'seed')}{f'; {failed} failed' if failed else ''}"
     )
-    count += f"; {failed} failed" if failed else ""
-    if not done:
+    if record.best is None:
         return f"{count}; none has a result yet.", ""
     facts = find_metric(record.metric)
     name, decimals = (facts.name, facts.decimals + 1) if facts else (record.metric, 4)
-    number, best, best_value = max(done, key=lambda numbered: record.direction * numbered[2])
-    settings = ", ".join(f"{key} = {value}" for key, value in best.settings.items())
-    line = f"Best {name}: {best_value:.{decimals}f} at {settings} (point {number}). {count}. "
+    number = next(number for number, point in done.items() if point is record.best)
+    settings = ", ".join(f"{key} = {value}" for key, value in record.best.settings.items())
+    line = (
+        f"Best {name}: {record.best.value:.{decimals}f} at {settings} (point {number}). {count}. "
+    )
     line += "Judged by validation views; no test view was looked at."
-    values = [(float(number), value) for number, _, value in done]
+    values = [(float(number), point.value or 0.0) for number, point in done.items()]
     return line, line_chart("The search", [("each point", values)], "point", name)

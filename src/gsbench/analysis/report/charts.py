@@ -12,7 +12,7 @@ from types import MappingProxyType
 
 from gsbench.analysis.statistics import Interval
 from gsbench.analysis.table_formats import fill
-from gsbench.analysis.verdicts import SceneEstimate
+from gsbench.analysis.verdicts import SceneRow
 from gsbench.words import true_minus
 
 WIDTH, HEIGHT = 380, 250  # px at full size; text is 12 px
@@ -95,43 +95,46 @@ def line_chart(
     )
 
 
-def forest_plot(title: str, rows: Sequence[SceneEstimate], x_label: str, better: int) -> str:
+def forest_plot(title: str, rows: Sequence[SceneRow], x_label: str, better: int) -> str:
     """Differences with intervals, one per row, and a line at 0; ``better`` is a gain's sign.
 
     An interval much wider than the others is cut, so that it does not stretch the axis.
     """
     if not rows:
         return ""
+    intervals = [interval for *_, interval in rows if interval]
     reach = [
-        max(map(abs, (row.mean, row.interval.low, row.interval.high)))
-        for row in rows
-        if row.interval
+        max(map(abs, (mean, interval.low, interval.high)))
+        for _, mean, _, interval in rows
+        if interval
     ]
-    most = max([STRETCH * median(reach or [0.0]), *(abs(row.mean) for row in rows)])
-    ends = [0.0, *(row.mean for row in rows)]
-    ends += [
-        min(max(end, -most), most)
-        for row in rows
-        if row.interval
-        for end in (row.interval.low, row.interval.high)
-    ]
-    words = [
-        f"{row.scene} {short_number(row.mean)}"
-        + (
-            f", interval {short_number(row.interval.low)} to {short_number(row.interval.high)}"
-            if row.interval
-            else ""
-        )
-        for row in rows
-    ]
+    most = max([STRETCH * median(reach or [0.0]), *(abs(mean) for _, mean, *_ in rows)])
+
+    def cut(end: float) -> float:
+        return min(max(end, -most), most)
+
+    ends = [0.0, *(mean for _, mean, *_ in rows)]
+    ends += [cut(end) for interval in intervals for end in (interval.low, interval.high)]
+    words = []
+    for scene, mean, _, interval in rows:
+        words.append(f"{scene} {short_number(mean)}")
+        if interval:
+            low, high = map(short_number, (interval.low, interval.high))
+            words[-1] += f", interval {low} to {high}"
     bottom = FOREST_TOP + FOREST_ROW * len(rows)
     return fill(
         "forest_plot.html.j2",
         title=title,
         words=f"{title}. {x_label}. {'; '.join(words)}.",
         rows=[
-            (FOREST_TOP + FOREST_ROW * (k + 0.5), row, forest_color(row, better), _cut(row, most))
-            for k, row in enumerate(rows)
+            (
+                FOREST_TOP + FOREST_ROW * (k + 0.5),
+                scene,
+                mean,
+                forest_color(mean, interval, better),
+                (cut(interval.low), cut(interval.high)) if interval else None,
+            )
+            for k, (scene, mean, _, interval) in enumerate(rows)
         ],
         x=Axis(ends, False, FOREST_LEFT, WIDTH - RIGHT, ticks=3),
         x_label=x_label,
@@ -142,18 +145,11 @@ def forest_plot(title: str, rows: Sequence[SceneEstimate], x_label: str, better:
     )
 
 
-def forest_color(row: SceneEstimate, better: int) -> str:
+def forest_color(mean: float, interval: Interval | None, better: int) -> str:
     """Grey if the interval contains 0 or is unknown, green on the side ``better``, else red."""
-    if row.interval is None or not row.interval.excludes_zero():
+    if interval is None or not interval.excludes_zero():
         return "#555555"
-    return "#1b7837" if row.mean * better > 0.0 else "#b2182b"
-
-
-def _cut(row: SceneEstimate, most: float) -> tuple[float, float] | None:
-    """The ends of a row's interval, at most ``most`` from 0; None without an interval."""
-    if row.interval is None:
-        return None
-    return max(row.interval.low, -most), min(row.interval.high, most)
+    return "#1b7837" if mean * better > 0.0 else "#b2182b"
 
 
 ROUND = (1, 2, 2.5, 5, 10)  # steps between ticks, as multiples of a power of ten

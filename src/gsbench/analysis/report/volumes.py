@@ -102,7 +102,7 @@ def _logged_histograms(trials: Sequence[TrialResult]) -> dict[int, Curve]:
 
 def _threshold(trials: Sequence[TrialResult]) -> float | None:
     """The absolute volume threshold (cubed scene units) that all arms share, or None."""
-    configs = [group[0].config for group in group_by(trials, lambda trial: trial.arm).values()]
+    configs = [group[0].config for group in group_by(trials, "arm").values()]
     thresholds = [
         config["densify.volume_threshold"]
         for config in configs

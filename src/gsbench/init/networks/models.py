@@ -16,7 +16,7 @@ from gsbench.init.networks.options import NetworkOptions
 from gsbench.scene.images import read_image, resize_image
 from gsbench.scene.options import downscaled_size
 from gsbench.system.install import install_command
-from gsbench.weights import MissingWeightsError, load_state
+from gsbench.weights import load_into, load_state
 
 GPU_MEMORY_HINT = "lower init.max_image_size or init.max_keypoints, or set init.device=cpu"
 SUPERPOINT_BORDER = 4  # px without keypoints, as in deep-image-matching
@@ -55,28 +55,6 @@ def extract_features(
     return Features(keypoints, descriptors, scores, network_size, (width, height))
 
 
-def load_into(
-    network: torch.nn.Module, state: Mapping[str, Tensor], path: Path, device: torch.device
-) -> None:
-    """Load all parameters in ``state`` into ``network`` on ``device``; buffers may be missing."""
-    try:
-        missing, unexpected = network.load_state_dict(dict(state), strict=False)
-    except RuntimeError as error:
-        raise MissingWeightsError(
-            f"weights file {path} has tensors of other shapes than the network: replace it"
-        ) from error
-    # Buffers are constants that a network makes itself, and published checkpoints often lack them.
-    learned = {name for name, _ in network.named_parameters()}
-    missing = sorted(learned.intersection(missing))
-    if missing or unexpected:
-        example = (missing or unexpected)[0]
-        raise MissingWeightsError(
-            f"weights file {path} is for another network ({len(missing)} tensors missing, "
-            f"{len(unexpected)} foreign, for example {example}): replace it"
-        )
-    network.to(device).eval()
-
-
 def _superpoint(settings: Settings, weights: Path, device: torch.device) -> Extractor:
     try:
         from transformers import SuperPointConfig, SuperPointForKeypointDetection
@@ -99,7 +77,7 @@ def _superpoint(settings: Settings, weights: Path, device: torch.device) -> Extr
     detector = [name for name in state if name.startswith(prefix)]
     if detector:
         state = {name.removeprefix(prefix): state[name] for name in detector}
-    load_into(network, state, weights, device)
+    load_into(network, state, weights).to(device)
 
     def extract(image: Tensor) -> Found:
         height, width = image.shape[-2:]
@@ -128,7 +106,7 @@ def _aliked(settings: Settings, weights: Path, device: torch.device) -> Extracto
         detection_threshold=settings["keypoint_threshold"],
         nms_radius=settings["nms_radius"],
     )
-    load_into(network, load_state(weights), weights, device)
+    load_into(network, load_state(weights), weights).to(device)
 
     def extract(image: Tensor) -> Found:
         features = network(image)[0]
@@ -141,7 +119,7 @@ def _disk(settings: Settings, weights: Path, device: torch.device) -> Extractor:
     from kornia.feature import DISK
 
     network = DISK()
-    load_into(network, load_state(weights, entry="extractor"), weights, device)
+    load_into(network, load_state(weights, entry="extractor"), weights).to(device)
 
     def extract(image: Tensor) -> Found:
         features = network(
@@ -210,7 +188,7 @@ def lightglue_matcher(
     # DISK's file also has a constant 1 for each layer, "log_assignment.0.r", that no code reads.
     unread = [f"log_assignment.{layer}.r" for layer in range(network.conf.n_layers)]
     state = {name: value for name, value in state.items() if name not in unread}
-    load_into(network, state, weights, device)
+    load_into(network, state, weights).to(device)
 
     def inputs(features: Features) -> dict[str, torch.Tensor]:
         return {

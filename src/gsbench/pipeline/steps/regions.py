@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -43,7 +43,7 @@ def region_inputs(views: Views, parts: Parts) -> dict[str, Any] | None:
     if wanted != DISTANCE:
         return digests(region_masks(capture, parts))
     depths = _sensor_depths(capture)
-    if not depths and not len(_own_model(capture.model, capture.fingerprint).points):
+    if not depths and not len(_own_model(capture.model, capture.fingerprint)[0]):
         raise InputError(
             f"eval.regions={DISTANCE}: the scene {capture.name} has no depth maps and no model "
             "with points of its own, which all arms would share: give a COLMAP model (gsbench "
@@ -116,20 +116,16 @@ def _sensor_depths(capture: Capture) -> dict[str, Path]:
     return {name: capture.depths[name] for name in capture.test_names if name in capture.depths}
 
 
-class _OwnModel(NamedTuple):
-    """The points [P, 3] of a scene's own model, and cameras and poses by photograph."""
-
-    points: Array
-    placed: Mapping[str, tuple[CameraModel, Array, Array]]
-
-
 # Read before the training, to refuse a scene, and after it. The fingerprint covers its content.
 @lru_cache(maxsize=1)
-def _own_model(folder: Path | None, fingerprint: str) -> _OwnModel:
+def _own_model(
+    folder: Path | None, fingerprint: str
+) -> tuple[Array, Mapping[str, tuple[CameraModel, Array, Array]]]:
+    """The points [P, 3] of a scene's own model, and cameras and poses by photograph."""
     if folder is None:
-        return _OwnModel(np.empty((0, 3)), {})
+        return np.empty((0, 3)), {}
     model = read_model(folder)
-    return _OwnModel(model_points(model)[0], posed_by_name(model))
+    return model_points(model)[0], posed_by_name(model)
 
 
 def _unknown(view: View) -> Depth:

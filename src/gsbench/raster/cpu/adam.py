@@ -7,17 +7,20 @@ import numpy as np
 
 from gsbench.gaussians.paper_values import ADAM_BETAS, ADAM_EPSILON
 from gsbench.raster.cpu import layout as at
-from gsbench.raster.cpu.simd import LANES, load, square_root, store
+from gsbench.raster.cpu.simd import LANES, load, prefetch_far, square_root, store
 from gsbench.system.jit import inlined, kernel
 
 BETA1, BETA2 = (np.float32(beta) for beta in ADAM_BETAS)
 REST1, REST2 = (np.float32(1 - beta) for beta in ADAM_BETAS)
 EPSILON = np.float32(ADAM_EPSILON)
+AHEAD = 4096  # numbers ahead that are prefetched
 
 
 @inlined
 def _move(values, first, second, gradients, place, source, factor, root):
     """Step the 16 numbers from ``place`` by the gradients from ``source``."""
+    prefetch_far(first, place + AHEAD)
+    prefetch_far(second, place + AHEAD)
     gradient = load(gradients, source)
     mean = load(first, place) * BETA1 + gradient * REST1
     square = load(second, place) * BETA2 + gradient * gradient * REST2

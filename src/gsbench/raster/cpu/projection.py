@@ -50,6 +50,7 @@ from gsbench.raster.cpu.simd import (
     maximum,
     minimum,
     prefetch,
+    prefetch_far,
     scatter,
     select,
     splat,
@@ -84,6 +85,7 @@ MAX_VARIANCE, CONTOUR_MARGIN = CONSTANTS.max_variance, CONSTANTS.contour_margin
 ZERO, HALF, ONE, TWO, FOUR = (np.float32(value) for value in (0, 0.5, 1, 2, 4))
 
 AHEAD = 16  # records ahead that the backward pass prefetches
+FAR = 64  # Gaussians ahead whose harmonics are prefetched
 ALL_LANES = np.uint64((1 << LANES) - 1)
 EIGENVALUE_FLOOR = CONSTANTS.eigenvalue_floor
 # entries of a shard's flags: number of visible Gaussians; 1 if a value is bad
@@ -136,6 +138,8 @@ def _project(memory, begin, end, gaussians, degree, v, outputs):
         # The last vector of a shard repeats its last Gaussian; those lanes are never stored.
         for lane in range(LANES):
             indices[lane] = min(start + lane, end - 1)
+        if degree > 0:
+            _prefetch_harmonics(gaussians.sh_rest, start, start + LANES)
         mean = gather_vectors(gaussians.means, indices)
         log_scale = gather_vectors(gaussians.log_scales, indices)
         dc = gather_vectors(gaussians.sh_dc, indices)
@@ -217,6 +221,13 @@ def _project(memory, begin, end, gaussians, degree, v, outputs):
     flags[VISIBLE] = out - begin
     sound = mask_bits(absolute(bad) <= ZERO)  # False for NaN
     flags[BAD_VALUE] = 0 if short == 0 and sound == ALL_LANES else 1
+
+
+@inlined
+def _prefetch_harmonics(sh_rest, begin, end):
+    """Prefetch the rows `FAR` behind the rows ``begin`` to before ``end``, seen or not."""
+    for place in range((begin + FAR) * REST, (end + FAR) * REST, LANES):
+        prefetch_far(sh_rest, place)
 
 
 @inlined
@@ -357,6 +368,13 @@ def backproject_shards(
                 past_record += 1
             _clear_unseen(start, stop, origin, record, past_record, frame.record_ints, outputs)
             for sixteen in range(record, past_record, LANES):
+                if degree > 0:
+                    last_own = min(sixteen + LANES, past_record) - 1
+                    _prefetch_harmonics(
+                        gaussians.sh_rest,
+                        _gaussian(frame.record_ints, sixteen),
+                        _gaussian(frame.record_ints, last_own) + 1,
+                    )
                 _backproject(
                     memory, sixteen, past_record, origin, gaussians, degree, frame, rows, outputs
                 )

@@ -255,16 +255,30 @@ def scatter(context, builder, sig, args):
     return context.get_dummy_value()
 
 
-@lowering(types.void, "array index")
-def prefetch(context, builder, sig, args):
-    """Prefetch the cache line of ``array.flat[index]``; never faults."""
+def _prefetch(context, builder, sig, args, caches):
+    """Prefetch a cache line into all caches (3), or into all but the first level (2)."""
     byte_pointer, word = ir.IntType(8).as_pointer(), ir.IntType(32)
     kind = ir.FunctionType(ir.VoidType(), [byte_pointer, word, word, word])
     function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
-    read, keep_in_all_caches, data = (ir.Constant(word, value) for value in (0, 3, 1))
     pointer = pointer_to(context, builder, sig, args, ir.IntType(8))
-    builder.call(function, [pointer, read, keep_in_all_caches, data])
+    read, data = 0, 1
+    builder.call(function, [pointer, *(ir.Constant(word, n) for n in (read, caches, data))])
     return context.get_dummy_value()
+
+
+@lowering(types.void, "array index")
+def prefetch(context, builder, sig, args):
+    """Prefetch the cache line of ``array.flat[index]``; never faults."""
+    return _prefetch(context, builder, sig, args, 3)
+
+
+@lowering(types.void, "array index")
+def prefetch_far(context, builder, sig, args):
+    """Like ``prefetch``, but not into the first-level cache: for what streams from memory.
+
+    Few lines can be on their way to the first level at once; to the second, several times as many.
+    """
+    return _prefetch(context, builder, sig, args, 2)
 
 
 # Functions of vectors and masks
