@@ -89,7 +89,7 @@ def main(runs: Path) -> None:
         runs / "store" / "init" / key / "sparse" / "0", view, (truth.shape[1], truth.shape[0])
     )
 
-    figure = plt.figure(figsize=(12.5, 3.9), dpi=110)
+    figure = plt.figure(figsize=(12.5, 3.7), dpi=110)
     grid = figure.add_gridspec(
         2, 5, height_ratios=(2.0, 1.3), left=0.005, right=0.995, top=0.92, bottom=0.02, wspace=0.02
     )
