@@ -28,7 +28,7 @@ help: ## show this
 
 install: $(VENV)/.stamp-dev ## set up .venv with gsbench and the development tools
 
-demo: $(VENV)/.stamp-run ## baseline against volumetric densification on the courtyard: six trials, the table, the report
+demo: $(VENV)/.stamp-run ## baseline against two ideas on the courtyard: nine trials, the table, the report
 	$(BIN)/gsbench +experiment=demo
 	$(BIN)/gsbench tables demo
 	$(BIN)/gsbench report demo

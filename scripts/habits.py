@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbench.analysis.questions import count_tries, level_of, look_shares
-from gsbench.analysis.thresholds import Region, evenness
+from gsbench.analysis.statistics import Region, evenness
 
 Array = NDArray[np.float64]
 Rates = tuple[Array, Array]  # of each draw: whether it was ever called better, and either

@@ -23,7 +23,7 @@ import simulations
 from numpy.typing import NDArray
 
 from gsbench.analysis.questions import look_shares, plan_looks
-from gsbench.analysis.thresholds import Region, evenness
+from gsbench.analysis.statistics import Region, evenness
 from gsbench.analysis.verdicts import GIVE_UP
 from gsbench.claims.ledger import SCREEN
 

@@ -37,8 +37,7 @@ from gsbench.analysis.planning import (
 )
 from gsbench.analysis.questions import plan_looks
 from gsbench.analysis.results import Arm, TrialResult, Unfinished
-from gsbench.analysis.statistics import REFUTED, SUPPORTED
-from gsbench.analysis.thresholds import Region
+from gsbench.analysis.statistics import REFUTED, SUPPORTED, Region
 from gsbench.analysis.verdicts import judge
 from gsbench.claims import gate as gates
 from gsbench.runs.commands import Question

@@ -25,7 +25,8 @@ from gsbench.analysis import load_experiment, to_frame
 from gsbench.cli import run
 
 TARGET = Path(__file__).resolve().parents[1] / "docs" / "demo.jpg"
-BASELINE, IDEA = "adc", "volumetric"
+BASELINE, IDEA = "adc", "longaxis"
+ARMS = (BASELINE, "volumetric", IDEA)
 COLUMNS = {"psnr": "PSNR (dB) ↑", "ssim": "SSIM ↑", "flip": "FLIP ↓", "num_gaussians": "Gaussians"}
 FORMATS = {"psnr": "{:.2f}", "ssim": "{:.3f}", "flip": "{:.3f}", "num_gaussians": "{:,.0f}"}
 
@@ -60,16 +61,13 @@ def initial_cloud(model: Path, view: str, size: tuple[int, int]) -> NDArray[np.f
     return picture
 
 
-def verdict() -> str:
-    """The note with the verdict that ``gsbench tables demo`` prints; empty if there is none."""
+def verdicts() -> str:
+    """The last lines of the sweep, one for each idea, as ``gsbench tables demo`` gives them."""
     with contextlib.redirect_stdout(io.StringIO()) as printed:
         run(["tables", "demo"])
-    notes = [
-        line.removeprefix("- ")
-        for line in printed.getvalue().splitlines()
-        if line.startswith("- Verdict")
-    ]
-    return notes[0] if notes else ""
+    lines = [line.removeprefix("- ") for line in printed.getvalue().splitlines()]
+    badges = tuple(f"{badge}: " for badge in ("BETTER", "WORSE", "TOO SMALL", "UNDECIDED"))
+    return "\n".join(line for line in lines if line.startswith(badges))
 
 
 def main(runs: Path) -> None:
@@ -91,9 +89,9 @@ def main(runs: Path) -> None:
         runs / "store" / "init" / key / "sparse" / "0", view, (truth.shape[1], truth.shape[0])
     )
 
-    figure = plt.figure(figsize=(12.5, 3.3), dpi=110)
+    figure = plt.figure(figsize=(12.5, 3.7), dpi=110)
     grid = figure.add_gridspec(
-        2, 5, height_ratios=(2.1, 1), left=0.005, right=0.995, top=0.92, bottom=0.02, wspace=0.02
+        2, 5, height_ratios=(2.0, 1.3), left=0.005, right=0.995, top=0.92, bottom=0.02, wspace=0.02
     )
     panels = {
         "photograph": truth,
@@ -117,7 +115,7 @@ def main(runs: Path) -> None:
     below.axis("off")
     columns = [name for name in COLUMNS if name in frame]
     cells = []
-    for arm in (BASELINE, IDEA):
+    for arm in ARMS:
         rows = frame[frame["densify"] == arm]
         values = [
             f"{FORMATS[n].format(rows[n].mean())} ± {FORMATS[n].format(rows[n].std())}"
@@ -132,7 +130,7 @@ def main(runs: Path) -> None:
     for cell in table.get_celld().values():
         cell.set_edgecolor("#cccccc")
     below.text(
-        0.5, -0.02, verdict(), ha="center", va="bottom", fontsize=11, transform=below.transAxes
+        0.5, -0.02, verdicts(), ha="center", va="bottom", fontsize=11, transform=below.transAxes
     )
     figure.savefig(TARGET, pil_kwargs={"quality": 88})
     print(f"{TARGET}: {TARGET.stat().st_size // 1000} kB")

@@ -145,14 +145,6 @@ def test_a_comparison_of_several_ingredients_is_reported(tmp_path):
     assert said.rstrip(".") in page_of(tmp_path)
 
 
-def test_a_setting_changed_in_all_arms_is_no_difference(tmp_path):
-    changes = {"gradient_threshold": 0.0016, "max_gaussians": 9, "cap": "governor", "stop": 77}
-    arms = {name: densifier(name, **changes) for name in ("adc", "longaxis")}
-    assert sentence(trials_of(tmp_path, arms), "adc", "longaxis") == (
-        "sfm-longaxis differs from sfm-adc by split and gradient."
-    )
-
-
 def test_trials_without_recorded_settings_are_reported(tmp_path):
     for path in write_two(tmp_path, "adc", "longaxis"):
         if "longaxis" in path.parent.name:

@@ -155,12 +155,12 @@ def test_the_report_maps_where_the_arm_is_better_and_where_it_is_worse(tmp_path)
     experiment = report_of(tmp_path, seeds=(0, 1, 2), views=2, pictures=True)
     answers = compare(experiment).answers
     ((found,),) = region_maps(experiment.trials, answers).values()
-    assert (found.scene, found.seeds, found.regions) == ("garden", 3, 2 * 4 * 5)
-    assert found.better >= 2 * 4 * 2  # two columns of grass in each view
-    assert 2 <= found.worse <= 2 * 4  # the corner, and parts of its neighbours
+    assert (found["scene"], found["seeds"], found["regions"]) == ("garden", 3, 2 * 4 * 5)
+    assert found["better"] >= 2 * 4 * 2  # two columns of grass in each view
+    assert 2 <= found["worse"] <= 2 * 4  # the corner, and parts of its neighbours
     page = build_report(experiment)
-    said = f"{found.better} of 40 regions are better, {found.worse} worse"
-    assert f"garden, 3 seeds: {said}. View {found.view} has most of them." in page
+    said = f"{found['better']} of 40 regions are better, {found['worse']} worse"
+    assert f"garden, 3 seeds: {said}. View {found['view']} has most of them." in page
 
 
 def test_two_seeds_or_no_pictures_give_no_map(tmp_path):
@@ -185,6 +185,6 @@ def test_an_archive_keeps_the_errors_of_regions_in_place_of_pictures(tmp_path):
         next(iter(region_maps(own.trials, compare(own).answers).values()))[0]
         for own in (experiment, unpacked)
     ]
-    assert (maps[0].better, maps[0].worse) == (maps[1].better, maps[1].worse)
-    assert maps[0].truth
-    assert not maps[1].truth
+    assert (maps[0]["better"], maps[0]["worse"]) == (maps[1]["better"], maps[1]["worse"])
+    assert maps[0]["truth"]
+    assert not maps[1]["truth"]

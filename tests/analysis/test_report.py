@@ -25,13 +25,14 @@ from gsbench.analysis.report.charts import (
     line_chart,
     short_number,
 )
-from gsbench.analysis.report.curves import event_table, mean_by_step
-from gsbench.analysis.report.volumes import (
+from gsbench.analysis.report.curves import (
     _logged_histograms,
     _threshold,
     _volumes_in_training,
+    event_table,
     histogram,
     log10_volumes,
+    mean_by_step,
 )
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.statistics import Interval

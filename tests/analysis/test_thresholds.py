@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from gsbench.analysis.thresholds import Region, evenness, table
+from gsbench.analysis.statistics import Region, evenness, table
 
 DRAWS = 20_000
 CASES = [(2, 3), (3, 2), (3, 3), (4, 4), (8, 3), (7, 7), (13, 2), (30, 2), (25, 5), (45, 3)]

@@ -102,8 +102,8 @@ def test_the_demo_downloads_little_and_declares_what_it_measures():
     asked = {
         (tuple(trial.values["eval"]["lpips"]), trial.values["eval"]["primary"]) for trial in trials
     }
-    # FLIP needs no weights; LPIPS is measured where its weights are
-    assert asked == {(("squeeze",), "flip")}
+    # SSIM needs no weights; LPIPS is measured where its weights are
+    assert asked == {(("squeeze",), "ssim")}
 
 
 @pytest.mark.parametrize(

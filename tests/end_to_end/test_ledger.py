@@ -41,7 +41,7 @@ def test_two_ideas_at_once_share_the_baseline(do, start, tmp_path):
     ends = [process.communicate(timeout=300) for process in both]
     assert {process.returncode for process in both} <= {0, 1, 3}, ends
     ledger = read_ledger(tmp_path / "runs/night")
-    assert len(ledger.begun) == 2
+    assert len(ledger.questions) == 2
     seeds = {next(iter(one.seeds.values())) for one in ledger.tests.values()}
     assert len(seeds) == len(ledger.tests)
     baselines = (tmp_path / "runs/night").glob("courtyard/random-adc/*-seed0/results.json")
@@ -57,11 +57,11 @@ def test_a_killed_try_continues(do, start, tmp_path):
         time.sleep(0.05)
     killed.send_signal(signal.SIGKILL)
     killed.communicate()
-    (idea,) = read_ledger(home).begun
+    (idea,) = read_ledger(home).questions
     assert not read_ledger(home).is_decided(idea)
     code = do("ledger try night", "densify=volumetric")
     assert code.returncode in (0, 1, 3)
-    assert read_ledger(home).begun == [idea]
+    assert [*read_ledger(home).questions] == [idea]
     assert read_ledger(home).is_decided(idea)
 
 

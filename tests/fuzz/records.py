@@ -23,8 +23,7 @@ from random import Random
 from gsbench.analysis.cells import to_frame
 from gsbench.analysis.fairness import tuning_notes
 from gsbench.analysis.report.build import search_summary
-from gsbench.analysis.report.curves import event_charts, training_charts
-from gsbench.analysis.report.volumes import volume_charts
+from gsbench.analysis.report.curves import event_charts, training_charts, volume_charts
 from gsbench.analysis.results import load_experiment, read_views
 from gsbench.analysis.table_formats import to_html_page
 from gsbench.analysis.tables import build_table

@@ -65,19 +65,19 @@ def test_the_archive_of_results_gets_the_name_of_the_experiment_or_of_out(runs, 
 
 
 @pytest.mark.parametrize(
-    "words, message",
+    "words",
     [
-        ("--results exp a:b:c", "takes an experiment, --out and --pictures alone"),
-        ("--results a/b", "'a/b' is not the name of an experiment"),
-        ("a:b:c --pictures --out x.ply", "--pictures goes with --results"),
-        ("a:b:c", "export needs a TRIAL and --out PATH"),
-        ("--out x.ply", "export needs a TRIAL and --out PATH"),
-        ("a:b:c d:e:f --out x.ply", "one TRIAL is exported, not 2"),
-        ("init init d:e:f --out x", "one TRIAL is exported, not 3"),
+        "--results exp a:b:c",
+        "a:b:c --pictures --out x.ply",
+        "a:b:c",
+        "--out x.ply",
+        "a:b:c d:e:f --out x.ply",
+        "init init d:e:f --out x",
     ],
 )
-def test_words_that_do_not_go_together_are_refused(refused, words, message):
-    assert message in refused("export", *split(words))
+def test_words_that_do_not_go_together_are_refused(refused, words):
+    assert "export needs one TRIAL and --out PATH" in refused("export", *split(words))
+    assert "'a/b' is not the name of an experiment" in refused("export --results a/b")
 
 
 @pytest.mark.parametrize(

@@ -119,7 +119,7 @@ def not_tried(refused):
 
 def results(home):
     book = read_ledger(home)
-    return {idea: book.result(idea) for idea in book.begun}
+    return {idea: book.result(idea) for idea in book.questions}
 
 
 def seeds_of(home):
@@ -422,13 +422,6 @@ def test_an_archived_ledger_names_no_folder_and_no_server(home, trainings, tmp_p
     assert "tracking=none" not in shared.ideas["baseline"].words
 
 
-def test_show_prints_all_for_programs(home, said):
-    attempt(f"{SPLIT}=0.02")
-    shown = json.loads(said("ledger show night --json"))
-    assert [one["result"] for one in shown["ideas"]] == ["kept"]
-    assert (shown["tried"], shown["planned"], shown["kept"]) == (1, 40, ["adc"])
-
-
 def test_show_prints_the_rule_and_a_line_for_each_idea(home, said):
     attempt(f"{SPLIT}=0.02", "--as", "good")
     attempt(f"{SPLIT}=0.04", "--as", "bad")
@@ -441,6 +434,17 @@ def test_show_prints_the_rule_and_a_line_for_each_idea(home, said):
     )
     assert bad.startswith("2. bad against baseline: dropped: looks worse; psnr −")
     assert bad.endswith("; 2 seeds of all ideas")
+    shown = json.loads(said("ledger show night --json"))
+    assert [one["result"] for one in shown["ideas"]] == ["kept", "dropped"]
+    assert (shown["tried"], shown["planned"], shown["kept"]) == (2, 40, ["good"])
+
+
+def test_an_undecided_idea_says_so_once(home, trainings, said):
+    trainings.noise = 5.0
+    assert attempt(f"{SPLIT}=0.05") == 3
+    line = said("ledger show night").splitlines()[-1]
+    assert line.startswith("1. adc against baseline: undecided; psnr ")
+    assert line.count("undecided") == 1
 
 
 def test_ideas_with_other_code_are_not_superseded(home, tmp_path, said):
@@ -457,7 +461,7 @@ def test_names_of_ledgers_and_ideas_are_not_given_twice(home, trainings, refused
     for size in (0.02, 0.04):
         attempt(f"{SPLIT}={size}", "--as", "mine")
     attempt(f"{SPLIT}=0.05", "--as", "baseline")
-    assert read_ledger(home).begun == ["mine", "mine-2", "baseline-3"]
+    assert [*read_ledger(home).questions] == ["mine", "mine-2", "baseline-3"]
     assert "'store' cannot be the name" in refused("ledger show store")
     folder = home.parent / "used/courtyard/random-adc/12345678-seed0"
     write_results(folder, composed(NEW[6:])[0].values | {"name": "used"})
@@ -496,7 +500,7 @@ def test_the_simulated_rule_decides_as_the_ledger_does(trainings, monkeypatch, t
     kept, tests = np.array([0]), np.array([0])
     book = read_ledger(home)
     assert 1 < len(book.tests) < len(draws)
-    for (shared, new), idea in zip(draws, book.begun, strict=True):
+    for (shared, new), idea in zip(draws, book.questions, strict=True):
         one = ledger_rates.Attempt(shared[None], new[None], kept, tests, least=0.5)
         decided = ledger_rates.in_tests(one)
         seeds = (decided.tested if decided.test[0] else decided.seeds)[0]

@@ -37,8 +37,6 @@ def small_runs(tmp_path_factory):
     for seed, trial in enumerate(write_runs(runs, **plan, views=len(VIEWS))):
         gaussians = random_gaussians(40, seed, torch.float32, log_scale=(-4.0, -2.2))
         write_ply(gaussians, trial / "point_cloud.ply")
-        causes = np.arange(50, dtype=np.uint8) % 6  # ten Gaussians were pruned
-        np.savez(trial / "lineage.npz", causes=causes, ids=np.arange(10, 50))
         (trial / "ground_truth").mkdir()
         for name, (width, height) in VIEWS.items():
             noise = rng.integers(0, 256, (height, width, 3), dtype=np.uint8)

@@ -4,6 +4,7 @@ import math
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,6 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 from torch.testing import assert_close
 
-from gsbench.analysis.trial_settings import Configurations
 from gsbench.normalization import Normalization
 from gsbench.raster import create_rasterizer
 from gsbench.scene.types import Camera, View
@@ -175,7 +175,7 @@ def test_a_trial_is_drawn_as_the_evaluation_renders_it():
 
 def configured(trial, **settings):
     values = {key.replace("__", "."): value for key, value in settings.items()}
-    return replace(trial, settings=Configurations({trial.key: values}))
+    return replace(trial, settings=SimpleNamespace(shared=lambda *_: values))
 
 
 def test_a_trial_is_loaded_with_all_that_is_drawn(small_runs):

@@ -11,8 +11,7 @@ from typing import Any
 
 from gsbench.analysis.notes import Note
 from gsbench.analysis.results import Arm, TrialPair, TrialResult, group_by
-from gsbench.analysis.trial_result import Trained
-from gsbench.analysis.trial_settings import canonical
+from gsbench.analysis.trial_result import Trained, canonical
 from gsbench.gaussians.paper_values import RATES
 from gsbench.runs.config_hash import (
     is_ignored,

@@ -24,7 +24,7 @@ from gsbench.analysis.pairs import pair_trials
 from gsbench.analysis.quantities import COSTS, relative_change
 from gsbench.analysis.results import Arm, TrialResult, group_by, trials_of
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
-from gsbench.analysis.trial_settings import canonical
+from gsbench.analysis.trial_result import canonical
 from gsbench.parsing import read_if_sound
 from gsbench.runs.experiments import SearchPoint, TuningRecord
 from gsbench.runs.layout import EVENTS, TUNING

@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from gsbench.analysis.questions import look_shares, plan_looks
-from gsbench.analysis.statistics import ALPHA, MIN_SCENES, sign_test_needs
-from gsbench.analysis.thresholds import Region, evenness
+from gsbench.analysis.statistics import ALPHA, MIN_SCENES, Region, evenness, sign_test_needs
 from gsbench.errors import InputError
 
 COMMANDS = ("sweep", "looks", "gate", "ledger")

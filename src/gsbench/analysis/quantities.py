@@ -94,27 +94,25 @@ class Change:
 
     def __str__(self) -> str:
         totals, ratios = signed(self.of_totals, ".1%"), signed(self.of_scenes, ".1%")
-        if self.scenes == 1:
-            return totals
-        return f"{totals} as a ratio of totals, {ratios} as the mean of {self.scenes} scenes"
+        more = f" as a ratio of totals, {ratios} as the mean of {self.scenes} scenes"
+        return totals + more * (self.scenes > 1)
 
 
 def relative_change(
     baseline: Iterable[TrialResult], other: Iterable[TrialResult], read: Reader
 ) -> Change | None:
     """The change of a cost over scenes where both arms have a value above 0; else None."""
-    one, two = (_means(own, read) for own in (baseline, other))
+    sides: list[dict[str, float]] = []
+    for own in (baseline, other):
+        with_value = group_by([trial for trial in own if read(trial)], "scene")
+        means = {scene: fmean(map(read, of_scene)) for scene, of_scene in with_value.items()}  # type: ignore[arg-type]
+        sides.append(means)
+    one, two = sides
     scenes = sorted(one.keys() & two.keys())
     if not scenes:
         return None
     totals = sum(two[scene] for scene in scenes) / sum(one[scene] for scene in scenes)
     return Change(totals - 1, fmean(two[scene] / one[scene] for scene in scenes) - 1, len(scenes))
-
-
-def _means(trials: Iterable[TrialResult], read: Reader) -> dict[str, float]:
-    """The mean of a cost by scene."""
-    with_value = group_by([trial for trial in trials if read(trial)], "scene")
-    return {scene: fmean(read(trial) or 0.0 for trial in own) for scene, own in with_value.items()}
 
 
 def choose_quantities(
@@ -161,12 +159,12 @@ def quantity(name: str, trials: Iterable[TrialResult]) -> Quantity:
         raise InputError(f"unknown metric {name!r}; choose among {', '.join(names)}")
     units = COUNT_UNITS if key in COUNTS else TIME_UNITS
     values = [value for trial in trials if (value := COSTS[key][1](trial))] or [0.0]
-    for symbol, scale, decimals, start in units[:-1]:
-        # the smallest value must have two digits, as 0.12 M or 1.0 k
-        if max(values) >= start and min(values) >= 10 * scale / 10**decimals:
-            return _scaled(key, key, symbol, scale, decimals)
-    symbol, scale, decimals, _ = units[-1]
-    return _scaled(key, key, symbol, scale, decimals)
+    # the smallest value must have two digits, as 0.12 M or 1.0 k
+    return next(
+        _scaled(key, key, symbol, scale, decimals)
+        for symbol, scale, decimals, start in units
+        if not start or (max(values) >= start and min(values) >= 10 * scale / 10**decimals)
+    )
 
 
 def asked_quantity(key: str, trials: Iterable[TrialResult] = ()) -> Quantity:

@@ -24,8 +24,7 @@ from typing import Any, Literal
 
 from gsbench.analysis.addresses import ArmName
 from gsbench.analysis.statistics import ALPHA, MIN_SCENES, sign_test_needs
-from gsbench.analysis.trial_result import Trained
-from gsbench.analysis.trial_settings import canonical
+from gsbench.analysis.trial_result import Trained, canonical
 from gsbench.errors import InputError
 from gsbench.runs.commands import Digest, History, Place, Question, code_in
 from gsbench.runs.config_hash import is_ignored, is_of_scene
@@ -234,23 +233,22 @@ def choose_pairs(
 
     A baseline that it does not train is an earlier one, or is awaited.
     """
-    by_arm: dict[Arm, dict[str, Any]] = {}
+    by_arm: dict[Arm, dict[str, str]] = {}
     for row in planned:
-        by_arm.setdefault(row.arm, {key: str(value) for key, value in row.config.items()})
+        by_arm.setdefault(row.arm, _texts(row.config))
     known = dict(by_arm)
     for row in measured:
         if row.densify in (asked.baseline, *asked.controls.values()):
-            config = {key: str(value) for key, value in row.config.items()}
-            known.setdefault(replace(row.arm, variant=()), config)
+            known.setdefault(replace(row.arm, variant=()), _texts(row.config))
     arms, inits = list(by_arm), list(dict.fromkeys(arm.init for arm in by_arm))
 
     def partners(arm: Arm, densify: str) -> list[Arm]:
-        among = [one for one in by_arm if (one.init, one.densify) == (arm.init, densify)]
-        among = among or [one for one in known if (one.init, one.densify) == (arm.init, densify)]
-        if not among:
-            return [Arm(arm.init, densify)]
-        unlike = {one: _unlike(arm, one, known) for one in among}
-        return [one for one in among if unlike[one] == min(unlike.values())]
+        for pool in (by_arm, known):
+            among = [one for one in pool if (one.init, one.densify) == (arm.init, densify)]
+            if among:
+                unlike = {one: _unlike(arm, one, known) for one in among}
+                return [one for one in among if unlike[one] == min(unlike.values())]
+        return [Arm(arm.init, densify)]
 
     pairs = [
         (one, arm)
@@ -300,11 +298,10 @@ def _with_levels(
     for question in new:
         name = question.idea.name
         own = [one for one in tested if one.idea.name == name]
-        places = set().union(*(one.places for one in own)) | question.places
+        places = question.places.union(*(one.places for one in own))
         n = count_tries(places, _earlier(name, measured, history))
-        among = max(1, len(tested) if asked.shared else len(own))
-        question = replace(question, n=n, level=level_of(n, among))
-        levelled.append(question.with_id(len(history.commands)))
+        level = level_of(n, max(1, len(tested if asked.shared else own)))
+        levelled.append(replace(question, n=n, level=level).with_id(len(history.commands)))
     return levelled, list(dict.fromkeys(shown))
 
 
@@ -318,26 +315,21 @@ def draft(
     """The question about an idea's trials, without a level."""
     digests: dict[str, tuple[Digest, Digest]] = {}
     seeds: dict[str, tuple[int, ...]] = {}
+    of_baseline = {one.scene: one.digest for one in reversed(planned) if one.arm == baseline}
+    if not of_baseline:  # the newest ones of earlier commands, or an awaited one
+        of_baseline = {row.scene: "" for row in planned}
+        for one in measured:
+            if (
+                one.arm.name == baseline.name
+                and dict(baseline.variant).items() <= _texts(one.config).items()
+            ):
+                of_baseline[one.scene] = one.digest
     for row in planned:
-        if row.arm != idea:
-            continue
-        if row.scene not in digests:
-            of_baseline = [
-                one.digest for one in planned if (one.scene, one.arm) == (row.scene, baseline)
-            ]
-            if not of_baseline and not any(one.arm == baseline for one in planned):
-                # the newest one of an earlier command
-                of_baseline = [
-                    one.digest
-                    for one in reversed(measured)
-                    if one.scene == row.scene and one.arm.name == baseline.name
-                    if dict(baseline.variant).items() <= _texts(one.config).items()
-                ] or [""]
-            if not of_baseline:  # in this command the baseline has other scenes
-                continue
-            digests[row.scene] = of_baseline[0], row.digest
-        if row.digest == digests[row.scene][1]:
-            seeds[row.scene] = tuple(dict.fromkeys([*seeds.get(row.scene, ()), row.seed]))
+        # a baseline of this command may have other scenes
+        if row.arm == idea and row.scene in of_baseline:
+            pair = digests.setdefault(row.scene, (of_baseline[row.scene], row.digest))
+            if row.digest == pair[1]:
+                seeds[row.scene] = tuple(dict.fromkeys([*seeds.get(row.scene, ()), row.seed]))
     return Question(
         idea=idea,
         baseline=baseline,
@@ -358,36 +350,24 @@ def _with_doubt(
     question: Question, planned: Sequence[Trained], measured: Sequence[Trained], history: History
 ) -> Question:
     """The question, with the reason if results could have chosen its trials."""
-    own = {recipe_of(row) for row in planned if row.digest in _ideas(question)}
+    ideas = {second for _, second in question.digests.values()}
+    own = {recipe_of(row) for row in planned if row.digest in ideas}
     seen = {place_of(row) for row in measured if recipe_of(row) in own}
     if seen & question.places and (gone := seen - question.places):
         return replace(question, untested=f"it leaves out measured trials: {places_text(gone)}")
-    earlier = [one for one in history.questions if one.idea.name == question.idea.name]
+    earlier = [
+        one for one in history.questions if one.idea.name == question.idea.name and not one.untested
+    ]
     for scene, seeds in question.seeds.items():
-        there = sorted(
-            {row.seed for row in measured if (row.scene, row.digest) == _first(question, scene)}
-        )
-        used = sorted(set(seeds) & set(there))
-        again = any(
-            not one.untested and set(one.seeds.get(scene, ())) & set(there) == set(used)
-            for one in earlier
-        )
+        first = question.digests[scene][0]
+        there = sorted({row.seed for row in measured if (row.scene, row.digest) == (scene, first)})
+        used = sorted({*seeds} & {*there})
+        again = any({*one.seeds.get(scene, ())} & {*there} == {*used} for one in earlier)
         if used != there[: len(used)] and not again:
             left = [(scene, seed) for seed in there if seed < used[-1] and seed not in used]
-            return replace(
-                question,
-                untested=f"it leaves out measured trials of {question.baseline}: "
-                f"{places_text(left)}",
-            )
+            what = f"measured trials of {question.baseline}: {places_text(left)}"
+            return replace(question, untested=f"it leaves out {what}")
     return question
-
-
-def _ideas(question: Question) -> set[Digest]:
-    return {second for _, second in question.digests.values()}
-
-
-def _first(question: Question, scene: str) -> tuple[str, Digest]:
-    return scene, question.digests[scene][0]
 
 
 def places_text(places: Iterable[Place]) -> str:

@@ -14,8 +14,8 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any, TypeVar
 
+from gsbench.analysis.trial_result import Configurations, settings_text
 from gsbench.analysis.trial_result import TrialResult as TrialResult
-from gsbench.analysis.trial_settings import Configurations, settings_text
 from gsbench.errors import InputError
 from gsbench.files import require_no_links
 from gsbench.parsing import DamagedError, one_line

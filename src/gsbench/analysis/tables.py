@@ -25,7 +25,7 @@ from gsbench.analysis.quantities import Quantity, choose_quantities
 from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.analysis.table_notes import LEARNT_NOTHING, by_weight, trials_notes
-from gsbench.analysis.trial_settings import canonical
+from gsbench.analysis.trial_result import canonical
 from gsbench.words import counted
 
 if TYPE_CHECKING:

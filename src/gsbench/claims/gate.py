@@ -137,7 +137,7 @@ def deviations(baseline: Sequence[TrialResult], new: Sequence[TrialResult]) -> l
 
     names = {name for one in (*baseline, *new) for name in one.record.versions} - {"gsbench"}
     return [
-        Note.of(f"other {'library' if name else 'machine'}", library=name, baseline=old, new=now)
+        Note.of("other library" if name else "other machine", library=name, baseline=old, new=now)
         for name in ("", *sorted(names))  # the machine, and each library
         if (old := made(baseline, name)) != (now := made(new, name))
     ]

@@ -65,51 +65,23 @@ class Book:
         """All ideas in their order, the baseline first."""
         return self.experiment.history.ideas
 
-    @property
-    def begun(self) -> list[str]:
-        return [name for name in self.ideas if name != BASELINE]
-
     @cached_property
+    def questions(self) -> dict[str, Question]:
+        """The question of each idea in their order: its test, else its screening as a test."""
+        rules = (SCREENING, LOND)  # a test comes after its screening
+        asked = (one for one in self.experiment.history.questions if one.rule in rules)
+        return {one.name: replace(one, untested="") for one in asked}
+
+    @property
     def tests(self) -> dict[str, Question]:
-        """The tests on seeds that no idea had seen, in their order."""
-        return {one.name: one for one in self.experiment.history.questions if one.rule == LOND}
+        """The tests on seeds that no idea had seen."""
+        return {name: one for name, one in self.questions.items() if one.rule == LOND}
 
     @cached_property
     def verdicts(self) -> dict[str, Verdict]:
-        """The verdict on each idea: that of its test, else that of the comparison before it."""
+        """The verdict on the question of each idea."""
         trials, unfinished = self.experiment.trials, self.experiment.unfinished
-        return {idea: judge(trials, self.question(idea), unfinished) for idea in self.begun}
-
-    def question(self, idea: str) -> Question:
-        """The question of an idea now: its test, else its screening."""
-        return self.tests.get(idea) or self.screening(self.ideas[idea])
-
-    def screening(self, idea: Idea) -> Question:
-        """The comparison on the seeds of all ideas, in looks, as if it were a test.
-
-        An idea passes by one side of the interval, so the interval has twice the rate.
-        """
-        baseline, seeds = self.ideas[idea.against], self.opened.seeds
-        asked = self.ask(idea, baseline, SCREENING, seeds, 2 * SCREEN)
-        return replace(asked, looks=plan_looks(len(seeds)))
-
-    def test(self, name: str) -> Question:
-        """The test of an idea that looks better, in as many looks on new seeds.
-
-        These are in a row that begins where the hash of all lines before says, so another ledger on
-        the same captures has other seeds.
-        """
-        history, count = self.experiment.history, len(self.opened.seeds)
-        seen = {seed for one in history.questions for _, seed in one.places}
-        first = SEEDS_FROM + int(history.head, 16) % SEEDS
-        while not seen.isdisjoint(range(first, first + count)):
-            first += count
-        asked = self.screening(self.ideas[name])
-        level = level_of_test(
-            self.opened.rate, self.opened.ideas, len(self.tests) + 1, len(self.kept)
-        )
-        seeds = dict.fromkeys(asked.seeds, tuple(range(first, first + count)))
-        return replace(asked, rule=LOND, seeds=seeds, level=min(1.0, 2 * level))
+        return {name: judge(trials, one, unfinished) for name, one in self.questions.items()}
 
     def ask(
         self, idea: Idea, baseline: Idea, rule: str, seeds: tuple[int, ...], level: float
@@ -125,11 +97,38 @@ class Book:
             idea=Arm("", idea.name),
             digests={scene: (old, idea.digests[scene]) for scene, old in scenes.items()},
             seeds=dict.fromkeys(scenes, seeds),
+            looks=() if rule == CONFIRMATION else plan_looks(len(seeds)),
             rule=rule,
             level=level,
+            untested=CHOOSES if rule == SCREENING else "",
             versions=True,
             name=idea.name,
         )
+
+    def screening(self, idea: Idea) -> Question:
+        """The comparison on the seeds of all ideas.
+
+        An idea passes by one side of the interval, so the interval has twice the rate.
+        """
+        baseline, seeds = self.ideas[idea.against], self.opened.seeds
+        return self.ask(idea, baseline, SCREENING, seeds, 2 * SCREEN)
+
+    def test(self, name: str) -> Question:
+        """The test of an idea that looks better, in as many looks on new seeds.
+
+        These are in a row that begins where the hash of all lines before says, so another ledger on
+        the same captures has other seeds.
+        """
+        history, count = self.experiment.history, len(self.opened.seeds)
+        seen = {seed for one in history.questions for _, seed in one.places}
+        first = SEEDS_FROM + int(history.head, 16) % SEEDS
+        while not seen.isdisjoint(range(first, first + count)):
+            first += count
+        rate, number = self.opened.rate, len(self.tests) + 1
+        level = level_of_test(rate, self.opened.ideas, number, len(self.kept))
+        seeds = dict.fromkeys(self.questions[name].seeds, tuple(range(first, first + count)))
+        level = min(1.0, 2 * level)
+        return replace(self.questions[name], rule=LOND, seeds=seeds, level=level)
 
     def is_measured(self, idea: str) -> bool:
         """Return whether a trial of the idea gave a result."""
@@ -191,7 +190,7 @@ class Book:
     @property
     def tried(self) -> int:
         """The number of ideas that count; those that failed do not, since they tell nothing."""
-        return sum(not self.failure(idea) for idea in self.begun)
+        return sum(not self.failure(idea) for idea in self.questions)
 
     def check_untouched(self, asked: Sequence[Question]) -> None:
         """Raise InputError if a scene of ``asked`` was used before, by name or photographs."""

@@ -20,8 +20,7 @@ from gsbench.analysis.addresses import ArmName
 from gsbench.analysis.quantities import COSTS, asked_quantity
 from gsbench.analysis.questions import Asked, announce, ask
 from gsbench.analysis.results import TrialResult, read_experiment
-from gsbench.analysis.trial_result import Planned
-from gsbench.analysis.trial_settings import config_if_readable
+from gsbench.analysis.trial_result import Planned, config_if_readable
 from gsbench.config.overrides import parse_word
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator

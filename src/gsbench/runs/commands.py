@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from hashlib import sha256
 from itertools import chain
+from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -151,15 +152,13 @@ class Question(Record):
     def covers(self, other: "Question") -> bool:
         """Return whether this asks the same, about all trials of ``other``."""
 
-        def same(mine: Digest, asked: Digest) -> bool:
-            return mine == asked or "" in (mine, asked)
-
+        terms = attrgetter("metric", "sign", "baseline.name", "rule")
         return (
-            (self.metric, self.sign, self.baseline.name, self.rule)
-            == (other.metric, other.sign, other.baseline.name, other.rule)
+            terms(self) == terms(other)
             and other.places <= self.places
             and all(
-                same(self.digests[scene][0], first) and self.digests[scene][1] == second
+                (self.digests[scene][0] == first or "" in (self.digests[scene][0], first))
+                and self.digests[scene][1] == second
                 for scene, (first, second) in other.digests.items()
             )
         )

@@ -16,7 +16,7 @@ from gsbench.errors import InputError
 from gsbench.files import DAMAGE, file_sha256
 from gsbench.scene.images import open_image
 from gsbench.scene.types import Camera, CameraModel, Capture
-from gsbench.scene.undistortion import as_colmap
+from gsbench.scene.undistortion import as_colmap, grid, rays_through
 from gsbench.words import listed
 
 DEPTH = "depth"
@@ -103,13 +103,13 @@ def pixels_of_view(picture: Pixels, lens: CameraModel, view: Camera, source: Pat
         )
     if not lens.distorted:
         return resized(picture, view.width, view.height)
-    columns, rows = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
-    x, y = (columns - view.cx) / view.fx, (rows - view.cy) / view.fy  # [H, W]
-    rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
-    places = as_colmap(lens).img_from_cam(rays) / (lens.width, lens.height)  # [H W, 2], in 0..1
+    middles = [np.arange(side, dtype=np.float64) + 0.5 for side in (view.width, view.height)]
+    pixels = grid(*middles)  # [H W, 2]
+    rays = rays_through(pixels, view.fx, view.fy, view.cx, view.cy)
+    seen: Any = as_colmap(lens).img_from_cam(rays)  # [H W, 2] px
+    places = seen / (lens.width, lens.height)  # in 0..1
     inside = ((places >= 0) & (places < 1)).all(axis=1)  # False for a ray without a place
-    pixels = np.where(inside[:, None], places, 0) * picture.shape[1::-1]
-    across, down = pixels.astype(int).T
+    across, down = (np.where(inside[:, None], places, 0) * picture.shape[1::-1]).astype(int).T
     chosen = picture[down, across]
     chosen[~inside] = 0
     return chosen.reshape(view.height, view.width, *picture.shape[2:])

@@ -86,8 +86,6 @@ def read_model(folder: Path) -> pycolmap.Reconstruction:
             f"{place}: a name is not UTF-8 ({str(name)[2:-1]}): rename the photographs to ASCII, "
             "and make the model again"
         ) from error
-    except OSError as error:
-        raise InputError(f"{place}: cannot be read ({error.strerror})") from error
     except DAMAGE as error:
         reason = one_line(str(error)) or type(error).__name__
         raise InputError(

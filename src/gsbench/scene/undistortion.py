@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from gsbench.errors import InputError
 from gsbench.scene.rules import Finding
-from gsbench.scene.types import PINHOLE_NAMES, Camera, CameraModel, to_pinhole
+from gsbench.scene.types import PINHOLE_NAMES, Array, Camera, CameraModel, to_pinhole
 from gsbench.system.isolate import CrashError, run_isolated
 from gsbench.words import some_of
 
@@ -164,12 +164,8 @@ def largest_distortion(camera: pycolmap.Camera) -> float:
     It is measured along the pinhole's rays through a grid of pixels that covers the image. The
     result is NaN if the camera does not see one of these rays.
     """
-    columns, rows = np.meshgrid(
-        np.linspace(0, camera.width, GRID), np.linspace(0, camera.height, GRID)
-    )
-    pixels = np.stack([columns.ravel(), rows.ravel()], axis=1)  # [P, 2]
-    fx, fy, cx, cy = _pinhole_parameters(camera)
-    rays = np.column_stack([(pixels - (cx, cy)) / (fx, fy), np.ones(len(pixels))])  # [P, 3]
+    pixels = grid(np.linspace(0, camera.width, GRID), np.linspace(0, camera.height, GRID))
+    rays = rays_through(pixels, *_pinhole_parameters(camera))
     projected = np.asarray(camera.img_from_cam(rays), dtype=np.float64)
     return float(np.linalg.norm(projected - pixels, axis=1).max())
 
@@ -182,12 +178,9 @@ def folded_share(camera: pycolmap.Camera, pinhole: pycolmap.Camera) -> float:
     to each pixel of ``pinhole``, the mapping must keep its orientation; from the first place where
     it does not, or where the camera sees no ray, the line is lost.
     """
-    fx, fy, cx, cy = _pinhole_parameters(pinhole)
-    columns, rows = np.meshgrid(
-        (np.arange(FOLD_GRID) + 0.5) * pinhole.width / FOLD_GRID,
-        (np.arange(FOLD_GRID) + 0.5) * pinhole.height / FOLD_GRID,
-    )
-    ends = np.stack([(columns.ravel() - cx) / fx, (rows.ravel() - cy) / fy], axis=1)  # [P, 2]
+    middles = np.arange(FOLD_GRID) + 0.5
+    pixels = grid(middles * pinhole.width / FOLD_GRID, middles * pinhole.height / FOLD_GRID)
+    ends = rays_through(pixels, *_pinhole_parameters(pinhole))[:, :2]  # [P, 2]
     rays = ends[:, None] * (np.arange(1, FOLD_STEPS + 1) / FOLD_STEPS)[:, None]  # [P, S, 2]
 
     def project(offset: tuple[float, float]) -> NDArray[np.float64]:
@@ -199,6 +192,16 @@ def folded_share(camera: pycolmap.Camera, pinhole: pycolmap.Camera) -> float:
     along_x, along_y = (project(move) - origin for move in ((FOLD_MOVE, 0.0), (0.0, FOLD_MOVE)))
     orientation = along_x[..., 0] * along_y[..., 1] - along_x[..., 1] * along_y[..., 0]  # [P, S]
     return float((~(orientation > 0)).any(axis=1).mean())  # NaN is lost too
+
+
+def grid(columns: Array, rows: Array) -> Array:
+    """All pairs [P, 2] of the coordinates, row by row."""
+    return np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+
+
+def rays_through(pixels: Array, fx: float, fy: float, cx: float, cy: float) -> Array:
+    """The rays [P, 3] of a pinhole camera through pixels [P, 2], on the plane at distance 1."""
+    return np.column_stack([(pixels - (cx, cy)) / (fx, fy), np.ones(len(pixels))])
 
 
 def _pinhole_parameters(camera: pycolmap.Camera) -> list[float]:

@@ -69,23 +69,14 @@ def export(argv: Sequence[str], runs: Path) -> int:
             "--pictures": "with --results: the pictures of the test views, too",
         },
     ).parse_args(argv)
-    if options.results is not None:
-        if options.trial:
-            raise InputError("export --results takes an experiment, --out and --pictures alone")
+    if options.results is not None and not options.trial:
         export_results(options.results, runs, options.out, options.pictures)
         return 0
-    if options.pictures:
-        raise InputError("--pictures goes with --results")
-    if not options.trial or options.out is None:
+    *before, address = options.trial or [""]
+    if not (address and options.out) or before not in ([], ["init"]) or options.pictures:
         raise InputError(
-            "export needs a TRIAL and --out PATH, or --results EXPERIMENT (see gsbench export "
-            "--help)"
-        )
-    *before, address = options.trial
-    if before not in ([], ["init"]):
-        raise InputError(
-            f"one TRIAL is exported, not {len(options.trial)}; for an initial model: export init "
-            "TRIAL"
+            "export needs one TRIAL and --out PATH (for an initial model: export init TRIAL), or "
+            "--results EXPERIMENT alone, and --pictures with these"
         )
     from gsbench.view.trials import find_trial
 

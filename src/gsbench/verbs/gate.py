@@ -97,9 +97,7 @@ def _result(options: argparse.Namespace) -> str:
         if verdict.test is None and not verdict.equal:
             why = with_notes(reason(verdict), verdict)
             raise InputError(f"the versions cannot be compared: {why}")
-        made = [*asked.read()]
-        new_trials = [trial for trial in made if trial.alias == gates.NEW]
-        deviations = map(str, gates.deviations(old, new_trials))
+        deviations = map(str, gates.deviations(old, new()))
         print("\n".join([gates.describe(verdict), *deviations]))
     return gates.result_of(verdict)
 

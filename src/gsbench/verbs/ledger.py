@@ -15,7 +15,6 @@ from gsbench.analysis.verdicts import judge
 from gsbench.app.command import compose_trials, require_waiting, run_trials
 from gsbench.claims.gate import asked_difference
 from gsbench.claims.ledger import (
-    CHOOSES,
     DROPPED,
     FAILED,
     IDEAS,
@@ -137,7 +136,7 @@ def try_idea(options: argparse.Namespace, home: Path) -> int:
     idea, fails = _begin(home, asked), ""
     for rule in (SCREENING, LOND):
         book = read_ledger(home)
-        question = book.question(idea)
+        question = book.questions[idea]
         if question.rule == rule and not book.is_decided(idea):
             seeds = f"seed={','.join(map(str, next(iter(question.seeds.values()))))}"
             sides = [_compose(home, _merged(own, [seeds]), typed)[1] for own in words]
@@ -192,10 +191,10 @@ def show(options: argparse.Namespace, home: Path) -> int:
     book = read_ledger(home)
     if options.json:
         opened = book.opened.to_json() | {"words": book.ideas[BASELINE].words}
-        ideas = [_facts(book, idea) for idea in book.begun]
+        ideas = [_facts(book, idea) for idea in book.questions]
         print(json.dumps({"opened": opened, "ideas": ideas} | _left(book), indent=1))
         return 0
-    lines = [f"{number}. {book.line(idea)}" for number, idea in enumerate(book.begun, 1)]
+    lines = [f"{number}. {book.line(idea)}" for number, idea in enumerate(book.questions, 1)]
     print("\n".join([*book.describe(), *lines]))
     return 0
 
@@ -242,8 +241,7 @@ def _begin(home: Path, idea: Idea) -> str:
         if name in book.ideas:
             name = f"{name}-{len(book.ideas)}"
         own = replace(idea, name=name)
-        question = replace(book.screening(own), untested=CHOOSES).with_id(history.head)
-        return command_now(idea=own, questions=(question,))
+        return command_now(idea=own, questions=(book.screening(own).with_id(history.head),))
 
     append(home, make)
     return name

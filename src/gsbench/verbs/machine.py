@@ -196,14 +196,12 @@ def check_devices() -> Iterator[Finding]:
     devices = ["cpu"]
     if torch.cuda.is_available():
         devices.append("cuda")
-        untested = torch.version.hip is not None
+        verdict: Verdict = "ok" if torch.version.hip is None else "note"
+        after = ": AMD, never tested" if torch.version.hip else ""
         for index in range(torch.cuda.device_count()):
             free, total = map(readable_bytes, torch.cuda.mem_get_info(index))
-            text = f"{torch.cuda.get_device_name(index)}, {free} of {total} free"
-            if untested:
-                yield Finding("note", "gpu", f"{text}: AMD, never tested")
-            else:
-                yield Finding("ok", "gpu", text)
+            name = torch.cuda.get_device_name(index)
+            yield Finding(verdict, "gpu", f"{name}, {free} of {total} free{after}")
     else:
         listed = len(installed_gpus())
         cause = "this torch is a build for CPUs"

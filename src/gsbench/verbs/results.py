@@ -5,6 +5,7 @@ import json
 import re
 import sys
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -85,14 +86,14 @@ def tables(argv: Sequence[str], runs: Path) -> int:
     if options.experiment == PAPER_NOTES and not (runs / PAPER_NOTES).exists():
         print("\n".join(f"- {line}" for line in load_published().contradictions))
         return 0
-    experiment = load_experiment(runs, options.experiment)
-    other = None if options.other is None else load_experiment(runs, options.other)
-    if other is not None:
-        experiment, other = side_by_side(experiment, other)
-    for warning in experiment.warnings:
+    given = filter(None, (options.experiment, options.other))
+    experiments = [load_experiment(runs, name) for name in given]
+    if options.other is not None:
+        experiments = [*side_by_side(*experiments)]
+    for warning in chain.from_iterable(one.warnings for one in experiments):
         print(f"left out: {warning}", file=sys.stderr)
     where = dict(options.where)
-    trials = select_trials([*experiment.trials, *(other.trials if other else ())], where)
+    trials = select_trials([*chain.from_iterable(one.trials for one in experiments)], where)
     if options.format in (TRIALS, JSON):
         for name in ("rows", "columns", "metrics", "layout", "paper"):
             if getattr(options, name) is not None:
@@ -100,12 +101,12 @@ def tables(argv: Sequence[str], runs: Path) -> int:
     if options.format == TRIALS:
         texts = {"-trials.csv": csv_of(to_frame(trials))}
     else:
-        comparison = _comparison([experiment, *([other] if other else [])], trials, where)
+        comparison = _comparison(experiments, trials, where)
         if options.format == JSON:
             texts = {f".{JSON}": json.dumps(comparison.to_json(), indent=1) + "\n"}
         else:
             texts = _tables(comparison, trials, options)
-    _write(texts, options.out, experiment.name)
+    _write(texts, options.out, experiments[0].name)
     return 0
 
 

@@ -176,30 +176,26 @@ def retry(argv: Sequence[str], runs: Path) -> int:
         print(f"nothing to retry: all trials of {options.experiment} are done, running or queued")
         return 0
     modules = os.getcwd()  # noted now, since `recompose` changes the current folder
-    trials = [
-        recompose(state.folder, state.planned, runs, options.changes, modules)
-        for state in unfinished
-    ]
-    # A plan of somebody's must not declare or run anything in an experiment of the user's.
-    for old, trial in zip(unfinished, trials, strict=True):
-        if trial.files.home != home:
+    trials, replaced = list[Trial](), list[Path]()
+    for old in unfinished:
+        trials.append(recompose(old.folder, old.planned, runs, options.changes, modules))
+        # A plan of somebody's must not declare or run anything in an experiment of the user's.
+        if (other := trials[-1].files.home) != home:
             raise InputError(
-                f"{TrialFolder(old.folder).label} is planned as a trial of "
-                f"{trial.files.home.name}, not of {home.name}: give the sweep's own command"
+                f"{TrialFolder(old.folder).label} is planned as a trial of {other.name}, not of "
+                f"{home.name}: give the sweep's own command"
+            )
+        if trials[-1].folder != old.folder:
+            replaced += [old.folder] if old.planned else []
+            log.info(
+                "%s: its configuration has changed since; the new one is run",
+                TrialFolder(old.folder).label,
             )
     if options.dry_run:
         print("\n".join(describe_plan(trials, trials[0].values["launch"]["parallel"])))
         return 0
-    replaced = [
-        old for old, trial in zip(unfinished, trials, strict=True) if trial.folder != old.folder
-    ]
-    for old in replaced:
-        log.info(
-            "%s: its configuration has changed since; the new one is run",
-            TrialFolder(old.folder).label,
-        )
     code = run_trials(trials)
-    drop(home, [old.folder for old in replaced if old.planned is not None])
+    drop(home, replaced)
     return code
 
 

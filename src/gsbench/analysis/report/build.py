@@ -20,10 +20,14 @@ from gsbench.analysis.paper import layout_of, load_published, paper_tables
 from gsbench.analysis.planning import seeds_needed
 from gsbench.analysis.quantities import COSTS, relative_change
 from gsbench.analysis.report.charts import forest_plot, line_chart
-from gsbench.analysis.report.curves import event_charts, event_table, training_charts
+from gsbench.analysis.report.curves import (
+    event_charts,
+    event_table,
+    sweep_charts,
+    training_charts,
+    volume_charts,
+)
 from gsbench.analysis.report.quality import quality_charts
-from gsbench.analysis.report.sweeps import sweep_charts
-from gsbench.analysis.report.volumes import volume_charts
 from gsbench.analysis.report.where import region_maps
 from gsbench.analysis.results import Experiment, TrialResult, group_by, trials_of
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry, fill

@@ -1,7 +1,7 @@
 """Maps of regions in the report: an arm's gain beyond noise (`analysis.regions`)."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,24 +21,9 @@ Flags = NDArray[np.bool_]
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class RegionMap:
-    """The test view of a scene with most lit regions, and the counts of all views of the scene."""
-
-    scene: str
-    view: str
-    seeds: int
-    better: int
-    worse: int
-    regions: int
-    truth: str  # data URIs; the photograph is empty where there is none
-    lit: str
-    noise: str
-
-
 def region_maps(
     trials: Sequence[TrialResult], answers: Iterable[Answer]
-) -> dict[tuple[Arm, Arm], list[RegionMap]]:
+) -> dict[tuple[Arm, Arm], list[dict[str, Any]]]:
     """The maps of each scene by (baseline, arm); all regions of the report are one family.
 
     A scene has none with fewer than three pairs of seeds, or without pictures or their errors.
@@ -54,14 +39,18 @@ def region_maps(
                     continue
     family = [p for _, _, scene in found for p in scene.p.values()]
     lit = iter(discoveries(family)) if family else iter(())
-    maps: dict[tuple[Arm, Arm], list[RegionMap]] = {}
+    maps: dict[tuple[Arm, Arm], list[dict[str, Any]]] = {}
     for arms, pairs, scene in found:
         of_views = {view: next(lit) for view in scene.p}
         maps.setdefault(arms, []).append(_map(pairs, scene, of_views))
     return maps
 
 
-def _map(own: Sequence[TrialPair], scene: SceneRegions, lit: dict[str, Flags]) -> RegionMap:
+def _map(own: Sequence[TrialPair], scene: SceneRegions, lit: dict[str, Flags]) -> dict[str, Any]:
+    """The test view of a scene with most lit regions, and the counts of all its views.
+
+    Pictures are data URIs; that of the photograph is empty where there is none.
+    """
     better = {view: flags & (scene.change[view] > 0) for view, flags in lit.items()}
     view = max(lit, key=lambda name: int(lit[name].sum()))
     colours = np.full((*lit[view].shape, 3), NOTHING, dtype=np.uint8)
@@ -69,17 +58,17 @@ def _map(own: Sequence[TrialPair], scene: SceneRegions, lit: dict[str, Flags]) -
     colours[better[view]] = BETTER
     grey = 255 * (1 - np.clip(scene.spread[view] / NOISY, 0, 1))
     trial = own[0][0]
-    return RegionMap(
-        trial.scene,
-        view,
-        len(own),
-        better=sum(int(flags.sum()) for flags in better.values()),
-        worse=sum(int((lit[name] & ~flags).sum()) for name, flags in better.items()),
-        regions=sum(flags.size for flags in lit.values()),
-        truth=truth_uri(trial, view),
-        lit=png_uri(_enlarged(colours)),
-        noise=png_uri(_enlarged(np.repeat(grey[..., None], 3, axis=2).astype(np.uint8))),
-    )
+    return {
+        "scene": trial.scene,
+        "view": view,
+        "seeds": len(own),
+        "better": sum(int(flags.sum()) for flags in better.values()),
+        "worse": sum(int((lit[name] & ~flags).sum()) for name, flags in better.items()),
+        "regions": sum(flags.size for flags in lit.values()),
+        "truth": truth_uri(trial, view),
+        "lit": png_uri(_enlarged(colours)),
+        "noise": png_uri(_enlarged(np.repeat(grey[..., None], 3, axis=2).astype(np.uint8))),
+    }
 
 
 def _enlarged(colours: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -71,8 +71,9 @@ def enter_box(low, high, origin, inverted):
 
 
 @inlined
-def hit_tube(outer, half, inner, origin, direction):
+def hit_tube(size, origin, direction):
     """The first distance > 0 of a ray to a capped cylinder, solid or bored; inf for a miss."""
+    outer, half, inner = size[0], size[1], size[2]
     (ox, oy, oz), (dx, dy, dz) = origin, direction
     best = inf
     # The mantles x^2 + y^2 = r^2: the roots of a t^2 + 2 b t + c. A ray along the axis has a = 0.
@@ -112,7 +113,7 @@ def hit_primitive(kind, size, origin, direction):
             return inf
         t = -b - sqrt(root)
         return t if t > 0.0 else inf
-    return hit_tube(size[0], size[1], size[2], origin, direction)
+    return hit_tube(size, origin, direction)
 
 
 @inlined
