@@ -16,8 +16,8 @@ import logging
 import math
 import os
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext, suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -328,19 +328,13 @@ def proof_of(raster: str, device: torch.device, again: bool = False) -> RasterPr
     return proof
 
 
-@contextmanager
-def _exclusive(stamp: Path) -> Iterator[None]:
-    """Hold the lock of ``stamp``; if its folder is not writable, lock nothing."""
-    try:
+def _exclusive(stamp: Path) -> AbstractContextManager[object]:
+    """The lock of ``stamp``; if its folder is not writable, no lock."""
+    with suppress(OSError):
         stamp.parent.mkdir(parents=True, exist_ok=True)
-        writable = os.access(stamp.parent, os.W_OK)
-    except OSError:
-        writable = False
-    if not writable:
-        yield
-        return
-    with hold(stamp.with_suffix(".lock"), f"the proof of {stamp.stem}"):
-        yield
+        if os.access(stamp.parent, os.W_OK):
+            return hold(stamp.with_suffix(".lock"), f"the proof of {stamp.stem}")
+    return nullcontext()
 
 
 class Proven(NamedTuple):
