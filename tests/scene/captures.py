@@ -1,18 +1,15 @@
 """Captures read as a trial reads them."""
 
-from dataclasses import asdict
 from pathlib import Path
 
 from gsbench.pipeline.steps.scene import CaptureSource
-from gsbench.scene.options import EVERY_NTH, SceneConfig
+from gsbench.scene.options import SceneConfig
 from gsbench.scene.pipe import read_capture
 
 
-def read(kind, name, path, split=EVERY_NTH, **settings):
+def read(kind, name, path, **settings):
     """The capture in ``path``, by the reader of its ``kind``."""
-    return read_capture(
-        SceneConfig(kind=kind, name=name, path=str(path), **settings, **asdict(split))
-    )
+    return read_capture(SceneConfig(kind=kind, name=name, path=str(path), **settings))
 
 
 def read_colmap(name, path, **settings):

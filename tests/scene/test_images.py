@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
 from gsbench.scene.images import image_size, read_image, resize_image, same_up_to_rounding
-from gsbench.scene.options import check_final_size, downscaled_size
+from gsbench.scene.options import downscaled_size
 from tests.helpers import refusal
 
 from .conftest import smooth_image
@@ -86,14 +86,6 @@ def test_sizes_never_grow_and_the_longest_side_is_exact():
 )
 def test_sides_may_be_rounded_by_one_pixel(size, same):
     assert same_up_to_rounding(size, (40, 30)) == same
-
-
-def test_a_final_side_below_sixteen_pixels_is_refused():
-    check_final_size((16, 40), 1, None, "a.png")
-    check_final_size((40, 32), 2, None, "a.png")
-    for size, downscale, max_size in (((15, 40), 1, None), ((40, 31), 3, None), ((40, 20), 1, 30)):
-        with refusal("at least 16 px are needed"):
-            check_final_size(size, downscale, max_size, "a.png")
 
 
 def test_area_is_the_block_mean_and_lanczos_keeps_a_ramp():

@@ -21,7 +21,6 @@ from gsbench.scene.images import (
     list_images,
     read_image,
 )
-from gsbench.scene.options import SplitRule
 from gsbench.scene.pipe import fingerprint
 from tests.helpers import refusal, write
 from tests.scene.captures import read_photos
@@ -72,7 +71,7 @@ READERS = [
     (".ply", check_ply),
     (".ply", read_points),
     (".txt", read_points),
-    (".txt", lambda path: read_photos("x", path.parent, split=SplitRule(test_list=str(path)))),
+    (".txt", lambda path: read_photos("x", path.parent, test_list=str(path))),
 ]
 
 
@@ -178,7 +177,7 @@ def test_names_too_long_or_equal_as_pictures_are_refused(photos, tmp_path):
     long = "ä" * 120 + ".png"  # 244 bytes
     (photos / "a.png").rename(photos / long)
     with refusal("a name of more than 220 bytes"):
-        read_photos("x", tmp_path, split=SplitRule(test_every=2))
+        read_photos("x", tmp_path, test_every=2)
     with refusal(r"the pictures of a/b\.png and a__b\.jpg would both be a__b\.png"):
         check_picture_names(["a/b.png", "a__b.jpg"], photos)
     check_picture_names(["a/b.png", "a/c.png"], photos)

@@ -13,7 +13,6 @@ from gsbench.logs import no_progress
 from gsbench.runs.store import Store
 from gsbench.scene.colmap import plain_camera, read_model
 from gsbench.scene.load import INTRINSICS, ImageToPrepare, load_scene, prepare_all
-from gsbench.scene.options import SplitRule
 from gsbench.scene.rules import inspect
 from gsbench.scene.types import CameraModel
 from gsbench.scene.undistortion import flatten, largest_distortion, lens_findings, undistort
@@ -287,7 +286,7 @@ def test_centred_moves_the_principal_point_only(make_scene, tmp_path):
 
 
 def test_views_without_pose_are_left_out_with_a_count(make_scene, tmp_path, caplog):
-    capture = read_colmap("toy", make_scene(), split=SplitRule(test_every=3))
+    capture = read_colmap("toy", make_scene(), test_every=3)
     small = make_scene(names=("00.png", "01.png", "02.png", "04.png"), root="partial")
     with caplog.at_level(logging.WARNING):
         scene = load_scene(capture, small / "sparse/0", Store(tmp_path / "cache"))

@@ -11,10 +11,10 @@ from PIL import Image
 
 from gsbench.scene.colmap import read_model, read_reference
 from gsbench.scene.colmap_files import missing_model
-from gsbench.scene.hold_out import select_images, split_names
+from gsbench.scene.hold_out import select_images
 from gsbench.scene.images import list_images
 from gsbench.scene.names import match, match_anywhere
-from gsbench.scene.options import SceneConfig, SplitRule
+from gsbench.scene.options import SceneConfig
 from tests.helpers import refusal, write
 from tests.scene.captures import read_colmap, read_photos
 
@@ -23,7 +23,7 @@ from tests.scene.captures import read_colmap, read_photos
 @pytest.mark.parametrize("sparse", ["sparse/0", "sparse"])
 def test_a_colmap_folder_gives_photographs_and_model(make_scene, text, sparse):
     root = make_scene(text=text, sparse=sparse)
-    capture = read_colmap("toy", root, split=SplitRule(test_every=3))
+    capture = read_colmap("toy", root, test_every=3)
     assert capture.image_names == tuple(f"{k:02d}.png" for k in range(6))
     assert capture.test_names == ("00.png", "03.png")
     assert capture.train_names == ("01.png", "02.png", "04.png", "05.png")
@@ -172,8 +172,7 @@ def test_names_with_blanks_are_read_whole_with_any_byte_order_mark_and_line_end(
     model = read_model(root / "sparse/0")
     assert sorted(image.name for image in model.images.values()) == names
     (root / "tests.txt").write_bytes(mark + names[3].encode() + line_end)
-    split = SplitRule(test_list="tests.txt")
-    assert read_colmap("toy", root, split=split).test_names == (names[3],)
+    assert read_colmap("toy", root, test_list="tests.txt").test_names == (names[3],)
 
 
 @pytest.mark.parametrize(
@@ -206,7 +205,7 @@ def test_selection_is_even_and_comes_before_the_split(make_scene):
         gaps = {b - a for a, b in zip(chosen, [*chosen[1:], count], strict=True)}
         assert len(chosen) == most
         assert max(gaps) - min(gaps) <= 1
-    capture = read_colmap("toy", make_scene(), max_images=3, split=SplitRule(test_every=2))
+    capture = read_colmap("toy", make_scene(), max_images=3, test_every=2)
     assert capture.image_names == ("00.png", "02.png", "04.png")
     assert capture.test_names == ("00.png", "04.png")
 
@@ -236,24 +235,14 @@ def test_lists_choose_the_training_and_test_views(make_scene, train, test, train
     for name, text in LISTS.items():
         (root / f"{name}.txt").write_text(text)
     train, test = (None if name is None else f"{name}.txt" for name in (train, test))
-    rule = SplitRule(train_list=train, test_list=test)
+    lists = {"train_list": train, "test_list": test}
     if tested_on is None:
         with refusal(trained_on):
-            read_colmap("toy", root, split=rule)
+            read_colmap("toy", root, **lists)
         return
-    capture = read_colmap("toy", root, split=rule)
+    capture = read_colmap("toy", root, **lists)
     assert capture.train_names == tuple(f"{k:02d}.png" for k in trained_on)
     assert capture.test_names == tuple(f"{k:02d}.png" for k in tested_on)
-
-
-def test_a_split_without_views_is_refused():
-    names = [str(k) for k in range(5)]
-    for options, said in (
-        ({"test": names}, "no training view"),
-        ({"test": []}, "no test view"),
-    ):
-        with refusal(said):
-            split_names(names, **options)
 
 
 def test_fingerprint_depends_on_content_not_on_place(make_scene, tmp_path):
@@ -341,7 +330,7 @@ def test_a_scene_is_named_after_its_folder_and_a_missing_model_is_reported(make_
 
 def test_a_missing_list_is_named(make_scene):
     with refusal(r"scene\.test_list: .*cannot be read \(No such file or directory\): name a"):
-        read_colmap("toy", make_scene(), split=SplitRule(test_list="\\n"))
+        read_colmap("toy", make_scene(), test_list="\\n")
 
 
 @pytest.mark.parametrize(
@@ -362,4 +351,4 @@ def test_a_list_in_a_code_page_names_its_line(make_scene):
     root = make_scene()
     (root / "test_list.txt").write_bytes(b"a.png\nK\xfcche.png\n")
     with refusal(r"line 2 is not UTF-8 \(K.xfcche.png\): save it as UTF-8"):
-        read_colmap("toy", root, split=SplitRule(split="list"))
+        read_colmap("toy", root, split="list")

@@ -79,12 +79,15 @@ def sector_range(count: int, sector: int, sectors: int, exactly: int | None = No
 
 def along_principal_axis(centers: Array) -> Array:
     """Coordinates [V] of centres [V, 3] on their principal axis, away from the first camera."""
-    offsets = centers - centers.mean(axis=0)
-    _, _, axes = np.linalg.svd(offsets, full_matrices=False)
-    coordinates: Array = offsets @ axes[0]
+    coordinates: Array = (centers - centers.mean(axis=0)) @ _principal_axes(centers)[0]
     # The SVD leaves the sign of the axis open: the first camera that is not at the mean fixes it.
     off_center = np.abs(coordinates) > 1e-9 * (np.abs(coordinates).max() + 1e-300)
     return -coordinates if coordinates[np.argmax(off_center)] > 0.0 else coordinates
+
+
+def _principal_axes(centers: Array) -> Array:
+    axes: Array = np.linalg.svd(centers - centers.mean(axis=0), full_matrices=False)[2]
+    return axes
 
 
 def point_looked_at(cameras: Sequence[Camera], centers: Array) -> Array | None:
@@ -107,8 +110,7 @@ def scene_up(cameras: Sequence[Camera], centers: Array) -> Array:
     if length > 0.5:
         up: Array = mean / length
         return up
-    _, _, axes = np.linalg.svd(centers - centers.mean(axis=0), full_matrices=False)
-    normal: Array = axes[-1]
+    normal: Array = _principal_axes(centers)[-1]
     return normal
 
 

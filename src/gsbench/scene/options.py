@@ -122,9 +122,6 @@ class SplitRule:
             )
 
 
-EVERY_NTH = SplitRule()
-
-
 Backdrop = Literal["black", "white"]  # the colour under transparent pixels
 MAX_SIZE = 16_384  # px, the longest side of a view of the courtyard
 
