@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar, Literal
 
 import torch
@@ -36,7 +36,10 @@ class SpreadOut(Budgeted):
     initial_scale: PositiveFloat = 0.1  # of the distance to the neighbours
 
     def prepare(self, gaussians: Gaussians) -> Gaussians:
-        return spread_out(gaussians, self.initial_opacity, self.initial_scale)
+        opacity = self.initial_opacity
+        logits = torch.full_like(gaussians.opacity_logits, math.log(opacity / (1 - opacity)))
+        log_scales = gaussians.log_scales + math.log(self.initial_scale)
+        return replace(gaussians, opacity_logits=logits, log_scales=log_scales)
 
 
 @dataclass
@@ -173,13 +176,6 @@ def _draw(weights: Tensor, count: int, rng: torch.Generator) -> Tensor:
     draws = torch.rand(count, generator=rng, dtype=torch.float64) * cumulative[-1]
     index = torch.searchsorted(cumulative, draws, right=True).clamp_max(len(weights) - 1)
     return index.to(weights.device)
-
-
-def spread_out(gaussians: Gaussians, opacity: float, scale: float) -> Gaussians:
-    """Set all opacities to ``opacity``, and multiply all scales by ``scale``."""
-    logits = torch.full_like(gaussians.opacity_logits, math.log(opacity / (1 - opacity)))
-    changed = {"opacity_logits": logits, "log_scales": gaussians.log_scales + math.log(scale)}
-    return Gaussians(**(gaussians.tensors() | changed))
 
 
 # Constants from LichtFeld-Studio's code (src/training/strategies/mrnf.cpp,

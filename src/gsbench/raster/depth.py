@@ -13,16 +13,6 @@ from gsbench.raster.reference import tiles_of
 from gsbench.scene.types import Camera
 
 
-def depth_colors(gaussians: Gaussians, camera: Camera) -> Gaussians:
-    """The Gaussians with their view z as grey colour, without harmonics.
-
-    The colour of a Gaussian is ``0.5 + C0 sh_dc``, cut at 0 below; z is above 0 in front.
-    """
-    z = _view_z(gaussians, camera)
-    grey = ((z - 0.5) / C0)[:, None].expand(-1, 3)
-    return replace(gaussians, sh_dc=grey)
-
-
 def _view_z(gaussians: Gaussians, camera: Camera) -> Tensor:
     """z along the camera's axis, [N] world units, with its gradient."""
     axis = gaussians.means.new_tensor(camera.rotation[2])
@@ -37,8 +27,10 @@ def render_depth(
     It is 0 where alpha is 0, and has gradients by all that z and the weights w depend on. Returns
     also the render of z as colour, whose ``screen_points`` get a gradient of their own.
     """
-    black = torch.zeros(3, dtype=gaussians.means.dtype, device=gaussians.means.device)
-    render = rasterizer.render(depth_colors(gaussians, camera), camera, 0, black)
+    # z as grey: at degree 0 a colour is 0.5 + C0 sh_dc, cut at 0 below; z is above 0 in front.
+    grey = ((_view_z(gaussians, camera) - 0.5) / C0)[:, None].expand(-1, 3)
+    black = gaussians.means.new_zeros(3)
+    render = rasterizer.render(replace(gaussians, sh_dc=grey), camera, 0, black)
     alpha = render.alpha
     # An alpha that is not 0 is at least that of one blended Gaussian, 1/255.
     depth = torch.where(alpha > 0, render.image[..., 0] / torch.where(alpha > 0, alpha, 1.0), 0.0)

@@ -35,7 +35,6 @@ from gsbench.train.growth import GrowthWatch
 from gsbench.train.ideas import (
     NO_IDEAS,
     Ideas,
-    Schedule,
     Step,
     TrainedView,
     scheduled,
@@ -162,8 +161,8 @@ class Trainer:
             partial(sh_degree_at, options),
         )
         self.scaled_views = ScaledViews(scene.train, self.targets, self.device, image_budget)
-        scheduled = options.resolution_schedule != "none"
-        self.resolution = Resolution(options, scene.train) if scheduled else None
+        fixed = options.resolution_schedule == "none"
+        self.resolution = None if fixed else Resolution(options, scene.train)
         is_white = bool((self.background == 1).all())
         self.context = DensifyContext(scene.extent, is_white, self.device, views)
         densifier.begin(initial, self.context)
@@ -253,7 +252,9 @@ class Trainer:
             step if self.resolution is None else self.resolution.position_step(step)
         )
         if self.ideas.schedule is not None:
-            self._schedule(self.ideas.schedule)
+            base = self.gaussians.base_rates(self.gaussians.position_rate)
+            for name, rate in scheduled(self.ideas.schedule, step, base).items():
+                self.gaussians.set_rate(name, rate)
         index = self.order.next()
         try:
             render, scalars = self._differentiate(index)
@@ -380,12 +381,6 @@ class Trainer:
             beside.pop(DEPTH, None),
             beside,
         )
-
-    def _schedule(self, schedule: Schedule) -> None:
-        """Set the rates of this iteration by the user's ``schedule``."""
-        base = self.gaussians.base_rates(self.gaussians.position_rate)
-        for name, rate in scheduled(schedule, self.step, base).items():
-            self.gaussians.set_rate(name, rate)
 
     def render(self, index: int) -> RenderOutput:
         """Render the training view ``index`` as in the current iteration, with gradients."""
