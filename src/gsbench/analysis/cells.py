@@ -6,6 +6,7 @@ Only repetitions of a trial are averaged: `check_averageable` refuses all others
 from __future__ import annotations
 
 import statistics
+from collections import Counter
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -122,19 +123,12 @@ def side_by_side(first: Experiment, second: Experiment) -> tuple[Experiment, Exp
 
     Raises ``InputError`` if there is no such scene.
     """
-    by_scene = [group_by(one.trials, "scene") for one in (first, second)]
-    views = [
-        {
-            scene: {tuple(map(trial.conditions.get, OF_VIEWS)) for trial in own}
-            for scene, own in of_scenes.items()
-        }
-        for of_scenes in by_scene
+    sides = [
+        {(trial.scene, *map(trial.conditions.get, OF_VIEWS)) for trial in one.trials}
+        for one in (first, second)
     ]
-    alike = {
-        scene
-        for scene in views[0].keys() & views[1].keys()
-        if len(views[0][scene] | views[1][scene]) == 1
-    }
+    kinds = Counter(scene for scene, *_ in sides[0] | sides[1])
+    alike = {scene for scene, *_ in sides[0] & sides[1] if kinds[scene] == 1}
     if not alike:
         raise InputError(
             f"{first.name} and {second.name} have no scene with the same views and protocol"

@@ -35,6 +35,10 @@ WORDS: dict[Outcome, str] = {
 }
 
 
+# classes of badges, which give their colours
+CLASSES = {"BETTER": "better", "WORSE": "worse", "DIFFERENT": "worse", "TOO SMALL": "small"}
+
+
 def outcome_words(verdict: Verdict) -> str:
     """The outcome in a few words: better, worse, higher, too small to matter, ….
 
@@ -67,16 +71,8 @@ def badge(verdict: Verdict) -> str:
 
 
 def badge_class(verdict: Verdict) -> str:
-    """The class of a badge on a page, which gives its colour."""
-    if verdict.state in (RUNNING, STOPPED):
-        return "open"
-    if verdict.state != ANSWERED or verdict.untestable:
-        return ""
-    if verdict.outcome == REFUTED and not verdict.question.sign:
-        return "worse"
-    return {"better": "better", "worse": "worse", WORDS[TOO_SMALL]: "small"}.get(
-        outcome_words(verdict), ""
-    )
+    """The class of a badge on a page."""
+    return "open" if verdict.state in (RUNNING, STOPPED) else CLASSES.get(badge(verdict), "")
 
 
 def with_notes(words: str, verdict: Verdict) -> str:

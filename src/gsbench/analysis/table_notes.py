@@ -116,16 +116,13 @@ def _rounds_note(trial: TrialResult) -> Note | None:
 
 def origin_notes(trials: Sequence[TrialResult]) -> list[Note]:
     """Notes on arms that gsbench did not train: who did, and what was measured."""
-    notes = []
     not_ours = [trial for trial in trials if trial.program or trial.made_elsewhere]
-    for (trained_here, measured), kind in ORIGINS.items():
-        own = {
-            (f"{t.init}-{t.densify}", t.trainer_version)
-            for t in not_ours
-            if bool(t.program) == trained_here and t.record.evaluated_from == measured
-        }
-        arms = [f"{arm} (version {made})" if trained_here else arm for arm, made in sorted(own)]
-        notes += [Note.of(kind, arms=arms)] if own else []
+    by_origin = group_by(not_ours, lambda one: (bool(one.program), one.record.evaluated_from))
+    notes = []
+    for origin, kind in ORIGINS.items():
+        made = {(f"{t.init}-{t.densify}", t.trainer_version) for t in by_origin.get(origin, [])}
+        arms = [f"{arm} (version {version})" if origin[0] else arm for arm, version in sorted(made)]
+        notes += [Note.of(kind, arms=arms)] if arms else []
     return notes
 
 

@@ -199,12 +199,12 @@ def _round_ticks(low: float, high: float, count: int) -> list[float]:
     raw = (high - low) / count
     power = 10.0 ** math.floor(math.log10(raw))
     first = next(index for index, factor in enumerate(ROUND) if factor * power >= raw)
-    for factor in (*reversed(ROUND[: first + 1]), 0.5):
-        step = factor * power
-        indices = range(math.ceil(low / step), math.floor(high / step) + 1)
-        if len(indices) > 1:
+    steps = (factor * power for factor in (*reversed(ROUND[: first + 1]), 0.5))
+    for step in steps:
+        ticks = [k * step for k in range(math.ceil(low / step), math.floor(high / step) + 1)]
+        if len(ticks) > 1:
             break
-    return [index * step for index in indices]
+    return ticks
 
 
 def _ends(points: Points) -> str:
