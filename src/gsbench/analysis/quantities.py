@@ -105,8 +105,9 @@ def relative_change(
     sides: list[dict[str, float]] = []
     for own in (baseline, other):
         with_value = group_by([trial for trial in own if read(trial)], "scene")
-        means = {scene: fmean(map(read, of_scene)) for scene, of_scene in with_value.items()}  # type: ignore[arg-type]
-        sides.append(means)
+        sides.append(
+            {scene: fmean(read(one) or 0.0 for one in same) for scene, same in with_value.items()}
+        )
     one, two = sides
     scenes = sorted(one.keys() & two.keys())
     if not scenes:
