@@ -27,7 +27,6 @@ STARTS = {
     ("system/isolate.py", "continue_in_child", "os.fork"): "current",
     ("system/programs.py", "answer_of", "subprocess.run"): "neutral",
     ("tracking/beside.py", "_sync", "subprocess.Popen"): "current",
-    ("verbs/servers.py", "_announce", "subprocess.run"): "neutral",
     ("verbs/servers.py", "serve", "subprocess.Popen"): "own",
     ("view/page.py", "write_page", "subprocess.run"): "own",
 }
