@@ -59,6 +59,28 @@ def test_a_missing_seed_costs_its_pair_only():
 
 
 @pytest.mark.parametrize(
+    "method, places, said",
+    [
+        ("mine", [("garden", 2)], "UNDECIDED"),
+        ("mine", [("garden", 0)], "UNDECIDED"),
+        ("mine", [("garden", seed) for seed in range(3)], "UNDECIDED"),  # of a scene, all rows
+        ("base", [("garden", 2)], "BETTER"),  # what the favoured arm has, the other one lacks
+        ("other", [("garden", 2)], "BETTER"),  # another question's row
+    ],
+)
+@pytest.mark.parametrize("rename", [{}, {"garden": "a/b"}])
+def test_a_row_that_one_arm_lacks_counts_as_its_failed_training(method, places, said, rename):
+    gone = [
+        index
+        for index, row in FRAME.iterrows()
+        if row.method == method and (row.scene, row.seed) in places
+    ]
+    for frame in (FRAME.drop(gone), FRAME.assign(psnr=FRAME.psnr.mask(FRAME.index.isin(gone)))):
+        renamed = frame.assign(scene=frame.scene.replace(rename))
+        assert badge(gsbench.analysis.judge(renamed, "base", "psnr")["mine"]) == said
+
+
+@pytest.mark.parametrize(
     "frame, words, said",
     [
         (FRAME, ("bas", "psnr"), "did you mean base"),

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from gsbench.analysis.comparison import Comparison, compare
 from gsbench.analysis.quantities import asked_quantity
 from gsbench.analysis.questions import read_least
-from gsbench.analysis.results import Experiment, TrialResult, group_by
+from gsbench.analysis.results import Experiment, TrialResult, Unfinished, group_by
 from gsbench.analysis.sentences import DECLARED_TABLE, TABLE
 from gsbench.analysis.verdicts import Verdict
 from gsbench.errors import InputError
@@ -76,7 +76,7 @@ def judge(
     """The verdict on each method of a ``frame`` against ``baseline`` in ``metric``, by its name.
 
     The frame has the columns method, scene, seed and metrics, a row for each training; a missing
-    value is a training that failed. ``least`` is the least difference that matters, such as 0.1 or
+    value, or a row that only one of two methods has, is a training that failed. ``least`` is the least difference that matters, such as 0.1 or
     "10%"; by default the metric's usual one. ``direction`` (1: more is better, -1: less) is needed
     for metrics that gsbench does not know. A verdict has 5 %, and holds if metric, scenes and seeds
     were chosen before.
@@ -125,8 +125,33 @@ def compare_methods(frame: pd.DataFrame, asked: Declared, name: str = "results")
         _question(trials, asked, idea, quantity.direction, size).with_id(TABLE) for idea in ideas
     ]
     folder = Path(name)
-    command = Command(words=(), cwd="", time=0.0, questions=tuple(questions))
-    return compare(Experiment(name, folder, tuple(trials), (), history=History(folder, (command,))))
+    history = History(folder, (Command(words=(), cwd="", time=0.0, questions=tuple(questions)),))
+    # trainings that were declared may still come
+    absent = () if asked.methods else _absent(folder, trials, questions)
+    return compare(Experiment(name, folder, tuple(trials), (), unfinished=absent, history=history))
+
+
+def _absent(
+    folder: Path, trials: Sequence[TrialResult], questions: Sequence[Question]
+) -> tuple[Unfinished, ...]:
+    """The rows of the questions that the table lacks, as trials that failed."""
+    there = {(trial.digest, trial.scene, trial.seed) for trial in trials}
+    places = {
+        (side.densify, scene, seed)
+        for question in questions
+        for side in (question.baseline, question.idea)
+        for scene, seed in question.places
+    }
+    return tuple(
+        Unfinished(_place(folder, scene, method, seed), _digest(method), failed=True)
+        for method, scene, seed in sorted(places)
+        if (_digest(method), scene, seed) not in there
+    )
+
+
+def _place(folder: Path, scene: str, method: str, seed: int) -> Path:
+    """A path of a row, as the folder of a trial is called."""
+    return folder / scene / method.replace("/", "_") / f"row{SEED_MARK}{seed}"
 
 
 def _question(
@@ -137,20 +162,20 @@ def _question(
     least: tuple[float | None, bool],
 ) -> Question:
     """The question about all trials of a method, or about those that were declared."""
-    places = group_by(trials, "densify", "scene")
-    seeds = {
-        scene: tuple(sorted(one.seed for one in own))
-        for (method, scene), own in places.items()
-        if method == idea
-    }
-    untested, baseline = "", asked.baseline
-    if asked.methods:
-        seeds = dict.fromkeys(asked.scenes, asked.seeds)
-    else:
-        for scene, own in seeds.items():
-            first = sorted(one.seed for one in places.get((baseline, scene), []))[: len(own)]
-            if not set(own) >= set(first):
+    rows = group_by(trials, "densify", "scene")
+    untested, baseline, seeds = "", asked.baseline, dict[str, tuple[int, ...]]()
+    tried = {trial.seed for trial in trials if trial.densify == idea}
+    for scene in dict.fromkeys(trial.scene for trial in trials):
+        first, own = (
+            {one.seed for one in rows.get((side, scene), ())} for side in (baseline, idea)
+        )
+        # a seed of the idea that only one of both has here counts, too: the other's may have failed
+        if wanted := sorted(tried & (first | own)):
+            seeds[scene] = tuple(wanted)
+            if not {*wanted} >= {*sorted(first)[: len(wanted)]}:
                 untested = f"it leaves out seeds of {baseline} on {scene}"
+    if asked.methods:
+        seeds, untested = {_scene(one): asked.seeds for one in asked.scenes}, ""
     return Question(
         idea=Arm("", idea),
         baseline=Arm("", baseline),
@@ -163,6 +188,10 @@ def _question(
         rule=DECLARED_TABLE if asked.methods else TABLE,
         untested=untested,
     )
+
+
+def _scene(name: str) -> str:
+    return name.replace("/", "_")  # it is a part of a path
 
 
 def _digest(method: str) -> str:
@@ -192,7 +221,7 @@ def _trials(frame: pd.DataFrame, metric: str, direction: int, name: str) -> list
     }
     trials = []
     for number, row in enumerate(frame[list(COLUMNS)].itertuples(index=False)):
-        method, scene, seed = str(row[0]), str(row[1]), _seed(row[2])
+        method, scene, seed = str(row[0]), _scene(str(row[1])), _seed(row[2])
         own = {key: column[number] for key, column in metrics.items()}
         trials.append(_trial(name, method, scene, seed, own, facts))
     for place, same in group_by(trials, "densify", "scene", "seed").items():
@@ -248,6 +277,5 @@ def _trial(
         evaluated_from="renders",
         metric_facts=dict(facts),
     )
-    # as the folder of a trial is called
-    path = Path(name) / scene.replace("/", "_") / method.replace("/", "_") / f"row{SEED_MARK}{seed}"
+    path = _place(Path(name), scene, method, seed)
     return replace(TrialResult(path, "", record), alias=_digest(method))
