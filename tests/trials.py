@@ -280,15 +280,24 @@ def write_arms(runs, arms, seeds=(0, 1, 2), scenes=("courtyard",), settings=None
     return paths
 
 
-def ask_about(runs, chosen=lambda trial: True, experiment="exp", metric="psnr", seen=None, **asked):
+def ask_about(
+    runs,
+    chosen=lambda trial: True,
+    experiment="exp",
+    metric="psnr",
+    seen=None,
+    turned=False,
+    **asked,
+):
     """Write the command that asks about these trials as if before they were trained.
 
     ``seen`` are the trials measured before; by default those that an earlier command asked about.
+    The command lists its trials in the order of their folders, or ``turned`` in the other one.
     Returns the questions.
     """
     home = runs / experiment
     trials = read_experiment(home).trials
-    own = with_variants([trial for trial in trials if chosen(trial)])
+    own = with_variants([trial for trial in trials if chosen(trial)])[:: -1 if turned else 1]
     quantity = asked_quantity(metric, own)
     about = {"sign": quantity.direction, "least": quantity.worthwhile} | asked
     known = [trial for trial in trials if (seen or (lambda one: one.asked))(trial)]

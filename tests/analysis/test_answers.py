@@ -72,6 +72,18 @@ def test_what_nobody_asked_has_an_interval_and_no_verdict(tmp_path):
     assert compare(load_experiment(tmp_path, "exp")).risk == ""
 
 
+def test_arms_that_were_asked_about_are_not_shown_again_the_other_way_round(tmp_path):
+    """A sweep lists its baseline first, and the folders of its arms have another order."""
+    for low, key, psnr in (("0.01", "a", 21.0), ("0.005", "b", 20.0)):
+        settings = {"densify": {"name": "adc", "prune_opacity": low}}
+        for seed in range(3):
+            write_trial(tmp_path, seed, key * 8, settings, psnr=psnr + 0.02 * seed * seed)
+    ask_about(tmp_path, turned=True)
+    (answer,) = answers(tmp_path)
+    assert answer.badge == "BETTER"
+    assert dict(answer.arm.variant) == {"densify.prune_opacity": "0.01"}
+
+
 def test_another_baseline_that_is_chosen_later_is_not_tested(tmp_path):
     write_runs(tmp_path, **CLEAR)
     ask_about(tmp_path)

@@ -87,6 +87,7 @@ def test_a_row_that_one_arm_lacks_counts_as_its_failed_training(method, places, 
         (FRAME, ("base", "ssim"), "no column 'ssim'"),
         (FRAME.drop(columns="seed"), ("base", "psnr"), "no column 'seed'"),
         (FRAME.iloc[:0], ("base", "psnr"), "no rows"),
+        (FRAME, ("base", "psnr", None, -1), "higher values are better: leave --better out"),
         (pd.concat([FRAME, FRAME[:1]]), ("base", "psnr"), "base, garden, seed 0 is twice"),
     ],
 )

@@ -207,6 +207,7 @@ def test_a_question_may_be_about_some_scenes_alone(tmp_path):
         ({"idea": "mine", "least": 0}, r"questions\[1\]\.least must be a number above 0"),
         ({"idea": "mine", "metric": "psn"}, "psn"),
         ({"idea": "mine", "metric": "gaussians", "direction": "same"}, "least is needed"),
+        ({"idea": "mine", "metric": "gaussians", "least": 0.1}, "must be a part, such as 10%"),
         ({"idea": "mine", "sez": "x"}, "sez"),
     ],
 )

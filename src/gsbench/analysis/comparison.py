@@ -172,10 +172,11 @@ def compare(experiment: Experiment, baseline: str | None = None) -> Comparison:
     asked = [] if baseline else _asked(experiment, trials)
     terms = Asked(metric=DEFAULT_METRIC, baseline=baseline or BASELINE)
     known, ideas = {trial.arm for trial in trials}, {answer.arm for answer in asked}
+    turned = {(answer.arm, answer.baseline) for answer in asked}
     unasked = [
         pair
         for pair in choose_pairs(trials, terms)
-        if pair[1] not in ideas and known.issuperset(pair)
+        if pair[1] not in ideas and pair not in turned and known.issuperset(pair)
     ]
     state, why = (NOT_TESTED if baseline else NOT_ASKED), ""
     if (experiment.folder / LEDGER).exists():

@@ -76,10 +76,10 @@ def judge(
     """The verdict on each method of a ``frame`` against ``baseline`` in ``metric``, by its name.
 
     The frame has the columns method, scene, seed and metrics, a row for each training; a missing
-    value, or a row that only one of two methods has, is a training that failed. ``least`` is the least difference that matters, such as 0.1 or
-    "10%"; by default the metric's usual one. ``direction`` (1: more is better, -1: less) is needed
-    for metrics that gsbench does not know. A verdict has 5 %, and holds if metric, scenes and seeds
-    were chosen before.
+    value, or a row that only one of two methods has, is a training that failed. ``least`` is the
+    least difference that matters, such as 0.1 or "10%"; by default the metric's usual one.
+    ``direction`` (1: more is better, -1: less) is needed for metrics that gsbench does not know. A
+    verdict has 5 %, and holds if metric, scenes and seeds were chosen before.
 
     Raises InputError, one line, for a frame that lacks a column, has a training twice, or has no
     such baseline.
@@ -119,6 +119,9 @@ def compare_methods(frame: pd.DataFrame, asked: Declared, name: str = "results")
         raise InputError(
             f"{metric}: say whether more is better (--better higher, direction 1) or less"
         )
+    if asked.better and DIRECTIONS[asked.better] != quantity.direction:
+        known = next(word for word, sign in DIRECTIONS.items() if sign == quantity.direction)
+        raise InputError(f"{metric} is known, and {known} values are better: leave --better out")
     least = asked.least or quantity.worthwhile
     size = (None, False) if least is None else read_least(least, "--least")
     questions = [

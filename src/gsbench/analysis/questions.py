@@ -87,10 +87,11 @@ def count_tries(places: Collection[Place], earlier: Iterable[Collection[Place]])
     return found + 1
 
 
-def read_least(value: float | str, where: str) -> tuple[float, bool]:
+def read_least(value: float | str, where: str, is_cost: bool = False) -> tuple[float, bool]:
     """Read the least effect that matters: ``0.005``, or ``10%`` of the baseline's value.
 
-    The second value is True for such a part. Raises InputError unless it is a number above 0.
+    The second value is True for such a part. Raises InputError unless it is a number above 0, and a
+    part if it is that of a cost, whose unit no table shows.
     """
     text = str(value).strip()
     relative = text.endswith("%")
@@ -103,6 +104,8 @@ def read_least(value: float | str, where: str) -> tuple[float, bool]:
             f"{where} must be a number above 0, got {value!r}: give a difference such as 0.005, or "
             "10% (of the baseline's value)"
         )
+    if is_cost and not relative:
+        raise InputError(f"{where} of a count, time or memory must be a part, such as 10%")
     return size, relative
 
 

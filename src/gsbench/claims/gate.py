@@ -102,9 +102,7 @@ def asked_difference(
         raise InputError(
             f"{metric} has no usual least difference that matters: give --least, such as 0.1 or 10%"
         )
-    size = read_least(str(usual) if least is None else least, "--least")
-    if metric in COSTS and not size[1]:
-        raise InputError(f"--least of {metric} must be a part, such as 10%, got {size[0]:g}")
+    size = read_least(str(usual) if least is None else least, "--least", metric in COSTS)
     return (1 if sign > 0 else -1), size
 
 

@@ -174,7 +174,8 @@ def _named(
         sign = DIRECTIONS.get(named.direction, facts.direction if facts else -1)
         usual = facts.worthwhile if facts else None
         least = usual if named.least is None else named.least
-        effect = (None, False) if least is None else read_least(least, f"{where}.least")
+        is_cost = asked in COSTS
+        effect = (None, False) if least is None else read_least(least, f"{where}.least", is_cost)
         if effect[0] is None and named.direction == "same":
             raise InputError(f"{where}.least is needed: a difference below which both are the same")
         found.append((named, sign, effect))

@@ -54,8 +54,9 @@ def judge(argv: Sequence[str], runs: Path) -> int:
     options = ArgumentParser(
         "judge",
         "RESULTS is a table with the columns method, scene, seed and metrics, or a folder of "
-        "renders {arm}/{scene}/{seed} (docs/other_trainers.md). A missing value, or a row that only "
-        "one of two methods has, is a training that failed. The verdict has 5 %; it holds if metric, scenes and seeds were chosen before.",
+        "renders {arm}/{scene}/{seed} (docs/other_trainers.md). A missing value, or a row that "
+        "only one of two methods has, is a training that failed. The verdict has 5 %; it holds if "
+        "metric, scenes and seeds were chosen before.",
         ROWS,
     ).parse_args(argv)
     if options.declare is not None:
