@@ -61,6 +61,8 @@ REFUSED = {  # command line: a part of the line that refuses it
     f"seed={'1' * 5000}": "is not a setting like key=value",
     "+experiment=typo --config-dir conf": "train.iteration is not a setting in "
     "experiment/typo.yaml; did you mean it",
+    "+experiment=asks --config-dir conf --dry-run": "did you mean metric?",
+    "declare --config-dir conf +experiment=asks": "did you mean metric?",
     "+experiment=bomb --config-dir bombs": "it has more than 100,000 values",
     "+experiment=tabel1": "tabel1 does not exist; did you mean table1?",
     "densify._target_=mine.X densify.own=1": "+densify.own=",
@@ -182,6 +184,9 @@ def place(tmp_path, monkeypatch):
         "# @package _global_\nhydra:\n  callbacks:\n    x:\n      _target_: os.system\n"
     )
     (experiments / "typo.yaml").write_text("# @package _global_\ntrain: {iteration: 300}\n")
+    (experiments / "asks.yaml").write_text(
+        "# @package _global_\nquestions: [{idea: volumetric, metrik: psnr}]\n"
+    )
     bomb = [
         "a0: &a0 [x]",
         *(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 10)),

@@ -25,7 +25,7 @@ from gsbench.eval.options import EvalConfig
 from gsbench.launch.batch import check_parts, missing_folders, need_no_check, run_batch
 from gsbench.launch.dry_run import describe_plan
 from gsbench.launch.outcomes import Outcome
-from gsbench.launch.record import forget_refused
+from gsbench.launch.record import check_questions, forget_refused
 from gsbench.words import command, counted
 
 log = logging.getLogger(__name__)
@@ -43,6 +43,7 @@ def launch(argv: list[str]) -> int:
         if is_dry_run:
             trials, are_known = trials_of(sweep)
             if are_known:  # those that a search will choose are only described
+                check_questions(trials)
                 list_trials(trials)
             return 0
         if sweep.config.hydra.job.chdir:

@@ -154,6 +154,13 @@ def asked_of(trials: Sequence[Trial], rows: Sequence[Planned]) -> Asked | None:
     )
 
 
+def check_questions(trials: Sequence[Trial]) -> None:
+    """Raise InputError for a wrong question that an experiment's file names."""
+    asked_metrics(trials)
+    for own in group_by(trials, lambda one: one.files.home).values():
+        asked_of(own, planned_rows(own))
+
+
 def _named(
     values: Mapping[str, Any], metric: str, rows: Sequence[Planned]
 ) -> tuple[tuple[NamedQuestion, int, tuple[float | None, bool]], ...]:
