@@ -8,7 +8,7 @@ import pytest
 
 from gsbench.verbs.plan import PLANNED, plan
 from tests.helpers import change_json, refusal
-from tests.trials import write_runs, write_trial
+from tests.trials import ask_about, write_runs, write_trial
 
 
 @pytest.fixture
@@ -28,6 +28,12 @@ def test_plan_names_designs_that_suffice(pilots, capsys):
     assert "sfm-volumetric against sfm-adc" in out
     assert "(from 9 pairs on 3 scenes)" in out
     assert "scenes like these (from 6 scenes on)" in out
+
+
+def test_plan_is_about_the_metric_that_was_asked_about(pilots, capsys):
+    ask_about(pilots, metric="ssim")
+    assert plan(["exp"], pilots) == 0
+    assert "differences in SSIM vary between seeds" in capsys.readouterr().out
 
 
 def test_plan_answers_for_the_command_given(pilots, capsys):

@@ -28,6 +28,7 @@ from gsbench.analysis.verdicts import GIVE_UP, interval_of
 from gsbench.claims.ledger import IDEAS, RATE, SCREEN, level_of_test
 from gsbench.errors import InputError
 from gsbench.runs.commands import ERROR_RATE
+from gsbench.runs.experiments import DEFAULT_METRIC
 from gsbench.verbs.arguments import ArgumentParser, number, whole_number
 from gsbench.words import counted
 
@@ -66,7 +67,7 @@ def plan(argv: Sequence[str], runs: Path) -> int:
                 "pairs of arms, claims, or planned ideas that share the error rate (1; ledger: 40)",
                 whole_number(MOST_QUESTIONS),
             ),
-            "--metric NAME": ("such as psnr (the default), ssim, lpips_squeeze", str, "psnr"),
+            "--metric NAME": "such as ssim; default: that of the experiment's question, or psnr",
             "--difference SIZE": (
                 "to be seen; default: what papers count as an improvement",
                 number(PositiveFloat),
@@ -78,10 +79,12 @@ def plan(argv: Sequence[str], runs: Path) -> int:
     experiment = load_experiment(runs, options.experiment)
     comparison = compare(experiment, None if options.baseline == BASELINE else options.baseline)
     trials = comparison.trials
-    metric = quantity(options.metric, trials)
+    questions = [answer.verdict.question for answer in comparison.answers]
+    usual = questions[0].metric if questions else DEFAULT_METRIC
+    metric = quantity(options.metric or usual, trials)
     if metric.cost:
         raise InputError(
-            f"--metric {options.metric}: only metrics can be planned for, not counts and times"
+            f"--metric {metric.key}: only metrics can be planned for, not counts and times"
         )
     difference = options.difference or metric.worthwhile
     if difference is None:
