@@ -65,6 +65,7 @@ def test_composed_values_name_a_part_only_if_there_is_one(module):
     "word,error",
     [
         ("train.terms=[{weight: 1}]", "train.terms.0 names no _target_"),
+        (term(weigth=1), "train.terms.0.weigth is not a setting; did you mean weight?"),
         (term(weight="much"), "train.terms.0.weight must be a number, got 'much'"),
         (term(weight=1, powre=2), "did you mean power"),
         (term(weight=1, power="x"), "train.terms.0.power must be"),

@@ -9,7 +9,7 @@ import logging
 import sys
 from typing import Any
 
-from gsbench.config.groups import REMOVABLE
+from gsbench.config.groups import GROUPS, REMOVABLE
 from gsbench.config.permissions import (
     check_program,
     check_target,
@@ -96,10 +96,15 @@ def _check_names(cls: Any, target: str, options: dict[str, Any], group: str) -> 
     key = f"{group}.{unknown}"
     if target.startswith(GSBENCH):
         raise InputError(unknown_setting(key, unknown, parameters))
-    remove = f"remove it by ~{key}, or " if group in REMOVABLE else ""
+    known, advice = [*parameters], ""
+    if group.startswith("train.terms."):
+        known.append("weight")  # of every term
+    if group in GROUPS:
+        remove = f"remove it by ~{key}, or " if group in REMOVABLE else ""
+        advice = f"; {remove}start from another choice, {group}=NAME"
     raise InputError(
-        f"{key} is not a setting{did_you_mean(unknown, parameters)} ({target} has: "
-        f"{', '.join(parameters) or 'none'}); {remove}start from another choice, {group}=NAME"
+        f"{key} is not a setting{did_you_mean(unknown, known)} ({target} has: "
+        f"{', '.join(known) or 'none'}){advice}"
     )
 
 
