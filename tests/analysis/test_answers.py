@@ -258,6 +258,20 @@ def test_an_old_declaration_is_read_as_five_percent_by_arms(tmp_path):
     assert not read_history(tmp_path / "exp").questions
 
 
+@pytest.mark.parametrize(
+    "missing,count", [("*", "6/12"), ("*adc", "9/12"), ("*volumetric", "9/12")]
+)
+def test_an_old_declaration_awaits_a_scene_that_an_arm_lacks(tmp_path, missing, count):
+    write_runs(tmp_path, **CLEAR)
+    for path in tmp_path.glob("exp/*/*/*/results.json"):
+        change_json(path, measured="2021-01-01T00:00:00Z")
+    declare(tmp_path)
+    scene = load_experiment(tmp_path, "exp").trials[0].scene
+    for arm in list(tmp_path.glob(f"exp/{scene}/{missing}")):
+        shutil.rmtree(arm)
+    assert badges(tmp_path) == {"sfm-volumetric": f"STOPPED {count}"}
+
+
 def test_an_old_declaration_after_results_is_not_tested(tmp_path):
     write_runs(tmp_path, **CLEAR)
     for path in tmp_path.glob("exp/*/*/*/results.json"):

@@ -6,13 +6,13 @@ declaration and by the versions of an arm's code.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import field, replace
 
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.quantities import asked_quantity
 from gsbench.analysis.questions import Asked, choose_pairs, draft, level_of
-from gsbench.analysis.results import Experiment, TrialResult
+from gsbench.analysis.results import Experiment, TrialResult, group_by
 from gsbench.parsing import Amount, Count, Record
 from gsbench.runs.commands import ERROR_RATE, Digest, Question, code_in
 from gsbench.runs.experiments import Arm, unix_time
@@ -122,7 +122,33 @@ def _of_sweep(
         of_idea = [trial for trial in own if trial.arm == idea]
         # failed ones, too
         seeds = {one.scene: planned[one.key] for one in of_idea if one.scene in question.seeds}
+        digests, of_missing = _of_missing(question, planned, own)
         late = min(trial.measured for trial in of_idea) < moment
         level, why = ERROR_RATE / len(pairs), LATE if late else ""
-        questions.append(replace(question, seeds=seeds, level=level, untested=why))
+        question = replace(question, digests=digests, seeds=seeds | of_missing)
+        questions.append(replace(question, level=level, untested=why))
     return questions
+
+
+def _of_missing(
+    question: Question, planned: Mapping[str, tuple[int, ...]], trials: Sequence[TrialResult]
+) -> tuple[dict[str, tuple[Digest, Digest]], dict[str, tuple[int, ...]]]:
+    """The digests of a question, with the declared scenes of which an arm has no trial yet.
+
+    Returns also the seeds of these scenes. Without them a sweep would be decided by the scenes that
+    happen to be trained first. A declaration has keys of trials, not arms: arms that differ in
+    swept settings only have one name, and each of them lacks what one of them lacks.
+    """
+    measured = {(trial.scene, trial.arm): trial.digest for trial in trials}
+    keys = group_by([key for key in planned if key.count("/") == 2], lambda key: key.split("/")[0])
+    arms = question.baseline, question.idea
+    digests, seeds = dict(question.digests), {}
+    for scene in sorted(keys.keys() - question.seeds.keys()):
+        own = [[key for key in keys[scene] if key.split("/")[1] == arm.name] for arm in arms]
+        if all(own):
+            # a key stands for the digest of what is not trained yet
+            first, second = (
+                measured.get((scene, arm), of_arm[0]) for arm, of_arm in zip(arms, own, strict=True)
+            )
+            digests[scene], seeds[scene] = (first, second), planned[own[1][0]]
+    return digests, seeds
