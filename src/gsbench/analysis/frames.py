@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
 METHOD, SCENE, SEED = COLUMNS = ("method", "scene", "seed")
 DIRECTIONS = {"": 0, "higher": 1, "lower": -1}
+BETTER = {sign: word for word, sign in DIRECTIONS.items()}
 
 
 class Declared(Record):
@@ -92,9 +93,8 @@ def judge(
         >>> judge(frame, "base", "psnr")["mine"].outcome
         'supported'
     """
-    better = next(word for word, sign in DIRECTIONS.items() if sign == direction)
     size = None if least is None else str(least)
-    asked = Declared(baseline=baseline, metric=metric, better=better, least=size)
+    asked = Declared(baseline=baseline, metric=metric, better=BETTER[direction], least=size)
     answers = compare_methods(frame, asked).answers
     return {answer.arm.densify: answer.verdict for answer in answers}
 
@@ -120,7 +120,7 @@ def compare_methods(frame: pd.DataFrame, asked: Declared, name: str = "results")
             f"{metric}: say whether more is better (--better higher, direction 1) or less"
         )
     if asked.better and DIRECTIONS[asked.better] != quantity.direction:
-        known = next(word for word, sign in DIRECTIONS.items() if sign == quantity.direction)
+        known = BETTER[quantity.direction]
         raise InputError(f"{metric} is known, and {known} values are better: leave --better out")
     least = asked.least or quantity.worthwhile
     size = (None, False) if least is None else read_least(least, "--least")

@@ -7,6 +7,7 @@ serves tables, reports, looks, gates and ledgers.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -94,7 +95,7 @@ class Verdict:
         """The number of the question's trials."""
         return self.question.trials
 
-    @property
+    @cached_property
     def scenes(self) -> list[SceneRow]:
         """The estimates of single scenes."""
         lacking = {one.scene for one in self.lacking}
