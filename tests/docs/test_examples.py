@@ -136,7 +136,7 @@ SCENE = " ".join(word for word in TINY.split() if not word.startswith("init"))
 
 def test_the_initialiser_of_its_document_runs(folder):
     run_command("initialiser.md", "init._target_=shell.Shell", SCENE)
-    (results,) = Path("runs").glob("shell/courtyard/shell-none/*/results.json")
+    (results,) = Path("runs").glob("shell/courtyard/shell-adc/*/results.json")
     values = read_json(results)
     assert values["num_init_points"] == 20_000
     assert values["init_report"]["init"] == "shell"
