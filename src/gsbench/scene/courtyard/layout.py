@@ -11,6 +11,8 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from gsbench.parsing import SafeLoader
+
 PLAN = Path(__file__).with_name("plan.yaml")
 BOX, SPHERE, TUBE = 0, 1, 2
 X, Y, Z = 0, 1, 2
@@ -44,7 +46,7 @@ Solid = tuple[int, tuple[float, ...], tuple[float, ...], str, NDArray[np.float64
 
 def build_layout(seed: int) -> Layout:
     """Build the courtyard. The plan is fixed; the seed varies small objects and shrubs."""
-    plan = yaml.safe_load(PLAN.read_text(encoding="utf-8"))
+    plan = yaml.load(PLAN.read_text(encoding="utf-8"), Loader=SafeLoader)
     rng, rows, starts = np.random.default_rng(seed), list[Any](), [0]
 
     def draw(value: Any) -> float:
