@@ -1,6 +1,6 @@
 """The courtyard's plan (``plan.yaml``) as solid primitives with materials, in metres, z up."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from enum import IntEnum
 from itertools import pairwise, product
 from math import cos, radians, sin
@@ -121,4 +121,10 @@ def crate(x, y, z, side, paint, yaw) -> Iterator[Solid]:
         yield from box(x + across, y + along, middle, 0.07, 0.07, side, "dark_oak", yaw, Z)
 
 
-FORMS = {"box": box, "sphere": sphere, "tube": tube, "blob": blob, "crate": crate}
+FORMS: dict[str, Callable[..., Iterator[Solid]]] = {
+    "box": box,
+    "sphere": sphere,
+    "tube": tube,
+    "blob": blob,
+    "crate": crate,
+}
