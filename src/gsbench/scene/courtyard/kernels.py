@@ -134,9 +134,6 @@ def cast(layout, origin, direction, any_hit):
         for i in range(layout.group_start[g], layout.group_start[g + 1]):
             size, rotation = layout.size[i], layout.rotation[i]
             start = minus(origin, layout.center[i])
-            along = dot(start, direction)
-            if along * along < dot(start, start) - size[3] * size[3]:
-                continue  # misses the bounding sphere
             local = to_local(rotation, start), to_local(rotation, direction)
             t = hit_primitive(layout.kind[i], size, local[0], local[1])
             if t < best:
@@ -176,8 +173,6 @@ def nearest_surface(layout, point, limit):
             continue
         for i in range(layout.group_start[g], layout.group_start[g + 1]):
             size, offset = layout.size[i], minus(point, layout.center[i])
-            if dot(offset, offset) >= (best + size[3]) ** 2:
-                continue
             local = to_local(layout.rotation[i], offset)
             best = min(best, abs(signed_distance(layout.kind[i], size, local)))
     return best
