@@ -85,10 +85,10 @@ def read_transforms(
     find = _FileFinder(folder, image_folder)
     rows: dict[str, Photograph] = {}
     points: PointsFile | None = None
-    all_missing: list[str] = []
+    missing: list[str] = []
     ratios: list[Finding] = []
     for split, record in records.items():
-        path, missing = files[split], []
+        path = files[split]
         applied = applied_transform_of(path, record)
         for frame in record.frames:
             name = find(path, frame.file_path)
@@ -108,26 +108,21 @@ def read_transforms(
                 depth=_beside(path, frame.depth_file_path),
                 role=ROLES[split] if len(files) > 1 else "",
             )
-        all_missing += missing
         points = _points(path, record, applied, points)
-    lacking = f", while {some_of(all_missing)} have no file" if all_missing else ""
-    first = next(iter(files.values()))
-    require_enough(
-        len(rows),
-        folder,
-        f"with a file and a camera in {first.name}{lacking}",
-        "set scene.images to the folder of the photographs" if all_missing else "",
-    )
+    which, mend = f"with a file and a camera in {next(iter(files.values())).name}", ""
+    if missing:
+        which += f", while {some_of(missing)} have no file"
+        mend = "set scene.images to the folder of the photographs"
+    require_enough(len(rows), folder, which, mend)
     if "" in files:
         roles = _named_split(files[""], records[""], rows, find)
         rows = {name: replace(row, role=roles.get(name, row.role)) for name, row in rows.items()}
-    read_from = (*files.values(), *(() if points is None else (points.path,)))
+    read_from = [*files.values()]
+    if points is not None:
+        read_from.append(points.path)
     ordered = tuple(rows[name] for name in sorted(rows))
-    noted = {
-        "no-file": [Finding(len(all_missing), all_missing)],
-        "focal-length-and-field": ratios,
-    }
-    return RawCapture(folder, ordered, points, read_from, noted=noted)
+    noted = {"no-file": [Finding(len(missing), missing)], "focal-length-and-field": ratios}
+    return RawCapture(folder, ordered, points, tuple(read_from), noted=noted)
 
 
 def _beside(path: Path, written: str | None) -> Path | None:
@@ -226,11 +221,9 @@ def _named_split(
             f"{path}: {some_of(both)} would be trained and tested on: correct its lists of "
             "filenames"
         )
-    others: Role = "train" if train is None else "unused"
-    roles = dict.fromkeys(images, others)
-    roles.update((name, "train") for name in chosen["train"])
-    roles.update((name, "test") for name in chosen["held-out"])
-    return roles
+    roles: dict[str, Role] = dict.fromkeys(images, "train" if train is None else "unused")
+    roles |= dict.fromkeys(chosen["train"], "train")
+    return roles | dict.fromkeys(chosen["held-out"], "test")
 
 
 KEYS = yaml.load(
