@@ -19,7 +19,7 @@ from PIL import Image, UnidentifiedImageError
 
 from gsbench.errors import InputError
 from gsbench.files import GIT_LFS, LFS_REMEDY, MAX_NAME_BYTES, require_regular
-from gsbench.scene.names import IMAGE_SUFFIXES
+from gsbench.scene.names import FILES, IMAGE_SUFFIXES
 from gsbench.scene.options import Backdrop
 from gsbench.words import counted, is_one_line, some_of
 
@@ -28,9 +28,7 @@ log = logging.getLogger(__name__)
 Resample = Literal["lanczos", "area", "bicubic"]
 
 # photographs and videos that are not read, and how they are called
-NOT_READ = dict.fromkeys((".heic", ".heif"), "HEIC") | {".avif": "AVIF", ".jxl": "JPEG XL"}
-NOT_READ |= dict.fromkeys((".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"), "raw")
-NOT_READ |= {".exr": "EXR", ".gif": "GIF"} | dict.fromkeys((".mp4", ".mov", ".insv"), "video")
+NOT_READ = {suffix: kind for kind, own in FILES["not_read"].items() for suffix in own}
 # The formats of files with these suffixes. Without this list, Pillow would try some forty formats
 # on every file.
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")  # JPEG includes MPO, which holds several JPEGs

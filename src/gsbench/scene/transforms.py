@@ -17,12 +17,11 @@ from functools import cached_property
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
-import yaml
 from pydantic_core import from_json
 
 from gsbench.errors import InputError
 from gsbench.files import GIT_LFS, LFS_REMEDY
-from gsbench.parsing import DamagedError, SafeLoader, parse_typed, read_bytes, resolved, text_of
+from gsbench.parsing import DamagedError, parse_typed, read_bytes, resolved, table_beside, text_of
 from gsbench.scene.colmap_files import require_subfolder
 from gsbench.scene.images import list_images
 from gsbench.scene.names import IMAGE_SUFFIXES, match
@@ -226,9 +225,7 @@ def _named_split(
     return roles | dict.fromkeys(chosen["held-out"], "test")
 
 
-KEYS = yaml.load(
-    Path(__file__).with_name("transforms_keys.yaml").read_text(encoding="utf-8"), Loader=SafeLoader
-)
+KEYS = table_beside(__file__, "transforms_keys.yaml")
 
 
 def check_keys(path: Path, document: Any, backdrop: Backdrop) -> None:

@@ -4,16 +4,13 @@ from collections.abc import Callable, Iterator
 from enum import IntEnum
 from itertools import pairwise, product
 from math import cos, radians, sin
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
-from gsbench.parsing import SafeLoader
+from gsbench.parsing import table_beside
 
-PLAN = Path(__file__).with_name("plan.yaml")
 BOX, SPHERE, TUBE = 0, 1, 2
 X, Y, Z = 0, 1, 2
 Material = IntEnum(
@@ -46,7 +43,7 @@ Solid = tuple[int, tuple[float, ...], tuple[float, ...], str, NDArray[np.float64
 
 def build_layout(seed: int) -> Layout:
     """Build the courtyard. The plan is fixed; the seed varies small objects and shrubs."""
-    plan = yaml.load(PLAN.read_text(encoding="utf-8"), Loader=SafeLoader)
+    plan = table_beside(__file__, "plan.yaml")
     rng, rows, starts = np.random.default_rng(seed), list[Any](), [0]
 
     def draw(value: Any) -> float:
