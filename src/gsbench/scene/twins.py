@@ -65,7 +65,7 @@ def copies_of_test_views(folder: Path, train: Sequence[str], test: Sequence[str]
 
     def size(name: str) -> str:
         file = folder / name
-        return str(file.stat().st_size) if file.is_file() else name
+        return str(file.stat().st_size) if file.is_file() else name  # a link to nowhere
 
     by_size = grouped(test, size)
     copies: dict[str, str] = {}
