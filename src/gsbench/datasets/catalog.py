@@ -73,7 +73,10 @@ def read_catalog() -> dict[str, PublicDataset]:
     """The data sets of gsbench's catalogue by name."""
     datasets = {}
     for name, entry in table_beside(__file__, "catalog.yaml").items():
-        archives = tuple(Archive(**archive) for archive in entry.pop("archives"))
+        archives = tuple(
+            Archive(archive["url"], archive["scenes"], archive.get("size", ""))
+            for archive in entry.pop("archives")
+        )
         datasets[name] = PublicDataset(name=name, archives=archives, **entry)
     return datasets
 
