@@ -205,7 +205,7 @@ def position_gradient(a0, a1, g_column, g_row, free_x, free_y, inverse_z, v):
 
 
 def splitting_entries(d00, d01, d11, shear, rows):
-    """xx, xy, xz, yy, yz, zz of the splitting matrix F^T U^T (D G D - h D) U F.
+    """The splitting matrix F^T U^T (D G D - h D) U F, row by row.
 
     F = ``rows`` is the derivative of the projected mean; ``d00``, ``d01`` and ``d11`` are the
     entries of D G D - h D. The second derivative of alpha by the projected mean is alpha
@@ -215,11 +215,10 @@ def splitting_entries(d00, d01, d11, shear, rows):
     r1 = rows[1]
     r0 = plus(rows[0], shear, r1)
     s0, s1 = mixed(d00, r0, d01, r1), mixed(d01, r0, d11, r1)
-    return (
-        r0[0] * s0[0] + r1[0] * s1[0],
+    xy, xz, yz = (
         r0[0] * s0[1] + r1[0] * s1[1],
         r0[0] * s0[2] + r1[0] * s1[2],
-        r0[1] * s0[1] + r1[1] * s1[1],
         r0[1] * s0[2] + r1[1] * s1[2],
-        r0[2] * s0[2] + r1[2] * s1[2],
     )
+    xx, yy = r0[0] * s0[0] + r1[0] * s1[0], r0[1] * s0[1] + r1[1] * s1[1]
+    return xx, xy, xz, xy, yy, yz, xz, yz, r0[2] * s0[2] + r1[2] * s1[2]

@@ -5,6 +5,7 @@ kernels transpose it into one row per Gaussian and multiply that by the coeffici
 """
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -14,11 +15,10 @@ from gsbench.raster.cpu.shuffle import transpose
 from gsbench.raster.cpu.simd import (
     LANES,
     exp2,
-    gather,
+    gather_fours,
     load,
     maximum,
     minimum,
-    scatter,
     select,
     splat,
     square_root,
@@ -44,6 +44,11 @@ OF_VECTORS = formulas.compiled(
 dot, stretched = OF_VECTORS.dot, OF_VECTORS.stretched
 
 
+def __getattr__(name: str) -> Any:
+    """The other formulas, so that kernels import them from here."""
+    return getattr(OF_VECTORS, name)
+
+
 @inlined
 def exponential(x):
     return exp2(maximum(minimum(x * LOG2_E, MAX_LOG2), -MAX_LOG2))
@@ -55,22 +60,9 @@ def exponentials(row):
 
 
 @inlined
-def gather_vectors(array, indices):
-    return gather(array, indices, 3, 0), gather(array, indices, 3, 1), gather(array, indices, 3, 2)
-
-
-@inlined
-def scatter_vectors(array, indices, values):
-    scatter(array, indices, 3, 0, values[0])
-    scatter(array, indices, 3, 1, values[1])
-    scatter(array, indices, 3, 2, values[2])
-
-
-@inlined
 def gather_quaternions(quaternions, indices):
     """The unit quaternions, and the inverse norm and the squared norm of the stored ones."""
-    w, x = gather(quaternions, indices, 4, 0), gather(quaternions, indices, 4, 1)
-    y, z = gather(quaternions, indices, 4, 2), gather(quaternions, indices, 4, 3)
+    w, x, y, z = gather_fours(quaternions, indices)
     squared = w * w + x * x + y * y + z * z
     inverse = 1 / square_root(squared)
     return (w * inverse, x * inverse, y * inverse, z * inverse), inverse, squared

@@ -15,15 +15,28 @@ from gsbench.raster.cpu.geometry import (
     F0,
     LOG2_E,
     MATRIX,
-    OF_VECTORS,
+    clamped_slopes,
+    covariance_gradients,
     direction_gradient,
+    dot,
     exponential,
     exponentials,
     fill_basis,
+    from_camera,
     gather_quaternions,
-    gather_vectors,
+    image_rows,
     normalized,
-    scatter_vectors,
+    plus,
+    position_gradient,
+    quaternion_gradient,
+    rotation_matrix,
+    scaled,
+    splitting_entries,
+    spread,
+    stretched,
+    through,
+    times,
+    view_axes,
 )
 from gsbench.raster.cpu.shuffle import (
     REST,
@@ -42,7 +55,8 @@ from gsbench.raster.cpu.simd import (
     absolute,
     ceil,
     floor,
-    gather,
+    gather_numbers,
+    gather_vectors,
     load,
     log2,
     lowest_bit,
@@ -57,26 +71,8 @@ from gsbench.raster.cpu.simd import (
     square_root,
     store,
 )
-from gsbench.raster.cpu.splitting import scatter_splitting
 from gsbench.raster.staged import MIN_QUATERNION_NORM
 from gsbench.system.jit import inlined, kernel
-
-clamped_slopes, image_rows, view_axes = (
-    OF_VECTORS.clamped_slopes,
-    OF_VECTORS.image_rows,
-    OF_VECTORS.view_axes,
-)
-dot, plus, scaled, stretched = (
-    OF_VECTORS.dot,
-    OF_VECTORS.plus,
-    OF_VECTORS.scaled,
-    OF_VECTORS.stretched,
-)
-from_camera, through, times = OF_VECTORS.from_camera, OF_VECTORS.through, OF_VECTORS.times
-rotation_matrix, spread = OF_VECTORS.rotation_matrix, OF_VECTORS.spread
-covariance_gradients = OF_VECTORS.covariance_gradients
-position_gradient = OF_VECTORS.position_gradient
-quaternion_gradient = OF_VECTORS.quaternion_gradient
 
 NEAR, SIGMA_EXTENT = CONSTANTS.near, CONSTANTS.sigma_extent
 ALPHA_MIN, LOG2_ALPHA_MIN = CONSTANTS.alpha_min, math.log2(CONSTANTS.alpha_min)
@@ -111,7 +107,7 @@ def _contour_range(center, half, tiles):
 
 @kernel
 def project_shards(
-    memory, first, past, edges, gaussians, degree, v, records, record_ints, keys, radii, flags
+    first, past, memory, edges, gaussians, degree, v, records, record_ints, keys, radii, flags
 ):
     """Project the shards ``first`` to ``past``.
 
@@ -122,13 +118,12 @@ def project_shards(
     for shard in range(first, past):
         begin, end = edges[shard], edges[shard + 1]
         outputs = records, record_ints, keys, radii, flags[shard]
-        _project(memory, begin, end, gaussians, degree, v, outputs)
+        _project(memory[0][first], memory[1][first], begin, end, gaussians, degree, v, outputs)
 
 
 @inlined
-def _project(memory, begin, end, gaussians, degree, v, outputs):
+def _project(floats, indices, begin, end, gaussians, degree, v, outputs):
     records, record_ints, keys, radii, flags = outputs
-    floats, indices = memory
     rows, scratch = floats[MATRIX : 2 * MATRIX], floats[2 * MATRIX :]
     out = begin
     bad = splat(ZERO)  # sum of 0 * value: 0 if every value is finite, else NaN
@@ -144,7 +139,7 @@ def _project(memory, begin, end, gaussians, degree, v, outputs):
         log_scale = gather_vectors(gaussians.log_scales, indices)
         dc = gather_vectors(gaussians.sh_dc, indices)
         quaternion, _, squared_norm = gather_quaternions(gaussians.quaternions, indices)
-        logit = gather(gaussians.logits, indices, 1, 0)
+        (logit,) = gather_numbers(gaussians.logits, indices)
         finite = _zero_if_finite(mean)
         finite += _zero_if_finite(log_scale)
         finite += _zero_if_finite(dc)
@@ -345,7 +340,7 @@ def _take_rows(record, count, past, v, record_ints, tile_shard, rows, indices, s
 
 @kernel
 def backproject_shards(
-    memory, first, past, edges, visible, gaussians, degree, frame, rows, outputs, adam
+    first, past, memory, edges, visible, gaussians, degree, frame, rows, outputs, adam
 ):
     """Write the gradients of the shards ``first`` to ``past`` and clear their ``rows``.
 
@@ -355,14 +350,16 @@ def backproject_shards(
     [N, C]; the last two are empty if not requested.
 
     If ``adam`` has factors, the parameters are stepped, too, `layout.CHUNK` Gaussians at a time.
-    The gradients by the parameters then have the rows of one chunk only, which stay in the cache.
+    The gradients by the parameters then have one chunk of rows for each shard, of which a call uses
+    that of its first one; it stays in the cache.
     """
-    steps = len(adam.factors) > 0
+    steps, own_chunk = len(adam.factors) > 0, first * at.CHUNK
+    scratch = memory[0][first], memory[1][first]
     for shard in range(first, past):
         begin, end = edges[shard], edges[shard + 1]
         record, last = begin, begin + visible[shard]
         for start in range(begin, end, at.CHUNK):
-            stop, origin = min(start + at.CHUNK, end), start if steps else 0
+            stop, origin = min(start + at.CHUNK, end), start - own_chunk if steps else 0
             past_record = record
             while past_record < last and _gaussian(frame.record_ints, past_record) < stop:
                 past_record += 1
@@ -376,11 +373,19 @@ def backproject_shards(
                         _gaussian(frame.record_ints, last_own) + 1,
                     )
                 _backproject(
-                    memory, sixteen, past_record, origin, gaussians, degree, frame, rows, outputs
+                    scratch,
+                    sixteen,
+                    past_record,
+                    origin,
+                    gaussians,
+                    degree,
+                    frame,
+                    rows,
+                    outputs,
                 )
             record = past_record
             if steps:
-                step_all(gaussians, adam, outputs[0], start, stop, memory[0])
+                step_all(gaussians, adam, outputs[0], start, stop, own_chunk, scratch[0])
 
 
 @inlined
@@ -432,7 +437,7 @@ def _backproject(memory, record, past, origin, gaussians, degree, frame, rows, o
     # Colour. A channel below 0 was clamped and has no gradient.
     to, inverse_distance = normalized(offset)
     rgb = _unclamped(record, count, record_ints, sums, colors)
-    scatter_vectors(gradients.sh_dc, own, stretched(rgb, F0))
+    scatter(gradients.sh_dc, own, stretched(rgb, F0))
     turned = _backproject_harmonics(
         degree, to, indices, own, gaussians.sh_rest, gradients.sh_rest, floats[MATRIX:]
     )
@@ -454,12 +459,10 @@ def _backproject(memory, record, past, origin, gaussians, degree, frame, rows, o
     g_column = a * load(sums, at.SUM_H_T * LANES)
     g_row = shear * g_column + e * load(sums, at.SUM_H_Y * LANES)
     half_width, half_height = 0.5 * v.width, 0.5 * v.height  # from px to NDC
-    scatter(g_screen, indices, 2, 0, g_column * half_width)
-    scatter(g_screen, indices, 2, 1, g_row * half_height)
+    scatter(g_screen, indices, (g_column * half_width, g_row * half_height))
     if len(g_absolute) > 0:
-        absolute_t = a * load(sums, at.SUM_ABS_T * LANES)
-        scatter(g_absolute, indices, 2, 0, absolute_t * half_width)
-        scatter(g_absolute, indices, 2, 1, load(sums, at.SUM_ABS_Y * LANES) * half_height)
+        across, down = a * load(sums, at.SUM_ABS_T * LANES), load(sums, at.SUM_ABS_Y * LANES)
+        scatter(g_absolute, indices, (across * half_width, down * half_height))
 
     q00 = a * a * load(sums, at.SUM_H_TT * LANES)
     q01 = a * e * load(sums, at.SUM_H_TY * LANES)
@@ -467,25 +470,23 @@ def _backproject(memory, record, past, origin, gaussians, degree, frame, rows, o
     h = load(sums, at.SUM_H * LANES)
     if len(g_extra) > 0:
         free = image_rows(free_x, free_y, inverse_z, v)
-        scatter_splitting(g_extra, indices, q00 - a * h, q01, q11 - e * h, shear, free)
+        entries = splitting_entries(q00 - a * h, q01, q11 - e * h, shear, free)
+        scatter(g_extra, indices, entries)
     g_scales, turn, s0, s1 = covariance_gradients(q00, q01, q11, n0, n1, shear, scales)
-    scatter_vectors(gradients.log_scales, own, g_scales)
+    scatter(gradients.log_scales, own, g_scales)
     g_quaternion = quaternion_gradient(quaternion, turn, inverse_norm + inverse_norm)
-    scatter(gradients.quaternions, own, 4, 0, g_quaternion[0])
-    scatter(gradients.quaternions, own, 4, 1, g_quaternion[1])
-    scatter(gradients.quaternions, own, 4, 2, g_quaternion[2])
-    scatter(gradients.quaternions, own, 4, 3, g_quaternion[3])
+    scatter(gradients.quaternions, own, g_quaternion)
 
     # Mean: through A = J W and the position on the image, and through the view direction of the
     # colour, whose gradient is projected to the tangent of the sphere.
     a0, a1 = through(matrix, s0), through(matrix, s1)
     position = position_gradient(a0, a1, g_column, g_row, free_x, free_y, inverse_z, v)
     tangent = stretched(plus(turned, -dot(turned, to), to), inverse_distance)
-    scatter_vectors(gradients.means, own, plus(position, ONE, tangent))
+    scatter(gradients.means, own, plus(position, ONE, tangent))
 
     # d log(alpha) / d logit = 1 - opacity
-    growth = exponential(gather(gaussians.logits, indices, 1, 0)) + ONE
-    scatter(gradients.logits, own, 1, 0, h / growth)
+    (logit,) = gather_numbers(gaussians.logits, indices)
+    scatter(gradients.logits, own, (h / (exponential(logit) + ONE),))
 
 
 @inlined

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import triton
 import triton.language as tl
 
@@ -97,6 +99,11 @@ OF_LANES = formulas.compiled(
     square_root=square_root,
 )
 dot, plus, stretched = OF_LANES.dot, OF_LANES.plus, OF_LANES.stretched
+
+
+def __getattr__(name: str) -> Any:
+    """The other formulas, so that kernels import them from here."""
+    return getattr(OF_LANES, name)
 
 
 @triton.jit

@@ -12,15 +12,31 @@ from gsbench.raster.base import CONSTANTS
 from gsbench.raster.staged import MIN_QUATERNION_NORM
 from gsbench.raster.triton.geometry import (
     F0,
-    OF_LANES,
+    clamped_slopes,
     colors,
+    covariance_gradients,
+    dot,
+    from_camera,
+    image_rows,
     load_camera,
     load_quaternion,
     load_vector,
+    minus,
     normalized,
+    plus,
+    position_gradient,
+    quaternion_gradient,
+    rotation_matrix,
+    scaled,
+    splitting_entries,
+    spread,
     store_gradients,
     store_or_zero,
     store_vector,
+    stretched,
+    through,
+    times,
+    view_axes,
 )
 from gsbench.raster.triton.layout import (
     ALPHA_MIN,
@@ -47,18 +63,6 @@ from gsbench.raster.triton.layout import (
     TILE,
 )
 from gsbench.raster.triton.lists import lists_fit, units_that_fit
-
-clamped_slopes, image_rows, view_axes = (
-    OF_LANES.clamped_slopes,
-    OF_LANES.image_rows,
-    OF_LANES.view_axes,
-)
-dot, minus, plus, scaled = OF_LANES.dot, OF_LANES.minus, OF_LANES.plus, OF_LANES.scaled
-stretched, through, times = OF_LANES.stretched, OF_LANES.through, OF_LANES.times
-from_camera, rotation_matrix = OF_LANES.from_camera, OF_LANES.rotation_matrix
-covariance_gradients, spread = OF_LANES.covariance_gradients, OF_LANES.spread
-position_gradient = OF_LANES.position_gradient
-quaternion_gradient = OF_LANES.quaternion_gradient
 
 NEAR = tl.constexpr(CONSTANTS.near)
 SIGMA_EXTENT = tl.constexpr(CONSTANTS.sigma_extent)
@@ -269,6 +273,14 @@ def _turned(to, inverse_distance, g_rgb, color_slopes, index, mask, DEGREE: tl.c
     return stretched(minus(turned, dot(turned, to), to), inverse_distance)
 
 
+@triton.jit
+def store_splitting(g_extra, index, d00, d01, d11, shear, rows, seen, inside):
+    """Write the splitting matrices to ``g_extra`` [N, 9]; see `formulas.splitting_entries`."""
+    entries = splitting_entries(d00, d01, d11, shear, rows)
+    for k in tl.static_range(9):
+        store_or_zero(g_extra + 9 * index + k, entries[k], seen, inside)
+
+
 @triton.jit(do_not_specialize=["count", "units", "pairs"])
 def backproject(
     gaussians,
@@ -293,8 +305,8 @@ def backproject(
     """Write the ``gradients`` of Gaussians that are seen: those with a row in ``where`` (`Rows`).
 
     Other gradients are not changed, except that ``g_screen``, ``g_absolute`` and ``g_extra``
-    become 0. ``EXTRA`` is the function that writes ``g_extra``, for example that of
-    `raster.triton.splitting`, or None. See `lists_fit` for ``status``, ``units`` and ``pairs``.
+    become 0. ``EXTRA`` is the function that writes ``g_extra``, such as `store_splitting`, or None.
+    See `lists_fit` for ``status``, ``units`` and ``pairs``.
     """
     v = load_camera(camera)
     index = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
