@@ -5,14 +5,11 @@ is that of `gsbench.eval.ssim`: images are padded with zeros, and the result is 
 whole map, as in the reference code of 3DGS.
 """
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from gsbench.eval.images import as_unit_range
 from gsbench.eval.ssim import ssim_map
@@ -47,47 +44,6 @@ def photometric_loss(
     it has threads and reuses memory.
     """
     return PhotometricLoss(ssim_weight, threads=1)(image, target)
-
-
-class Compiled(ABC):
-    """The loss of float32 images by kernels that know its gradient."""
-
-    def __call__(self, image: Tensor, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        if target.dtype != torch.uint8:
-            target = target.to(torch.float32)
-        loss, l1, similarity = _Differentiable.apply(self, image, target.contiguous())
-        return loss, l1, similarity
-
-    @abstractmethod
-    def compute(
-        self, image: Tensor, target: Tensor, differentiate: bool
-    ) -> tuple[Tensor, Tensor | None]:
-        """Return loss, L1 and SSIM, [3], and the loss's gradient by ``image``, if wanted.
-
-        ``image`` and ``target``, which is uint8 or float32, are contiguous.
-        """
-
-
-class _Differentiable(torch.autograd.Function):
-    """Computes the gradient in ``forward``; ``backward`` only scales it."""
-
-    @staticmethod
-    def forward(ctx: Any, compiled: Compiled, image: Tensor, target: Tensor) -> tuple[Tensor, ...]:
-        pixels, wanted = image.detach().contiguous(), ctx.needs_input_grad[1]
-        values, ctx.gradient = compiled.compute(pixels, target, wanted)
-        loss, *shown = values.unbind()
-        ctx.mark_non_differentiable(*shown)
-        ctx.set_materialize_grads(False)
-        return loss, *shown
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, g_loss: Tensor | None, *_: None) -> tuple[None, Tensor | None, None]:
-        if g_loss is None or ctx.gradient is None:
-            return None, None, None
-        # On a GPU, a look at the factor would wait for the device.
-        is_one = g_loss.device.type == "cpu" and float(g_loss) == 1.0
-        return None, ctx.gradient if is_one else ctx.gradient * g_loss, None
 
 
 class PhotometricLoss:

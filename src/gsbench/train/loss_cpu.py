@@ -22,10 +22,9 @@ from gsbench.raster.cpu.simd import (
     store,
 )
 from gsbench.raster.cpu.workspace import ArenaPool, ShardRunner, TensorPool
-from gsbench.raster.staged import Lifetime
+from gsbench.raster.staged import KernelLoss, Lifetime
 from gsbench.system.jit import inlined, kernel
 from gsbench.system.resources import available_cores
-from gsbench.train.loss import Compiled
 
 SHARDS = 8  # runs of rows; each shard filters ten rows of its neighbours, too
 CHANNELS = 3
@@ -240,7 +239,7 @@ def gradient_rows(
         _write_row(line, center, numbers, gradient)
 
 
-class CompiledLoss(Compiled):
+class CompiledLoss(KernelLoss):
     """Calls the CPU kernels with threads and pooled memory; see ``loss.PhotometricLoss``."""
 
     def __init__(self, ssim_weight: float, threads: int | None) -> None:
@@ -252,7 +251,7 @@ class CompiledLoss(Compiled):
     def compute(
         self, image: Tensor, target: Tensor, differentiate: bool
     ) -> tuple[Tensor, Tensor | None]:
-        """See `gsbench.train.loss.Compiled`."""
+        """See `gsbench.raster.staged.KernelLoss`."""
         height, width, _ = image.shape
         numbers = image.numel()
         pixels, wanted = (pixels.numpy().reshape(-1) for pixels in (image, target))

@@ -18,9 +18,8 @@ from torch import Tensor
 
 from gsbench.eval.ssim import C1, C2, WINDOW_RADIUS, window
 from gsbench.raster.executors import load_driver
-from gsbench.raster.staged import Lifetime
+from gsbench.raster.staged import KernelLoss, Lifetime
 from gsbench.raster.triton.launch import Workspace, WorkspacePool, launch_grid
-from gsbench.train.loss import Compiled
 
 STRIP = 128  # numbers of a row per program
 MIN_ROWS = 8  # rows per program
@@ -243,7 +242,7 @@ def differentiate(
         tl.store(gradient + center * numbers + number, sign - ssim_factor * similarity, mask=inside)
 
 
-class TritonLoss(Compiled):
+class TritonLoss(KernelLoss):
     """Calls the kernels with pooled memory; see ``loss.PhotometricLoss``.
 
     Results have the same bits on every run on one GPU.
@@ -256,7 +255,7 @@ class TritonLoss(Compiled):
     def compute(
         self, image: Tensor, target: Tensor, differentiate: bool
     ) -> tuple[Tensor, Tensor | None]:
-        """See `gsbench.train.loss.Compiled`."""
+        """See `gsbench.raster.staged.KernelLoss`."""
         if image.device.type == "cuda":
             load_driver()
         holder = Lifetime()

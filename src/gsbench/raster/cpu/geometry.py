@@ -4,7 +4,6 @@ The harmonics of 16 Gaussians are a 16x16 matrix with one row per basis function
 kernels transpose it into one row per Gaussian and multiply that by the coefficients.
 """
 
-import math
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,9 @@ from gsbench.raster import formulas
 from gsbench.raster.cpu.shuffle import transpose
 from gsbench.raster.cpu.simd import (
     LANES,
+    ceil,
     exp2,
+    floor,
     gather_fours,
     load,
     maximum,
@@ -26,7 +27,7 @@ from gsbench.raster.cpu.simd import (
 )
 from gsbench.system.jit import inlined
 
-LOG2_E = 1.0 / math.log(2.0)
+LOG2_E = formulas.LOG2_E
 # Beyond this, exp2 is undefined. The variance of a scale of 2^126 is not finite, so such a Gaussian
 # is culled.
 MAX_LOG2 = 126.0
@@ -39,7 +40,13 @@ MATRIX = LANES * LANES
 
 
 OF_VECTORS = formulas.compiled(
-    inlined, select=select, minimum=minimum, maximum=maximum, square_root=square_root
+    inlined,
+    select=select,
+    minimum=minimum,
+    maximum=maximum,
+    square_root=square_root,
+    floor=floor,
+    ceil=ceil,
 )
 dot, stretched = OF_VECTORS.dot, OF_VECTORS.stretched
 

@@ -15,7 +15,7 @@ from gsbench.raster.cpu.geometry import (
     F0,
     LOG2_E,
     MATRIX,
-    clamped_slopes,
+    contour_range,
     covariance_gradients,
     direction_gradient,
     dot,
@@ -24,18 +24,20 @@ from gsbench.raster.cpu.geometry import (
     fill_basis,
     from_camera,
     gather_quaternions,
+    image_axes,
     image_rows,
     normalized,
     plus,
     position_gradient,
     quaternion_gradient,
-    rotation_matrix,
+    radius_of,
+    record_entries,
     scaled,
     splitting_entries,
     spread,
     stretched,
     through,
-    times,
+    tile_range,
     view_axes,
 )
 from gsbench.raster.cpu.shuffle import (
@@ -53,8 +55,6 @@ from gsbench.raster.cpu.shuffle import (
 from gsbench.raster.cpu.simd import (
     LANES,
     absolute,
-    ceil,
-    floor,
     gather_numbers,
     gather_vectors,
     load,
@@ -74,35 +74,16 @@ from gsbench.raster.cpu.simd import (
 from gsbench.raster.staged import MIN_QUATERNION_NORM
 from gsbench.system.jit import inlined, kernel
 
-NEAR, SIGMA_EXTENT = CONSTANTS.near, CONSTANTS.sigma_extent
+NEAR = CONSTANTS.near
 ALPHA_MIN, LOG2_ALPHA_MIN = CONSTANTS.alpha_min, math.log2(CONSTANTS.alpha_min)
-MAX_RADIUS, MAX_CENTER = CONSTANTS.max_radius, CONSTANTS.max_center
-MAX_VARIANCE, CONTOUR_MARGIN = CONSTANTS.max_variance, CONSTANTS.contour_margin
+MAX_CENTER, MAX_VARIANCE = CONSTANTS.max_center, CONSTANTS.max_variance
 ZERO, HALF, ONE, TWO, FOUR = (np.float32(value) for value in (0, 0.5, 1, 2, 4))
 
 AHEAD = 16  # records ahead that the backward pass prefetches
 FAR = 64  # Gaussians ahead whose harmonics are prefetched
 ALL_LANES = np.uint64((1 << LANES) - 1)
-EIGENVALUE_FLOOR = CONSTANTS.eigenvalue_floor
 # entries of a shard's flags: number of visible Gaussians; 1 if a value is bad
 VISIBLE, BAD_VALUE = 0, 1
-
-
-@inlined
-def _tile_range(low, high, tiles):
-    """First and past-the-last tile for the pixels ``low`` to ``high`` - 1, within the grid."""
-    first = floor(minimum(maximum(low * (1.0 / at.TILE), ZERO), np.float32(tiles)))
-    past = floor(
-        minimum(maximum((high + (at.TILE - 1)) * (1.0 / at.TILE), ZERO), np.float32(tiles))
-    )
-    return first, past
-
-
-@inlined
-def _contour_range(center, half, tiles):
-    """The tiles of the pixels within ``half`` px of ``center``, with a margin for rounding."""
-    half = half * (1 + CONTOUR_MARGIN) + CONTOUR_MARGIN
-    return _tile_range(ceil(center - half), floor(center + half) + ONE, tiles)
 
 
 @kernel
@@ -150,24 +131,22 @@ def _project(floats, indices, begin, end, gaussians, degree, v, outputs):
         offset = from_camera(mean, v)
         x, y, z = through(view_axes(v), offset)
         inverse_z = ONE / z
-        column = x * inverse_z * v.fx + v.pixel_cx
-        row = y * inverse_z * v.fy + v.pixel_cy
+        free_x, free_y = x * inverse_z, y * inverse_z
+        column, row = free_x * v.fx + v.pixel_cx, free_y * v.fy + v.pixel_cy
         visible = (z > NEAR) & (absolute(column) < MAX_CENTER) & (absolute(row) < MAX_CENTER)
         if mask_bits(visible) == 0:
             for i in range(start, start + count):
                 radii[i] = 0
             continue
 
-        # The covariance on the image is M M^T + blur I with M = J W R S (3DGS eq. 5 and 6).
-        slope_x, slope_y = clamped_slopes(x * inverse_z, y * inverse_z, v)
-        axis_x, axis_y = image_rows(slope_x, slope_y, inverse_z, v)
-        scales, matrix = exponentials(log_scale), rotation_matrix(quaternion)
-        m0, m1 = scaled(times(axis_x, matrix), scales), scaled(times(axis_y, matrix), scales)
+        _, n0, n1 = image_axes(free_x, free_y, inverse_z, quaternion, v)
+        scales = exponentials(log_scale)
+        m0, m1 = scaled(n0, scales), scaled(n1, scales)
         visible = visible & (dot(m0, m0) + dot(m1, m1) < MAX_VARIANCE)
         xx, xy, yy, a = spread(m0, m1)
-        radius = _radius(xx, xy, yy)
-        first_x, past_x = _tile_range(column - radius, column + radius, v.tiles_x)
-        first_y, past_y = _tile_range(row - radius, row + radius, v.tiles_y)
+        radius = radius_of(xx, xy, yy)
+        first_x, past_x = tile_range(column - radius, column + radius, v.tiles_x, at.TILE)
+        first_y, past_y = tile_range(row - radius, row + radius, v.tiles_y, at.TILE)
         visible = visible & (first_x < past_x) & (first_y < past_y)
         store(scratch, 0, select(visible, radius, ZERO))
         for lane in range(count):
@@ -178,8 +157,8 @@ def _project(floats, indices, begin, end, gaussians, degree, v, outputs):
         opacity = ONE / (exponential(-logit) + ONE)
         log2_opacity = log2(maximum(opacity, ALPHA_MIN))
         reach = maximum((log2_opacity - LOG2_ALPHA_MIN) * (2 / LOG2_E), ZERO)
-        inner_x, outer_x = _contour_range(column, square_root(reach * xx), v.tiles_x)
-        inner_y, outer_y = _contour_range(row, square_root(reach * yy), v.tiles_y)
+        inner_x, outer_x = contour_range(column, square_root(reach * xx), v.tiles_x, at.TILE)
+        inner_y, outer_y = contour_range(row, square_root(reach * yy), v.tiles_y, at.TILE)
         first_x, past_x = maximum(first_x, inner_x), minimum(past_x, outer_x)
         first_y, past_y = maximum(first_y, inner_y), minimum(past_y, outer_y)
         seen = visible & (opacity > ALPHA_MIN) & (first_x < past_x) & (first_y < past_y)
@@ -187,22 +166,16 @@ def _project(floats, indices, begin, end, gaussians, degree, v, outputs):
         if todo == 0:
             continue
 
-        red, green, blue = _color(degree, dc, offset, todo, start, gaussians.sh_rest, floats)
+        rgb = _color(degree, dc, offset, todo, start, gaussians.sh_rest, floats)
+        red, green, blue = rgb
         bad += select(seen, (red + green + blue) * ZERO, ZERO)
         clamped = select(red < ZERO, splat(ONE), ZERO)
         clamped += select(green < ZERO, splat(TWO), ZERO) + select(blue < ZERO, splat(FOUR), ZERO)
 
+        curve_y = (-0.5 * LOG2_E) / yy
         # One vector per entry of a record, in the order of `layout`; one row per Gaussian of them.
         entries = (
-            column,
-            row,
-            -xy / yy,
-            a * (-0.5 * LOG2_E),
-            (-0.5 * LOG2_E) / yy,
-            log2_opacity,
-            maximum(ZERO, red),  # NaN stays
-            maximum(ZERO, green),
-            maximum(ZERO, blue),
+            *record_entries(column, row, -xy / yy, a, curve_y, log2_opacity, rgb),
             xy / xx,
             xy * square_root(reach / xx),
             z,
@@ -228,17 +201,6 @@ def _prefetch_harmonics(sh_rest, begin, end):
 @inlined
 def _zero_if_finite(vector):
     return vector[0] * ZERO + vector[1] * ZERO + vector[2] * ZERO
-
-
-@inlined
-def _radius(xx, xy, yy):
-    """ceil(3 sqrt(largest eigenvalue)), px, as preprocessCUDA of 3DGS computes it.
-
-    The discriminant (trace / 2)^2 - det is written as a sum of squares, so it is never negative.
-    """
-    half = (xx - yy) * HALF
-    largest = (xx + yy) * HALF + square_root(maximum(half * half + xy * xy, EIGENVALUE_FLOOR))
-    return minimum(ceil(square_root(largest) * SIGMA_EXTENT), MAX_RADIUS)
 
 
 @inlined
@@ -444,14 +406,11 @@ def _backproject(memory, record, past, origin, gaussians, degree, frame, rows, o
 
     # Repeat the geometry of the forward pass.
     quaternion, inverse_norm, _ = gather_quaternions(gaussians.quaternions, indices)
-    matrix = rotation_matrix(quaternion)
     x, y, z = through(view_axes(v), offset)
     inverse_z = ONE / z
     free_x, free_y = x * inverse_z, y * inverse_z
-    slope_x, slope_y = clamped_slopes(free_x, free_y, v)
-    axis_x, axis_y = image_rows(slope_x, slope_y, inverse_z, v)
+    matrix, n0, n1 = image_axes(free_x, free_y, inverse_z, quaternion, v)
     scales = exponentials(log_scale)
-    n0, n1 = times(axis_x, matrix), times(axis_y, matrix)
     _, xy, yy, a = spread(scaled(n0, scales), scaled(n1, scales))
     e, shear = ONE / yy, -xy / yy  # power = -(a t^2 + e dy^2) / 2, t = dx + shear dy
 
