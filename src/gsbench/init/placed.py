@@ -71,7 +71,7 @@ class PlacedCloud(Initializer):
 
     def build(self, given: tuple[Capture, Path, Path | None], progress: Progress) -> InitReport:
         """Write the model and the report; runs in the isolated process."""
-        from gsbench.init.colmap.reconstruct import load_reference
+        from gsbench.init.colmap.models import load_reference
         from gsbench.init.report import make_report, write_result
 
         capture, output_dir, reference = given
@@ -137,7 +137,7 @@ class Dataset(PlacedCloud):
         self, model: pycolmap.Reconstruction, capture: Capture, output_dir: Path
     ) -> TrainingPoints | None:
         from gsbench.init.colmap.database import readable_images
-        from gsbench.init.colmap.reconstruct import keep_training_points
+        from gsbench.init.colmap.models import keep_training_points
 
         if model.num_points3D() == 0:
             raise InputError(
@@ -168,7 +168,7 @@ class Random(PlacedCloud):
     seed: Seed = 0  # of positions and colours
 
     def cloud(self, capture: Capture, model: pycolmap.Reconstruction) -> PointCloud:
-        from gsbench.init.colmap.alignment import training_centers, training_extent
+        from gsbench.init.colmap.models import training_centers, training_extent
 
         extent = training_extent(model, capture)
         if extent == 0:
