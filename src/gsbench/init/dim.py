@@ -19,6 +19,7 @@ from gsbench.init.colmap.pairs import STRONGEST, proposed_pairs
 from gsbench.init.options import ImageSize, MatchRatio
 from gsbench.init.reconstruction import Facts, Job, Reconstruction
 from gsbench.logs import Progress
+from gsbench.parsing import table_beside
 from gsbench.scene.masks import read_mask
 from gsbench.scene.types import Capture
 from gsbench.settings import AnyPath, Fraction
@@ -36,48 +37,11 @@ CACHE_BYTES = 1 << 30  # of descriptors kept in memory while pairs are matched
 BYTES_OF_KEYPOINT = 1024  # at most: 256 numbers of single precision
 SUPERPOINT_LICENCE = "Magic Leap: academic or non-profit noncommercial research use only"
 
-EXTRACTOR_WEIGHTS = {
-    "superpoint": WeightsFile(
-        (
-            "superpoint.safetensors",
-            "superpoint/model.safetensors",
-            "lightglue_superpoint/model.safetensors",
-        ),
-        "https://huggingface.co/magic-leap-community/superpoint/resolve/main/model.safetensors",
-    ),
-    "disk": WeightsFile(  # Apache-2.0
-        ("depth-save.pth",),
-        "https://raw.githubusercontent.com/cvlab-epfl/disk/master/depth-save.pth",
-        "9c2ee4ded238892dfa51569941372601e35e4a74aa6f84ea80053d2ab1c07abe",
-    ),
-}
-ALIKED_WEIGHTS = {  # BSD-3-Clause
-    model: WeightsFile(
-        (f"aliked-{model}.pth",),
-        f"https://github.com/Shiaoming/ALIKED/raw/main/models/aliked-{model}.pth",
-        sha256,
-    )
-    for model, sha256 in {
-        "n16": "5be8704840ed662d9d8c561bf7279c222092674e7eb05fd0feab94899e9d82f2",
-        "n16rot": "ddf3abbf38e86f6a74540d214e1a9712c54b2d8551abc864542199f2347d7332",
-        "n32": "055283fd1624d3ab46a05c3b617b1a79a3f28d1f551737eef2d653e8c8232890",
-        "t16": "56782336919db220144a884e710e2b6af13b3b8f8da15b915a239078ab471085",
-    }.items()
-}
-LIGHTGLUE_WEIGHTS = {  # Apache-2.0
-    extractor: WeightsFile(
-        # kornia and cvg/LightGlue use the first name, with "-pth", in the torch hub cache
-        (f"{extractor}_lightglue_v0-1_arxiv-pth", f"{extractor}_lightglue.pth"),
-        f"https://github.com/cvg/LightGlue/releases/download/v0.1_arxiv/{extractor}_lightglue.pth",
-        sha256,
-    )
-    for extractor, sha256 in {
-        "superpoint": None,
-        "disk": "b5b21d47ea24f2c5e501aec9c91b9716e4c8c3429a4dc1e615c133c4c9378335",
-        "aliked": "d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503",
-    }.items()
-}
-
+# the files of extractors and of LightGlue, by name
+EXTRACTOR_WEIGHTS, LIGHTGLUE_WEIGHTS = (
+    {name: WeightsFile(**row | {"names": tuple(row["names"])}) for name, row in rows.items()}
+    for rows in table_beside(__file__, "weights.yaml").values()
+)
 Extractor = Literal["superpoint", "aliked", "disk"]
 Matcher = Literal["lightglue", "mutual_nearest"]
 AlikedModel = Literal["n16", "n16rot", "n32", "t16"]
@@ -158,16 +122,11 @@ class Dim(Reconstruction):
     @property
     def _weights(self) -> tuple[list[WeightsFile], Path | None]:
         """The files, and the folder that is searched first."""
-        aliked = self.extractor == "aliked"
-        files = [ALIKED_WEIGHTS[self.aliked_model] if aliked else EXTRACTOR_WEIGHTS[self.extractor]]
+        model = f"-{self.aliked_model}" if self.extractor == "aliked" else ""
+        files = [EXTRACTOR_WEIGHTS[self.extractor + model]]
         if self.matcher == "lightglue":
             files.append(LIGHTGLUE_WEIGHTS[self.extractor])
         return files, None if self.weights is None else Path(self.weights).expanduser()
-
-    @property
-    def packages(self) -> tuple[str, ...]:
-        own = ("transformers",) if self.extractor == "superpoint" else ()
-        return *super().packages, "torch", "kornia", *own
 
     def check(self, capture: Capture, reference: Path | None) -> None:
         super().check(capture, reference)
@@ -217,6 +176,7 @@ class Dim(Reconstruction):
             "counts": counts,
             "settings": self.extraction | self.matching | {"weights_sha256": named},
             "warnings": [lack] if empty else [],
+            "packages": ["torch", "kornia", *["transformers"] * (self.extractor == "superpoint")],
         }
 
     def _store(self, job: Job, weights: Sequence[Path], digests: Sequence[str]) -> FeatureStore:

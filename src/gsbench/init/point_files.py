@@ -138,13 +138,14 @@ def _points_and_colors(columns: Columns, path: Path) -> tuple[Array, NDArray[np.
     """
 
     def stacked(names: Iterable[str]) -> NDArray[np.generic]:
-        return np.stack([columns[known.get(name, name)] for name in names], axis=1)
+        return np.stack([known[name] for name in names], axis=1)
 
-    known = {_plain(name): name for name in columns} | {name.lower(): name for name in columns}
+    known = {_plain(name): column for name, column in columns.items()}
+    known |= {name.lower(): column for name, column in columns.items()}
     if lacking := [name for name in "xyz" if name not in known]:
         raise ValueError(f"it has no column {', '.join(lacking)}: {REMEDY}")
     points = stacked("xyz").astype(np.float64)
-    if columns.keys() >= {*DC_NAMES}:  # a model of Gaussians
+    if known.keys() >= {*DC_NAMES}:  # a model of Gaussians
         dc = stacked(DC_NAMES).astype(np.float64)
         return points, np.clip(0.5 + SH_C0 * dc, 0.0, 1.0)  # NaN stays; `read_points` refuses it
     for group in COLOR_NAMES:

@@ -58,17 +58,11 @@ class Job:
 class Reconstruction(ColmapOptions):
     """Base of the initialisers that reconstruct; subclasses differ in features and matches."""
 
-    @property
-    def packages(self) -> tuple[str, ...]:
-        """The packages whose versions are in the report."""
-        return "pycolmap", "numpy"
-
     @abstractmethod
     def fill(self, job: Job, task: DatabaseTask, progress: Progress, timer: Timer) -> Facts:
         """Write features, matches and verified geometries into the database.
 
-        Returns ``counts``, ``warnings`` and ``settings`` for the report. It runs in COLMAP's
-        process.
+        Returns ``counts`` and more for the report. It runs in COLMAP's process.
         """
 
     def check(self, capture: Capture, reference: Path | None) -> None:
@@ -167,7 +161,6 @@ def build_model(job: Job, progress: Progress) -> InitReport:
         options.name,
         capture=capture,
         model=model,
-        packages=options.packages,
         settings={**asdict(options), **facts.pop("settings", {})},
         seconds=timer.rounded(),
         **facts,

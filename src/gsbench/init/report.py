@@ -27,12 +27,12 @@ def make_report(
     poses: str,
     capture: Capture,
     model: pycolmap.Reconstruction,
-    packages: Sequence[str],
+    packages: Sequence[str] = (),
     warnings: Sequence[str] = (),
     scale_to_reference: float | None = None,
     **further: Any,
 ) -> InitReport:
-    """The report on ``model``, with versions of ``packages`` and further fields."""
+    """The report on ``model``, with versions of its ``packages``, and further fields."""
     placed = posed_images(model)
     observed = any(point.track.length() > 0 for point in model.points3D.values())
     report = InitReport(
@@ -48,7 +48,9 @@ def make_report(
             camera.mean_focal_length() for _, camera in sorted(model.cameras.items())
         ),
         gauge=measure_gauge(training_extent(model, capture), scale_to_reference),
-        versions={package: metadata.version(package) for package in packages},
+        versions={
+            package: metadata.version(package) for package in ("pycolmap", "numpy", *packages)
+        },
         **further,
     )
     odd = find_oddities(report, model, capture)

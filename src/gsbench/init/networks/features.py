@@ -105,8 +105,9 @@ class FeatureStore:
         path = self.features_path(name)
         with suppress(*DAMAGE), np.load(path, allow_pickle=False) as data:
             width, height, own_width, own_height = (int(side) for side in data["sizes"])
-            sizes = {"network_size": (width, height), "file_size": (own_width, own_height)}
-            return Features(**{name: data[name] for name in ARRAYS}, **sizes)
+            arrays = {name: data[name] for name in ARRAYS}
+            own = own_width, own_height
+            return Features(**arrays, network_size=(width, height), file_size=own)
         found = self._extract(name)
         both = np.array([*found.network_size, *found.file_size])
         with atomic(path, sync=False) as temporary, temporary.open("wb") as file:
