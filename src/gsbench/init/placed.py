@@ -192,7 +192,8 @@ def points_in_view(
     local, camera = image.cam_from_world() * points, model.cameras[image.camera_id]
     pixels = np.asarray(camera.img_from_cam(local))  # [P, 2]; NaN behind the camera
     with np.errstate(invalid="ignore"):
-        (seen,) = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1).nonzero()
+        inside = (pixels >= 0) & (pixels < (camera.width, camera.height))
+    (seen,) = np.nonzero(inside.all(axis=1))
     return seen, pixels[seen], np.linalg.norm(local[seen], axis=1)
 
 
