@@ -5,6 +5,7 @@ photograph>.png``, beside ``info.json`` (`save_predictions` of nerfbaselines 1.2
 has them in ``predictions/``.
 """
 
+import shutil
 import tarfile
 import tempfile
 import zipfile
@@ -21,7 +22,6 @@ from gsbench.words import readable_bytes
 RENDERED, PHOTOGRAPHS = "color", "gt-color"
 # Archives may come from strangers: this stops one that unpacks to far more than test views need.
 MAX_TOTAL_BYTES = 20 << 30
-CHUNK = 1 << 20
 PNG = ".png"
 
 
@@ -86,12 +86,13 @@ def _unpack(archive: Path, scratch: Path) -> None:
                 for member in tar
                 if member.isfile()
             }
-        for name, target in _wanted(archive, {key: files[key][0] for key in files}).items():
-            size, open_file = files[name]
-            content = open_file()
+        for name, place in _wanted(archive, {key: files[key][0] for key in files}).items():
+            (scratch / place).parent.mkdir(parents=True, exist_ok=True)
+            content = files[name][1]()
             assert content is not None  # of a regular file
-            with content:
-                _write(content, scratch / target, size)
+            # At most the size that the archive says is unpacked, and a wrong size is an error.
+            with content, (scratch / place).open("wb") as file:
+                shutil.copyfileobj(content, file)
 
 
 def _wanted(archive: Path, sizes: dict[str, int]) -> dict[str, Path]:
@@ -123,16 +124,3 @@ def _wanted(archive: Path, sizes: dict[str, int]) -> dict[str, Path]:
             f"{readable_bytes(MAX_TOTAL_BYTES)}"
         )
     return both[0]
-
-
-def _write(source: IO[bytes], target: Path, size: int) -> None:
-    """Copy exactly ``size`` bytes; raises ValueError for a member with more or fewer."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with target.open("wb") as file:
-        left = size
-        while left and (piece := source.read(min(CHUNK, left))):
-            file.write(piece)
-            left -= len(piece)
-        # A small number in the directory of an archive may hide gigabytes.
-        if left or source.read(1):
-            raise ValueError(f"{target.name} has another size than the archive says")
