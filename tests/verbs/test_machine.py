@@ -191,7 +191,6 @@ def test_options_of_a_proof_need_prove(tmp_path, words, message):
         ("--count 0", "--count: must be a whole number in "),
         ("--count 5,x", "--count: must be a whole number in "),
         ("--ply nowhere.ply", "nowhere.ply does not exist"),
-        ("--kernels", "has no place in the table: add --json"),
         ("--raster cpu,auto", "name those to time"),
     ],
 )

@@ -41,8 +41,11 @@ def opened_renders(place: Path) -> Iterator[tuple[Path, Path | None]]:
     if not place.exists():
         raise InputError(f"{place} is not a folder of renders")
     require_regular(place)
-    if kind := _kind_of(place):
-        raise InputError(f"{place} is {kind}")
+    with place.open("rb") as file:
+        start = file.read(len(GIT_LFS))
+    for first, kind in OTHERS.items():
+        if start.startswith(first):
+            raise InputError(f"{place} is {kind}")
     with tempfile.TemporaryDirectory(prefix="gsbench-") as scratch:
         try:
             _unpack(place, Path(scratch))
@@ -59,12 +62,6 @@ MODEL = "a model: gsbench scene=SCENE init=ply init.path=FILE train=none densify
 PICTURE = "one picture: give its folder"
 # By the first bytes of a file that is no archive: what it is, and what to do.
 OTHERS = {GIT_LFS: LFS_REMEDY, b"ply": MODEL, b"\x89PNG": PICTURE, b"\xff\xd8": PICTURE}
-
-
-def _kind_of(place: Path) -> str:
-    with place.open("rb") as file:
-        start = file.read(len(GIT_LFS))
-    return next((kind for first, kind in OTHERS.items() if start.startswith(first)), "")
 
 
 def _unpack(archive: Path, scratch: Path) -> None:
