@@ -172,6 +172,17 @@ ROWS = {
         Facts(color_spread=0.9, first_color=(9, 9, 9)),
         r"the colour \(9, 9, 9\)",
     ),
+    **{
+        name: (value(0), value(1), said)
+        for name, said in {
+            "transparent-render": r"1 render with transparent pixels .* \(a.png\)",
+            "lossy-render": "1 render compressed as JPEG",
+            "palette-render": "1 render with a palette",
+            "grey-render": "1 render in grey",
+            "turned": "1 photograph of another EXIF orientation",
+            "transparent-photograph": "1 photograph with transparent pixels, which are blended",
+        }.items()
+    },
 }
 
 
@@ -193,7 +204,7 @@ def test_a_rule_is_silent_up_to_its_limit_and_names_what_is_beyond(name):
 
 
 RULE = Rule(
-    "odd", "read", lambda raw: raw, (0, 1), "{value:g} of {names:few}", "take {low}", (0, 2)
+    "odd", lambda raw: raw, (0, 1), "read", "{value:g} of {names:few}", "take {low}", (0, 2)
 )
 
 
