@@ -91,8 +91,10 @@ def _flip(ppd: float, image: Tensor, truth: Tensor, mask: Tensor | None) -> floa
 def _lpips(network: Lpips, raw: bool, image: Tensor, truth: Tensor, mask: Tensor | None) -> float:
     """LPIPS by one network, fed [-1, 1] as it is defined, or [0, 1] if ``raw``."""
     _require_size(image, network.backbone.min_size)
-    pair = as_batch(image), as_batch(truth)  # [1, 3, H, W] each
-    return float(network(*(pair if raw else (2 * one - 1 for one in pair)), mask))
+    first, second = as_batch(image), as_batch(truth)  # [1, 3, H, W] each
+    if not raw:
+        first, second = 2 * first - 1, 2 * second - 1
+    return float(network(first, second, mask))
 
 
 def _structural(

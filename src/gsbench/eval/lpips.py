@@ -48,6 +48,7 @@ class Backbone:
         modules: list[nn.Module] = []
         widths, channels = [], 3  # behind each module
         for layer in self.layers:
+            added: list[nn.Module]
             match layer:
                 case str():
                     added = [POOLS[layer]]
@@ -56,8 +57,9 @@ class Backbone:
                     channels = 2 * expanded
                 case _:
                     plain = [layer, 3, 1, 1] if isinstance(layer, int) else layer
-                    convolution = nn.Conv2d(channels, *plain)
-                    added, channels = [convolution, nn.ReLU(inplace=True)], plain[0]
+                    width, size, stride, padding = plain
+                    convolution = nn.Conv2d(channels, width, size, stride, padding)
+                    added, channels = [convolution, nn.ReLU(inplace=True)], width
             modules += added
             widths += [channels] * len(added)
         return nn.Sequential(*modules), [widths[tap] for tap in self.taps]

@@ -52,8 +52,10 @@ def look_at(path: Path) -> Look:
             is_webp = file.read(16)[12:] == LOSSY_WEBP
         try:
             orientation = int(image.getexif().get(EXIF_ORIENTATION, 1))
-            alphas = image.convert("RGBA").getchannel("A") if image.has_transparency_data else None
-            transparent = alphas is not None and alphas.getextrema()[0] < 255
+            transparent = image.has_transparency_data
+            if transparent:
+                alphas = np.asarray(image.convert("RGBA").getchannel("A"))
+                transparent = bool((alphas < 255).any())
         except DAMAGE as error:
             raise InputError(
                 f"{path}: the image is damaged ({error}): replace or remove it"
