@@ -10,11 +10,12 @@ from PIL import Image
 from gsbench.config.compose import compose_one
 from gsbench.runs.config_hash import arm_hash, config_hash
 from gsbench.runs.store import Store
+from gsbench.runs.trial_record import TwinViews
 from gsbench.scene import rules
 from gsbench.scene.load import load_scene
 from gsbench.scene.options import SceneConfig
 from gsbench.scene.rules import BY_ID, RULES, Finding, Rule, check_accept, inspect
-from gsbench.scene.types import Camera, Scene, Twins, View
+from gsbench.scene.types import Camera, Scene, View
 from gsbench.verbs.machine import doctor
 from tests.helpers import refusal
 from tests.scene.captures import read_colmap, read_photos
@@ -31,7 +32,7 @@ def views(places=(-1.0, 0.0, 1.0, 2.0), level=200, **changes):
 
 
 def scene(twins=None, **changes):
-    return Scene("toy", views(**changes), views((0.5,)), twins=twins or Twins())
+    return Scene("toy", views(**changes), views((0.5,)), twins=twins or TwinViews())
 
 
 def value(number, **facts):
@@ -100,12 +101,12 @@ ROWS = {
     ),
     "copies-in-pixels": (
         scene(),
-        scene(Twins(left_out={"a": "b"})),
+        scene(TwinViews(left_out={"a": "b"})),
         r"1 training view left out, .*: a \(b is used\)",
     ),
     "near-twins": (
         scene(),
-        scene(Twins(near={"a": "b"})),
+        scene(TwinViews(near={"a": "b"})),
         r"1 of 1 test view with a near twin in training: a \(b\)",
     ),
     "far-camera": (
