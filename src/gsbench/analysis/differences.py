@@ -7,17 +7,17 @@ ADC. All are read from the trials' recorded configurations and code.
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
+
+import yaml
 
 from gsbench.analysis.notes import Note
 from gsbench.analysis.results import Arm, TrialPair, TrialResult, group_by
 from gsbench.analysis.trial_result import Trained, canonical
 from gsbench.gaussians.paper_values import RATES
-from gsbench.runs.config_hash import (
-    is_ignored,
-    is_ingredient,
-    is_of_scene,
-)
+from gsbench.parsing import LOADER
+from gsbench.runs.config_hash import is_ignored, is_ingredient, is_of_scene
 from gsbench.runs.freshness import Part
 from gsbench.runs.nested import SHOWN
 from gsbench.words import counted, some_of
@@ -31,58 +31,16 @@ ELSEWHERE = "a training elsewhere, which left no record"
 BY_PROGRAM = "everything that the program {} does differently"
 TARGET, INITIAL_CLOUD = "densify._target_", "initial cloud"
 
-# Ingredients that consist of several settings. Every other setting is an ingredient of its own,
-# named by its key without ``densify.``.
-INGREDIENT_NAMES = {
-    "densify.gradient_threshold": "threshold",
-    "densify.threshold_inclusive": "threshold",
-    **{f"densify.{key}": "schedule" for key in ("start", "stop", "interval")},
-    **{
-        f"train.{key}": "schedule"
-        for key in ("densify_start", "densify_stop", "densify_interval", "mcmc_stop")
-    },
-    **{
-        f"densify.{key}": "opacity reset"
-        for key in ("opacity_reset_interval", "opacity_reset_value")
-    },
-    "train.opacity_reset_interval": "opacity reset",
-    "train.resolution_schedule": "resolution schedule",
-    **{f"densify.{key}": "budget" for key in ("max_gaussians", "cap", "governor_dimension")},
-    **{
-        f"densify.{key}": "prunings"
-        for key in ("prune_opacity", "prune_size", "prune_screen_radius")
-    },
-    **{f"init.{key}": "cameras" for key in ("poses", "align")},
-    **{f"train.{key}": "learning rates" for key in RATES},
+TABLES: dict[str, dict[str, list[str]]] = yaml.load(
+    Path(__file__).with_name("ingredients.yaml").read_text("utf-8"), LOADER
+)
+DEPARTURES = TABLES["departures"]  # by the densifier's class
+INGREDIENT_NAMES = {f"train.{key}": "learning rates" for key in RATES} | {
+    key: name for name, keys in TABLES["settings"].items() for key in keys
 }
 # Conditions and settings that each scene may have for itself. The settings of a budget are not
 # among them, so that a note says where it differs. Iterations are a condition already.
 OF_A_SCENE = ("resolution", "data", "budget")
-
-# The ingredients in which each densifier class departs from ADC, beside its settings. They are not
-# attributes of the classes, since importing those loads torch. Another class is one ingredient.
-DEPARTURES: dict[str, tuple[str, ...]] = {
-    "gsbench.densify.AbsGS": ("absolute gradient for splits", "ceiling on opacities"),
-    "gsbench.densify.ADC": (),
-    "gsbench.densify.EdgeAware": ("split", "edge score", "prunings"),
-    "gsbench.densify.FastGS": (
-        "absolute gradient for splits",
-        "ceiling on opacities",
-        "error score",
-        "last prunings",
-    ),
-    "gsbench.densify.GNS": ("split", "edge score", "prunings", "natural selection"),
-    "gsbench.densify.LongAxis": ("split",),
-    "gsbench.densify.MCMC": ("relocation", "growth by a share", "noise", "regularisation"),
-    "gsbench.densify.MRNF": ("edge score", "growth by a share", "noise", "decay"),
-    "gsbench.densify.NoDensifier": ("densification",),
-    "gsbench.densify.PixelGS": ("weights of the gradient",),
-    "gsbench.densify.QuantileADC": ("threshold by a rate", "pruning by a share"),
-    "gsbench.densify.ResGS": ("residual split", "levels", "fading opacity"),
-    "gsbench.densify.SteepGS": ("saddle condition", "split along an eigenvector"),
-    "gsbench.densify.Taming": ("score", "prunings"),
-    "gsbench.densify.Volumetric": ("volume rule",),
-}
 
 
 def differing_conditions(trials: Sequence[TrialResult], code: bool = True) -> dict[str, list[str]]:
@@ -279,7 +237,7 @@ def is_mixed(names: Sequence[str]) -> bool:
     return len(names) > 1 or any(name.startswith(bundles) for name in names)
 
 
-def _class_ingredients(config: Mapping[str, Any]) -> tuple[str, ...]:
+def _class_ingredients(config: Mapping[str, Any]) -> Sequence[str]:
     """The ingredients in which the configuration's densifier class departs from ADC."""
     target = config.get(TARGET)
     if target is None:

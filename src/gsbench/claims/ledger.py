@@ -20,6 +20,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Literal
 
 from gsbench.analysis.quantities import COSTS, relative_change
 from gsbench.analysis.questions import plan_looks
@@ -41,16 +42,12 @@ from gsbench.runs.commands import (
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.words import counted, least_text, listed
 
-IDEAS, RATE = 40, 0.1  # the defaults of a ledger
 # The chance that an idea without an effect passes on to its test, over all looks. Half of it or
 # twice as much finds about as many good ideas (findings/simulations.md).
 SCREEN = 0.1
 SEEDS_FROM, SEEDS = 100_000, 900_000  # of tests
-KEPT, DROPPED, UNDECIDED, FAILED = "kept", "dropped", "undecided", "failed"
-BEGUN = "begun"
-CHOOSES = "it only chooses what is tested on new seeds"
-LOOKS_WORSE = "looks worse"  # on the seeds of all ideas, which is no verdict
-MEND = "bring back the file as gsbench wrote it, or begin another ledger"
+# of an idea; it has none ("begun") before it is decided
+Result = Literal["kept", "dropped", "undecided", "failed", "begun"]
 
 
 @dataclass(frozen=True)
@@ -100,7 +97,7 @@ class Book:
             looks=() if rule == CONFIRMATION else plan_looks(len(seeds)),
             rule=rule,
             level=level,
-            untested=CHOOSES if rule == SCREENING else "",
+            untested="it only chooses what is tested on new seeds" if rule == SCREENING else "",
             versions=True,
             name=idea.name,
         )
@@ -110,8 +107,7 @@ class Book:
 
         An idea passes by one side of the interval, so the interval has twice the rate.
         """
-        baseline, seeds = self.ideas[idea.against], self.opened.seeds
-        return self.ask(idea, baseline, SCREENING, seeds, 2 * SCREEN)
+        return self.ask(idea, self.ideas[idea.against], SCREENING, self.opened.seeds, 2 * SCREEN)
 
     def test(self, name: str) -> Question:
         """The test of an idea that looks better, in as many looks on new seeds.
@@ -124,45 +120,40 @@ class Book:
         first = SEEDS_FROM + int(history.head, 16) % SEEDS
         while not seen.isdisjoint(range(first, first + count)):
             first += count
-        rate, number = self.opened.rate, len(self.tests) + 1
-        level = level_of_test(rate, self.opened.ideas, number, len(self.kept))
+        number, ideas = len(self.tests) + 1, range(1, self.opened.ideas + 1)
+        # The weights 1 / number give the first tests more than equal ones would: few ideas of the
+        # planned ones pass on to a test, and each kept one raises the levels after it.
+        level = self.opened.rate * (len(self.kept) + 1) / number / sum(1 / one for one in ideas)
         seeds = dict.fromkeys(self.questions[name].seeds, tuple(range(first, first + count)))
-        level = min(1.0, 2 * level)
-        return replace(self.questions[name], rule=LOND, seeds=seeds, level=level)
-
-    def is_measured(self, idea: str) -> bool:
-        """Return whether a trial of the idea gave a result."""
-        known = {digest for digest, _ in self.experiment.history.results}
-        known |= {one.digest for one in self.experiment.trials}
-        return not known.isdisjoint(self.ideas[idea].digests.values())
+        return replace(self.questions[name], rule=LOND, seeds=seeds, level=min(1.0, 2 * level))
 
     def failure(self, idea: str) -> str:
         """The reason why an idea has no result, since its trials failed; "" otherwise."""
-        digests = self.ideas[idea].digests
+        own = self.ideas[idea].digests
+        measured = {digest for digest, _ in self.experiment.history.results}
+        measured |= {one.digest for one in self.experiment.trials}
         for one in self.experiment.unfinished:
-            if one.failed and digests.get(one.scene) == one.digest and not self.is_measured(idea):
+            is_own = one.failed and own.get(one.scene) == one.digest
+            if is_own and measured.isdisjoint(own.values()):
                 return TrialFolder(one.path).failure().reason
         return ""
 
-    def result(self, idea: str) -> str:
+    def result(self, idea: str) -> Result:
         if self.failure(idea):
-            return FAILED
+            return "failed"
         verdict = self.verdicts[idea]
         found = result_of(verdict)
-        ended = verdict.final and (found != KEPT or idea in self.tests)
-        return found if ended else BEGUN
-
-    def is_decided(self, idea: str) -> bool:
-        """Return whether the idea has a result; it has none if its trials failed."""
-        return self.result(idea) not in (FAILED, BEGUN)
+        ended = verdict.final and (found != "kept" or idea in self.tests)
+        return found if ended else "begun"
 
     def why(self, idea: str) -> str:
         """The reason of a result."""
         if failure := self.failure(idea):
             return failure
         verdict = self.verdicts[idea]
+        # on the seeds of all ideas that is no verdict
         looks_worse = idea not in self.tests and verdict.outcome == REFUTED
-        return with_notes(LOOKS_WORSE if looks_worse else reason(verdict), verdict)
+        return with_notes("looks worse" if looks_worse else reason(verdict), verdict)
 
     def line(self, idea: str) -> str:
         """``larger_splits against baseline: kept: better; psnr +0.5 (…); 3 new seeds, level …``"""
@@ -185,7 +176,7 @@ class Book:
 
     @property
     def kept(self) -> list[str]:
-        return [idea for idea in self.tests if self.result(idea) == KEPT]
+        return [idea for idea in self.tests if self.result(idea) == "kept"]
 
     @property
     def tried(self) -> int:
@@ -233,7 +224,9 @@ def read_ledger(home: Path) -> Book:
             f"{home.name} has no ledger: gsbench ledger new {home.name} --metric … begins one"
         )
     if history.faults:
-        raise InputError(f"{history.faults[0]}: {MEND}")
+        raise InputError(
+            f"{history.faults[0]}: bring back the file as gsbench wrote it, or begin another ledger"
+        )
     experiment = read_experiment(home)
     unknown = {(one.scene, one.digest) for one in experiment.trials}
     for one in history.questions:
@@ -247,18 +240,9 @@ def read_ledger(home: Path) -> Book:
     return Book(experiment, history.ledger)
 
 
-def level_of_test(rate: float, ideas: int, number: int, kept: int) -> float:
-    """The level of the test ``number`` (from 1) after ``kept`` ideas were kept.
-
-    The weights ``1 / number`` give the first tests more than equal weights would: few ideas of the
-    planned ones pass on to a test, and each kept one raises the levels after it.
-    """
-    return rate * (kept + 1) / number / sum(1 / test for test in range(1, ideas + 1))
-
-
-def result_of(verdict: Verdict) -> str:
-    """``kept``, ``dropped`` or ``undecided``; an undecided idea may change with more seeds."""
+def result_of(verdict: Verdict) -> Result:
+    """The result by a verdict; an undecided idea may change with more seeds."""
     if verdict.outcome == SUPPORTED:
-        return KEPT
-    dropped = verdict.equal or verdict.outcome in (REFUTED, TOO_SMALL) or gives_up(verdict)
-    return DROPPED if dropped else UNDECIDED
+        return "kept"
+    is_dropped = verdict.equal or verdict.outcome in (REFUTED, TOO_SMALL) or gives_up(verdict)
+    return "dropped" if is_dropped else "undecided"

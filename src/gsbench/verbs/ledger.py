@@ -14,16 +14,7 @@ from gsbench.analysis.sentences import sentence
 from gsbench.analysis.verdicts import judge
 from gsbench.app.command import compose_trials, require_waiting, run_trials
 from gsbench.claims.gate import asked_difference
-from gsbench.claims.ledger import (
-    DROPPED,
-    FAILED,
-    IDEAS,
-    KEPT,
-    RATE,
-    Book,
-    read_ledger,
-    result_of,
-)
+from gsbench.claims.ledger import Book, read_ledger, result_of
 from gsbench.claims.stopping import Needed, SequentialTest, finished_trials
 from gsbench.config.command_words import typed_permissions
 from gsbench.config.compose import Trial
@@ -52,9 +43,8 @@ from gsbench.settings import OpenFraction, is_folder_name
 from gsbench.verbs.arguments import ArgumentParser, number, whole_number
 from gsbench.words import listed
 
-EXIT_CODES = {KEPT: 0, DROPPED: 1, FAILED: 1}
-UNDECIDED_CODE = 3
-MOST_IDEAS = 10_000
+EXIT_CODES = {"kept": 0, "dropped": 1, "failed": 1, "undecided": 3, "begun": 3}
+IDEAS, MOST_IDEAS, RATE = 40, 10_000, 0.1
 GIVEN = ("name", "runs", "eval.primary")  # settings that the ledger sets itself
 # An idea may change how a model is made, not what it is measured on.
 OF_IDEAS = ("densify", "init", "train", "raster")
@@ -137,21 +127,19 @@ def try_idea(options: argparse.Namespace, home: Path) -> int:
     for rule in (SCREENING, LOND):
         book = read_ledger(home)
         question = book.questions[idea]
-        if question.rule == rule and not book.is_decided(idea):
+        if question.rule == rule and book.result(idea) in ("begun", "failed"):
             seeds = f"seed={','.join(map(str, next(iter(question.seeds.values()))))}"
             sides = [_compose(home, _merged(own, [seeds]), typed)[1] for own in words]
             fails = _train(question, {**sides[0], **sides[1]})
             append(home, lambda history: _promotion(history, home, idea))
     book = read_ledger(home)
+    facts, line = _facts(book, idea), book.line(idea)
     if fails:
-        fails = book.failure(idea) or f"{fails}; to go on, give the same command again"
-    if options.json:
-        failed = {"result": FAILED, "reason": fails} if fails else {}
-        print(json.dumps(_facts(book, idea) | failed | _left(book)))
-    else:
-        print(f"{idea}: {FAILED}: {fails}" if fails else book.line(idea))
-        print(book.describe()[1])
-    return EXIT_CODES.get(FAILED if fails else book.result(idea), UNDECIDED_CODE)
+        why = book.failure(idea) or f"{fails}; to go on, give the same command again"
+        facts |= {"result": "failed", "reason": why}
+        line = f"{idea}: failed: {why}"
+    print(json.dumps(facts | _left(book)) if options.json else f"{line}\n{book.describe()[1]}")
+    return EXIT_CODES[facts["result"]]
 
 
 def confirm(options: argparse.Namespace, home: Path) -> int:
@@ -251,7 +239,7 @@ def _promotion(history: History, home: Path, idea: str) -> Command | None:
     """The test of an idea that looks better, unless it has one."""
     book = read_ledger(home)
     verdict = book.verdicts[idea]
-    if idea in book.tests or not verdict.final or result_of(verdict) != KEPT:
+    if idea in book.tests or not verdict.final or result_of(verdict) != "kept":
         return None
     return command_now(questions=(book.test(idea).with_id(history.head),))
 

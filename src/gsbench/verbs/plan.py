@@ -1,7 +1,6 @@
 """``gsbench plan``: how many scenes and seeds show a difference (docs/claims.md)."""
 
 import json
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,20 +11,17 @@ from gsbench.analysis.comparison import compare
 from gsbench.analysis.notes import texts
 from gsbench.analysis.pairs import BASELINE
 from gsbench.analysis.planning import (
-    COMMANDS,
     UNSURE,
     Components,
     Design,
     Plan,
-    Purpose,
     estimate_components,
     make_plan,
 )
 from gsbench.analysis.quantities import Quantity, quantity
 from gsbench.analysis.results import Arm, TrialResult, load_experiment
 from gsbench.analysis.statistics import MIN_SCENES
-from gsbench.analysis.verdicts import GIVE_UP, interval_of
-from gsbench.claims.ledger import IDEAS, RATE, SCREEN, level_of_test
+from gsbench.analysis.verdicts import interval_of
 from gsbench.errors import InputError
 from gsbench.runs.commands import ERROR_RATE
 from gsbench.runs.experiments import DEFAULT_METRIC
@@ -34,14 +30,7 @@ from gsbench.words import counted
 
 MAX_DESIGNS = 5  # combinations of scenes and seeds that `plan` shows
 MOST_QUESTIONS = 10_000
-# the answers of `plan` for each command
-PLANNED = {
-    "sweep": "Planned for a sweep: each question errs in {:.3g} %; all seeds are judged at once.",
-    "looks": "Planned for a sweep that stops when decided: each question errs in {:.3g} %.",
-    "gate": "Planned for a gate: it calls a version worse that is worse by the difference.",
-    "ledger": "Planned for a ledger: an idea is kept, at {:.3g} % with both sides, after a quarter "
-    "of the ideas were tested and none was kept.",
-}
+PLANNED = "Planned for a sweep: each question errs in {:.3g} %; all seeds are judged at once."
 NEW_TRIALS = (
     "Train all of them with seeds that the pilot does not have (it has {}), under another name: "
     "what was seen is not declared beforehand."
@@ -57,15 +46,10 @@ def plan(argv: Sequence[str], runs: Path) -> int:
         "(docs/verdict.md). How many ideas will be found, it cannot say.",
         {
             "experiment": "of the pilot trials",
-            "--for=command WHAT": (
-                "what is planned: a sweep (the default), a sweep that stops when decided (looks), "
-                "a gate, or a ledger of ideas",
-                COMMANDS,
-                COMMANDS[0],
-            ),
             "--questions N": (
-                "pairs of arms, claims, or planned ideas that share the error rate (1; ledger: 40)",
+                "pairs of arms that share the error rate (1)",
                 whole_number(MOST_QUESTIONS),
+                1,
             ),
             "--metric NAME": "such as ssim; default: that of the experiment's question, or psnr",
             "--difference SIZE": (
@@ -95,7 +79,7 @@ def plan(argv: Sequence[str], runs: Path) -> int:
         raise InputError(
             f"{options.experiment} has one arm, and planning needs pairs of trials of two"
         )
-    purpose, plans = purpose_of(options.command, options.questions), list[dict[str, Any]]()
+    level, plans = ERROR_RATE / options.questions, list[dict[str, Any]]()
     lines = [*comparison.sentences, *texts(comparison.remarks), *experiment.warnings]
     for baseline, arm in comparison.pairs:
         plans.append({"arm": str(arm), "baseline": str(baseline)})
@@ -107,17 +91,15 @@ def plan(argv: Sequence[str], runs: Path) -> int:
             lines.append(str(error))
             plans[-1]["no_plan"] = str(error)
             continue
-        planned = make_plan(components, difference, purpose, MAX_DESIGNS)
+        planned = make_plan(components, difference, level, MAX_DESIGNS)
         lines += [f"{arm} against {baseline}", *_lines(planned, metric, difference)]
-        if purpose.screen:
-            lines.append("  an idea that looks better takes as many new seeds, its baseline too")
         plans[-1] |= planned.to_json()
     seeds = sorted({trial.seed for trial in trials})
-    lines.append(PLANNED[options.command].format(100 * purpose.rate))
+    lines.append(PLANNED.format(100 * level))
     lines.append(NEW_TRIALS.format(", ".join(map(str, seeds))))
     if options.json:
-        asked = {"metric": metric.key, "difference": difference, "for": options.command}
-        asked |= {"error_rate": purpose.rate, "pilot_seeds": seeds}
+        asked = {"metric": metric.key, "difference": difference}
+        asked |= {"error_rate": level, "pilot_seeds": seeds}
         found = asked | comparison.to_json() | {"plans": plans}
         lines = [json.dumps(found, indent=1)]
     print("\n".join(lines))
@@ -143,19 +125,6 @@ def _components(
             "many would show one"
         )
     return components
-
-
-def purpose_of(command: str, questions: int | None) -> Purpose:
-    """The purpose of a command's trials; each idea takes one side of its level.
-
-    A ledger is planned for the test after a quarter of the ideas were tested and none kept: no more
-    pass on where few are good (findings/simulations.md).
-    """
-    if command == "ledger":
-        ideas = questions or IDEAS
-        level = level_of_test(RATE, ideas, math.ceil(ideas / 4), 0)
-        return Purpose(2 * level, looks=True, give_up=GIVE_UP, screen=2 * SCREEN)
-    return Purpose(ERROR_RATE / (questions or 1), looks=command != "sweep")
 
 
 def _lines(planned: Plan, metric: Quantity, difference: float) -> list[str]:
