@@ -37,11 +37,11 @@ from gsbench.analysis.planning import (
 )
 from gsbench.analysis.questions import plan_looks
 from gsbench.analysis.results import Arm, TrialResult, Unfinished
-from gsbench.analysis.statistics import REFUTED, SUPPORTED, Region
+from gsbench.analysis.statistics import Region
 from gsbench.analysis.verdicts import judge
-from gsbench.claims import gate as gates
 from gsbench.runs.commands import Question
 from gsbench.runs.trial_record import TrialRecord
+from gsbench.verbs import gate as gates
 
 # If no bad training is seen, nothing tells such an arm from a better one (docs/verdict.md).
 ONE_ARM_LIMIT = 0.22
@@ -128,7 +128,7 @@ def question(
         seeds=dict.fromkeys(names, tuple(range(seeds))),
         looks=looks,
         level=level,
-        rule="simulated",
+        rule="declaration",
     )
 
 
@@ -189,7 +189,7 @@ def sweep(
         at = plan_looks(seeds) if looks else ()
         asked = [question(f"arm{k}", scenes, seeds, 0.05 / count, at) for k in range(count)]
         outcomes = {judge(made, one).outcome for one in asked}
-        return float(bool(outcomes & {SUPPORTED, *(() if effect else (REFUTED,))}))
+        return float(bool(outcomes & {"supported", *(() if effect else ("refuted",))}))
 
     return draw
 
@@ -210,7 +210,7 @@ def failing(finish: bool) -> Draw:
         done = [*baseline, *(one for one in arm if one not in lost)]
         missing = [Unfinished(one.path, one.digest, failed=True) for one in lost]
         verdict = judge(done, asked, missing)
-        return float(verdict.outcome == SUPPORTED)
+        return float(verdict.outcome == "supported")
 
     return draw
 
@@ -232,7 +232,7 @@ def like_these(scenes: int) -> Draw:
         made += trials("arm0", 25 + effects + rng.normal(0, part, shape))
         verdict = judge(made, question("arm0", scenes, 3))
         assert verdict.like_these is not None
-        return float(verdict.like_these.outcome == (REFUTED if gains else SUPPORTED))
+        return float(verdict.like_these.outcome == ("refuted" if gains else "supported"))
 
     return draw
 

@@ -12,7 +12,10 @@ from gsbench.analysis.results import load_experiment
 from gsbench.analysis.statistics import StudentT
 from gsbench.analysis.verdicts import Verdict
 from gsbench.claims.export import write_archive
-from gsbench.claims.gate import (
+from gsbench.cli import run
+from gsbench.errors import InputError
+from gsbench.runs.trial_record import Code
+from gsbench.verbs.gate import (
     NOT_DECIDED,
     PASSED,
     WORSE,
@@ -22,9 +25,6 @@ from gsbench.claims.gate import (
     deviations,
     result_of,
 )
-from gsbench.cli import run
-from gsbench.errors import InputError
-from gsbench.runs.trial_record import Code
 from tests.analysis.helpers import loaded
 from tests.helpers import refusal
 from tests.trials import write_as, write_runs, write_trial

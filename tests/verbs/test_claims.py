@@ -1,6 +1,5 @@
 """``gsbench plan``, with made-up results."""
 
-import json
 import re
 from shlex import split
 
@@ -67,35 +66,6 @@ def test_arms_that_cannot_be_planned_for_are_named_beside_the_others(pilots, cap
 def test_pilot_trials_on_one_scene_give_no_plan_for_scenes_like_these(pilots, capsys):
     assert plan(["one"], pilots) == 0
     assert "run pilot trials on a second scene" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("experiment", ["exp", "one"])
-def test_json_has_the_facts_of_the_text(pilots, capsys, experiment):
-    words = [experiment, "--metric", "ssim", "--difference", "0.02"]
-    assert (plan(words, pilots), plan([*words, "--json"], pilots)) == (0, 0)
-    text, start, rest = capsys.readouterr().out.partition("{\n")
-    found = json.loads(start + rest)
-    assert [found[key] for key in ("metric", "difference")] == ["ssim", 0.02]
-    assert [answer["sentence"] in text for answer in found["answers"]] == [True]
-    assert all(line in text for line in found["left_out"])
-    (one,) = found["plans"]
-    assert (one["arm"], one["baseline"]) == ("sfm-volumetric", "sfm-adc")
-    assert f"vary between seeds by {one['pilot']['within']:.4f}" in text
-    assert f"(from {one['pilot']['pairs']} pairs on {one['pilot']['scenes']} scene" in text
-    for name, said in (
-        ("these_scenes", "these scenes"),
-        ("scenes_like_these", "from 6 scenes on)"),
-    ):
-        shown = [f"{d['scenes']} × {d['seeds']} ({d['trials']} trials)" for d in one[name] or []]
-        (line,) = [line for line in text.splitlines() if said in line and "to see" in line] or [""]
-        assert line.endswith(", ".join(shown))
-    assert (one["scenes_like_these"] is None) == (experiment == "one")
-    assert found["pilot_seeds"] == [0, 1, 2]
-    assert f"each question errs in {100 * found['error_rate']:.3g} %" in text
-    low, high = one["deviation_factors"]
-    assert f"within {low:.2f} to {high:.2f} times ({100 * one['share_of_pilots']:.0f} %" in text
-    least, most = one["power"]
-    assert f"in {100 * least:.0f} to {100 * most:.0f} of 100 cases" in text
 
 
 @pytest.mark.parametrize(

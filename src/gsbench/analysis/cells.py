@@ -31,18 +31,9 @@ if TYPE_CHECKING:
 K = TypeVar("K", bound=Hashable)
 C = TypeVar("C", Planned, TrialResult)
 
-TRIAL_FIELDS = (
-    "scene",
-    "init",
-    "densify",
-    "seed",
-    "raster",
-    "protocol",
-    "iterations",
-    "experiment",
-)
 IDENTITY = ("experiment", "scene", "init", "densify", "seed")
 CONDITIONS = ("protocol", "raster", "iterations")
+TRIAL_FIELDS = (*IDENTITY, *CONDITIONS)
 OF_VIEWS = ("protocol", "resolution", "data", "split")  # conditions of the measured views
 MEASUREMENTS = (
     "num_init_points",

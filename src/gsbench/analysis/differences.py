@@ -7,6 +7,7 @@ ADC. All are read from the trials' recorded configurations and code.
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -79,41 +80,43 @@ def conditions_between_scenes(trials: Sequence[TrialResult]) -> dict[str, Scenes
 
     A mean over such scenes would be about nothing.
     """
-    by_scene = group_by(trials, "scene")
-    differing = differing_conditions([own[0] for own in by_scene.values()], code=False)
-    keys = [key for key in differing if key not in OF_A_SCENE]
-    return _between_scenes(by_scene, keys, lambda trial, key: trial.conditions.get(key, "none"))
+    found = _between_scenes(trials, attrgetter("conditions"))
+    return {key: scenes for key, scenes in found.items() if key not in OF_A_SCENE}
 
 
 def settings_between_scenes(trials: Sequence[TrialResult]) -> dict[str, ScenesByValue]:
     """The settings in which the scenes of one arm differ, without those of the scene itself."""
-    by_scene = group_by([trial for trial in trials if trial.config], "scene")
-    first, *others = (own[0].config for own in by_scene.values()) if by_scene else ({},)
+    found = _between_scenes([trial for trial in trials if trial.config], attrgetter("config"))
+    return {key: own for key, own in found.items() if is_ingredient(key) and not is_of_scene(key)}
+
+
+def _between_scenes(
+    trials: Sequence[TrialResult], facts_of: Callable[[TrialResult], Mapping[str, Any]]
+) -> dict[str, ScenesByValue]:
+    """For each fact that differs between scenes, the scenes that have a value.
+
+    What differs within a scene is left out: that is no difference between scenes.
+    """
+    by_scene = group_by(trials, "scene")
+    first, *others = (facts_of(own[0]) for own in by_scene.values()) if by_scene else ({},)
     # Compared as they are, not as text: this runs for every pair of arms.
     keys = {
         key for other in others for key in first.keys() | other if first.get(key) != other.get(key)
     }
-    keys = {key for key in keys if is_ingredient(key) and not is_of_scene(key)}
-    return _between_scenes(
-        by_scene, sorted(keys), lambda trial, key: canonical(trial.config.get(key))
-    )
-
-
-def _between_scenes(
-    by_scene: Mapping[str, Sequence[TrialResult]],
-    keys: Iterable[str],
-    value_of: Callable[[TrialResult, str], str],
-) -> dict[str, ScenesByValue]:
-    """For each of ``keys`` that differs between scenes, the scenes that have a value.
-
-    What differs within a scene is left out: that is no difference between scenes.
-    """
-    differing = {}
-    for key in keys:
-        values = {scene: {value_of(trial, key) for trial in by_scene[scene]} for scene in by_scene}
+    differing: dict[str, ScenesByValue] = {}
+    for key in sorted(keys):
+        values = {
+            scene: {as_text(facts_of(trial).get(key)) for trial in own}
+            for scene, own in by_scene.items()
+        }
         if all(len(own) == 1 for own in values.values()):
             differing[key] = group_by(values, lambda scene: min(values[scene]))  # noqa: B023
-    return {key: scenes for key, scenes in differing.items() if len(scenes) > 1}
+    return differing
+
+
+def as_text(value: Any) -> str:
+    """A value as text; text stays as it is."""
+    return value if isinstance(value, str) else canonical(value)
 
 
 def between_scenes_notes(*sides: Sequence[TrialResult]) -> list[Note]:

@@ -17,14 +17,10 @@ from gsbench.words import FORM
 
 @dataclass(frozen=True)
 class Note:
-    """A note of a kind in `SENTENCES`, with its facts; ``about`` is the metric that it is about.
-
-    Its text (``str``) is the kind's sentence.
-    """
+    """A note of a kind in `SENTENCES`, with its facts; ``str`` gives the kind's sentence."""
 
     kind: str
     facts: tuple[tuple[str, Any], ...] = ()
-    about: str = ""
 
     @classmethod
     def of(cls, kind: str, **facts: Any) -> Self:
@@ -35,13 +31,8 @@ class Note:
     def __getitem__(self, fact: str) -> Any:
         return dict(self.facts)[fact]
 
-    @property
-    def sentence(self) -> str:
-        """The sentence without the metric."""
-        return FORM.format(SENTENCES[self.kind], **dict(self.facts))
-
     def __str__(self) -> str:
-        return f"{self.about}: {self.sentence}" if self.about else self.sentence
+        return FORM.format(SENTENCES[self.kind], **dict(self.facts))
 
 
 SENTENCES: dict[str, str] = {

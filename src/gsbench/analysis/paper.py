@@ -1,27 +1,23 @@
 """Printed numbers of papers, their tables as measured, and the differences."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
-from typing import TYPE_CHECKING
 
 import yaml
 
 from gsbench.analysis.cells import Cell, check_averageable, make_cell
+from gsbench.analysis.comparison import Comparison
 from gsbench.analysis.quantities import choose_quantities, quantity
 from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by
+from gsbench.analysis.statistics import StudentT
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.analysis.tables import build_table
 from gsbench.errors import InputError
 from gsbench.words import did_you_mean, signed
-
-if TYPE_CHECKING:
-    from gsbench.analysis.comparison import Comparison
 
 # suffix of an experiment that repeats a table with each initialiser's own poses and gauge
 OWN = "_own"
@@ -266,8 +262,6 @@ def agreement(cell: Cell, printed: str) -> str:
     ``=`` if its mean is in the printed number's range, half a unit of its last digit on both sides;
     ``≈`` if its interval overlaps the range, else ``≠``. A single trial has no interval.
     """
-    from gsbench.analysis.statistics import StudentT  # here, since SciPy is slow to import
-
     assert cell.mean is not None
     value, half = float(printed), 0.5 * 10.0 ** -_decimals(printed)
     low, high = value - half, value + half

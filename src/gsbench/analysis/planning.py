@@ -12,9 +12,8 @@ noise that the pilot's scenes have, and decided by the thresholds of the judge.
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from functools import cache, partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -183,9 +182,19 @@ def sweep_power(
 
 
 def sweep_designs(difference: float, noise: Components, level: float = ALPHA) -> list[Design]:
-    """The designs of sweeps with a power of `POWER`, as `fewest_seeds` gives them."""
+    """The designs of sweeps with a power of `POWER`, those with the fewest trials first."""
     power = partial(sweep_power, difference=difference, noise=noise, level=level)
-    return fewest_seeds(power, range(1, MAX_SCENES + 1))
+    return cheapest_first(fewest_seeds(power, range(1, MAX_SCENES + 1)))
+
+
+def designs_like_these(difference: float, noise: Components) -> list[Design]:
+    """The same for the statement on scenes like these, from `MIN_SCENES` scenes on."""
+    power = partial(power_like_these, difference=difference, components=noise)
+    return cheapest_first(fewest_seeds(power, range(MIN_SCENES, MAX_SCENES + 1)))
+
+
+def cheapest_first(designs: Iterable[Design]) -> list[Design]:
+    return sorted(designs, key=lambda design: (design.trials, design.scenes))
 
 
 def seeds_needed(deviation: float, scenes: int, difference: float) -> int | None:
@@ -195,56 +204,3 @@ def seeds_needed(deviation: float, scenes: int, difference: float) -> int | None
     """
     power = partial(power_of_mean, deviation, difference=difference)
     return next((one.seeds for one in fewest_seeds(power, [scenes])), None)
-
-
-@dataclass(frozen=True)
-class Plan:
-    """The designs that show a difference between two arms, each list with the fewest trials first.
-
-    ``like_these`` are those for scenes like these, None if the pilot has one scene. The pilot's
-    ``factors`` say between which multiples of its deviation the real one lies (`UNSURE`), and
-    ``powers`` the chances at these that the first design shows the difference; None without one.
-    """
-
-    components: Components
-    these: tuple[Design, ...]
-    like_these: tuple[Design, ...] | None
-    factors: tuple[float, float]
-    powers: tuple[float, float] | None
-
-    def to_json(self) -> dict[str, Any]:
-        def listed(designs: Sequence[Design]) -> list[dict[str, int]]:
-            return [asdict(design) | {"trials": design.trials} for design in designs]
-
-        like_these = None if self.like_these is None else listed(self.like_these)
-        return {
-            "pilot": {"pairs": self.components.trials}
-            | {key: value for key, value in asdict(self.components).items() if key != "trials"},
-            "these_scenes": listed(self.these),
-            "scenes_like_these": like_these,
-            "share_of_pilots": UNSURE,
-            "deviation_factors": self.factors,
-            "power": self.powers,
-        }
-
-
-def make_plan(components: Components, difference: float, level: float, most: int) -> Plan:
-    """The plan to show ``difference`` at ``level``, with at most ``most`` designs per statement.
-
-    Statements about scenes like these start at `MIN_SCENES`.
-    """
-
-    def cheapest(designs: Sequence[Design]) -> tuple[Design, ...]:
-        return tuple(sorted(designs, key=lambda design: (design.trials, design.scenes))[:most])
-
-    these, like_these = cheapest(sweep_designs(difference, components, level)), None
-    if components.between is not None:
-        power = partial(power_like_these, difference=difference, components=components)
-        like_these = cheapest(fewest_seeds(power, range(MIN_SCENES, MAX_SCENES + 1)))
-    low, high = deviation_range(replace(components, within=1.0))
-    powers = None
-    if these:
-        ends = [replace(components, within=one * components.within) for one in (high, low)]
-        worst, best = (sweep_power(these[0], difference, one, level) for one in ends)
-        powers = worst, best
-    return Plan(components, these, like_these, (low, high), powers)

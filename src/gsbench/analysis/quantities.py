@@ -175,10 +175,12 @@ def asked_quantity(key: str, trials: Iterable[TrialResult] = ()) -> Quantity:
     """
     if key == TEXTURED.key:
         return TEXTURED
-    if key in COSTS:
+    trials = list(trials)
+    # a table of results may have a column of the name
+    if key in COSTS and not any(key in trial.metrics for trial in trials):
         name, read = COSTS[key]
         return Quantity(key, name, -1, 3, lambda trial: read(trial) or None, cost=True)
-    return _metric(key, "", list(trials))
+    return _metric(key, "", trials)
 
 
 def askable_names() -> tuple[str, ...]:

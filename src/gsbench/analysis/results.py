@@ -14,7 +14,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any, TypeVar
 
-from gsbench.analysis.trial_result import Configurations, settings_text
+from gsbench.analysis.trial_result import Configurations, read_configuration, settings_text
 from gsbench.analysis.trial_result import TrialResult as TrialResult
 from gsbench.errors import InputError
 from gsbench.files import require_no_links
@@ -123,12 +123,6 @@ def group_by(items: Iterable[T], *by: str | Callable[[T], Any]) -> dict[Any, lis
     return groups
 
 
-def seeds_text(trials: Iterable[TrialResult]) -> str:
-    """``seed 0`` or ``seeds 0, 1``"""
-    seeds = sorted(trial.seed for trial in trials)
-    return f"seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds))}"
-
-
 def load_experiment(runs_dir: Path, name: str) -> Experiment:
     """Read the trials of the experiment ``name`` that count (`newest_code`).
 
@@ -155,7 +149,7 @@ def read_experiment(folder: Path) -> Experiment:
     runs_dir = folder.parent
     trials: list[TrialResult] = []
     faults: dict[Path, str] = {}
-    settings = Configurations()
+    settings: Configurations = {}
     for path in map(Path, trial_folders(folder)):
         try:
             trials.append(read_trial(path, runs_dir, settings))
@@ -331,7 +325,8 @@ def _read_settings(trials: Sequence[TrialResult], settings: Configurations) -> d
     for of_arm in group_by(trials, lambda trial: trial.key.rpartition("/")[0]).values():
         paths = group_by([(t.key, t.path) for t in of_arm], lambda pair: pair[0])
         if len(paths) > 1:
-            faults |= {key: settings.read(key, [p for _, p in own]) for key, own in paths.items()}
+            for key, own in paths.items():
+                faults[key] = read_configuration(settings, key, [path for _, path in own])
     return faults
 
 

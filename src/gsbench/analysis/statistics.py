@@ -39,10 +39,6 @@ ALPHA = ERROR_RATE
 # for a statement about scenes like these: the fewest with which the sign test can reach 5 %
 MIN_SCENES = 6
 Outcome = Literal["supported", "refuted", "too small to matter", "undecided"]
-SUPPORTED: Outcome = "supported"
-REFUTED: Outcome = "refuted"
-TOO_SMALL: Outcome = "too small to matter"
-UNDECIDED: Outcome = "undecided"
 
 Array = NDArray[np.floating]
 
@@ -236,10 +232,10 @@ def favoured(outcome: Outcome, sign: int, direction: int) -> tuple[int, ...]:
     ``sign`` is that of the claim, ``direction`` says whether more is better. If neither side is
     better by the outcome, or if that is not known, both are favoured.
     """
-    if outcome == UNDECIDED:
+    if outcome == "undecided":
         return ()
-    toward = sign * direction * (1 if outcome == SUPPORTED else -1)
-    return (0, 1) if outcome == TOO_SMALL or not toward else (int(toward > 0),)
+    toward = sign * direction * (1 if outcome == "supported" else -1)
+    return (0, 1) if outcome == "too small to matter" or not toward else (int(toward > 0),)
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,6 @@ from gsbench.analysis.images import PixelMeasures, region_record, textured_error
 from gsbench.analysis.old_declarations import all_questions
 from gsbench.analysis.quantities import TEXTURED
 from gsbench.analysis.results import Experiment, TrialResult, group_by, newest_code, read_views
-from gsbench.analysis.verdicts import RUNNING, STOPPED
 from gsbench.claims.archive import (
     FORMAT,
     MANIFEST,
@@ -98,9 +97,8 @@ def write_archive(
 
 def _open(experiment: Experiment) -> str:
     answers = compare(newest_code(experiment)).answers
-    states = [verdict.state for one in answers for verdict in (one.verdict, *one.others)]
-    still_open = sum(state in (RUNNING, STOPPED) for state in states)
-    return f"open: {still_open} of {len(states)}" if still_open else ""
+    is_open = [verdict.is_open for one in answers for verdict in (one.verdict, *one.others)]
+    return f"open: {sum(is_open)} of {len(is_open)}" if any(is_open) else ""
 
 
 def _write_zip(out: Path, name: str, files: Mapping[str, bytes]) -> None:

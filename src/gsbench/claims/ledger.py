@@ -22,28 +22,17 @@ from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
-from gsbench.analysis.quantities import COSTS, relative_change
 from gsbench.analysis.questions import plan_looks
 from gsbench.analysis.results import Arm, Experiment, read_experiment
 from gsbench.analysis.sentences import numbers, reason, with_notes
-from gsbench.analysis.statistics import REFUTED, SUPPORTED, TOO_SMALL
 from gsbench.analysis.verdicts import Verdict, gives_up, judge
 from gsbench.errors import InputError
-from gsbench.runs.commands import (
-    BASELINE,
-    CONFIRMATION,
-    LOND,
-    SCREENING,
-    Idea,
-    Ledger,
-    Question,
-    read_history,
-)
+from gsbench.runs.commands import BASELINE, Idea, Ledger, Question, Rule, read_history
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.words import counted, least_text, listed
 
-# The chance that an idea without an effect passes on to its test, over all looks. Half of it or
-# twice as much finds about as many good ideas (findings/simulations.md).
+# The chance that an idea without an effect passes on to its test, over all looks, by one side of
+# its interval. Half or twice as much finds about as many good ideas (findings/simulations.md).
 SCREEN = 0.1
 SEEDS_FROM, SEEDS = 100_000, 900_000  # of tests
 # of an idea; it has none ("begun") before it is decided
@@ -65,14 +54,14 @@ class Book:
     @cached_property
     def questions(self) -> dict[str, Question]:
         """The question of each idea in their order: its test, else its screening as a test."""
-        rules = (SCREENING, LOND)  # a test comes after its screening
+        rules = ("screening", "lond")  # a test comes after its screening
         asked = (one for one in self.experiment.history.questions if one.rule in rules)
         return {one.name: replace(one, untested="") for one in asked}
 
     @property
     def tests(self) -> dict[str, Question]:
         """The tests on seeds that no idea had seen."""
-        return {name: one for name, one in self.questions.items() if one.rule == LOND}
+        return {name: one for name, one in self.questions.items() if one.rule == "lond"}
 
     @cached_property
     def verdicts(self) -> dict[str, Verdict]:
@@ -81,7 +70,7 @@ class Book:
         return {name: judge(trials, one, unfinished) for name, one in self.questions.items()}
 
     def ask(
-        self, idea: Idea, baseline: Idea, rule: str, seeds: tuple[int, ...], level: float
+        self, idea: Idea, baseline: Idea, rule: Rule, seeds: tuple[int, ...], level: float
     ) -> Question:
         """The question of an idea by one of the ledger's rules."""
         opened, scenes = self.opened, baseline.digests
@@ -94,27 +83,23 @@ class Book:
             idea=Arm("", idea.name),
             digests={scene: (old, idea.digests[scene]) for scene, old in scenes.items()},
             seeds=dict.fromkeys(scenes, seeds),
-            looks=() if rule == CONFIRMATION else plan_looks(len(seeds)),
+            looks=() if rule == "confirmation" else plan_looks(len(seeds)),
             rule=rule,
             level=level,
-            untested="it only chooses what is tested on new seeds" if rule == SCREENING else "",
+            untested="it only chooses what is tested on new seeds" if rule == "screening" else "",
             versions=True,
             name=idea.name,
         )
 
-    def screening(self, idea: Idea) -> Question:
-        """The comparison on the seeds of all ideas.
-
-        An idea passes by one side of the interval, so the interval has twice the rate.
-        """
-        return self.ask(idea, self.ideas[idea.against], SCREENING, self.opened.seeds, 2 * SCREEN)
-
-    def test(self, name: str) -> Question:
-        """The test of an idea that looks better, in as many looks on new seeds.
+    def next_test(self, name: str) -> Question | None:
+        """The test of an idea that looks better and has none, in as many looks on new seeds.
 
         These are in a row that begins where the hash of all lines before says, so another ledger on
         the same captures has other seeds.
         """
+        verdict = self.verdicts[name]
+        if name in self.tests or not verdict.final or result_of(verdict) != "kept":
+            return None
         history, count = self.experiment.history, len(self.opened.seeds)
         seen = {seed for one in history.questions for _, seed in one.places}
         first = SEEDS_FROM + int(history.head, 16) % SEEDS
@@ -125,7 +110,8 @@ class Book:
         # planned ones pass on to a test, and each kept one raises the levels after it.
         level = self.opened.rate * (len(self.kept) + 1) / number / sum(1 / one for one in ideas)
         seeds = dict.fromkeys(self.questions[name].seeds, tuple(range(first, first + count)))
-        return replace(self.questions[name], rule=LOND, seeds=seeds, level=min(1.0, 2 * level))
+        test = replace(self.questions[name], rule="lond", seeds=seeds, level=min(1.0, 2 * level))
+        return test.with_id(history.head)
 
     def failure(self, idea: str) -> str:
         """The reason why an idea has no result, since its trials failed; "" otherwise."""
@@ -152,7 +138,7 @@ class Book:
             return failure
         verdict = self.verdicts[idea]
         # on the seeds of all ideas that is no verdict
-        looks_worse = idea not in self.tests and verdict.outcome == REFUTED
+        looks_worse = idea not in self.tests and verdict.outcome == "refuted"
         return with_notes("looks worse" if looks_worse else reason(verdict), verdict)
 
     def line(self, idea: str) -> str:
@@ -161,18 +147,12 @@ class Book:
         if not facts[0].startswith(result := self.result(idea)):  # such as undecided
             facts[0] = f"{result}: {facts[0]}"
         if shown := numbers(verdict):
-            where = f"{counted(verdict.pairs.seeds, 'seed')} of all ideas"
+            seeds = verdict.pairs.seeds
+            where = f"{counted(seeds, 'seed')} of all ideas"
             if test:
-                new = counted(verdict.pairs.seeds, "new seed")
-                where = f"{new}, level {50 * test.level:.2g} %"
+                where = f"{counted(seeds, 'new seed')}, level {50 * test.level:.2g} %"
             facts += [f"{self.opened.metric} {shown}", where]
         return f"{idea} against {self.ideas[idea].against}: {'; '.join(facts)}"
-
-    def ratio(self, idea: str) -> float | None:
-        """The Gaussians of an idea over those of what it is compared with."""
-        pairs = self.verdicts[idea].pairs
-        change = relative_change(pairs.of_baseline, pairs.of_arm, COSTS["gaussians"][1])
-        return None if change is None else 1 + change.of_totals
 
     @property
     def kept(self) -> list[str]:
@@ -187,7 +167,7 @@ class Book:
         """Raise InputError if a scene of ``asked`` was used before, by name or photographs."""
         earlier = set(self.ideas[BASELINE].digests)
         for one in self.experiment.history.questions:
-            if one.rule == CONFIRMATION and not any(map(one.covers, asked)):
+            if one.rule == "confirmation" and not any(map(one.covers, asked)):
                 earlier |= one.digests.keys()
         data = {one.scene: one.record.hashes.get("data") for one in self.experiment.trials}
         seen = {data[scene] for scene in earlier & data.keys()}
@@ -242,7 +222,9 @@ def read_ledger(home: Path) -> Book:
 
 def result_of(verdict: Verdict) -> Result:
     """The result by a verdict; an undecided idea may change with more seeds."""
-    if verdict.outcome == SUPPORTED:
+    if verdict.outcome == "supported":
         return "kept"
-    is_dropped = verdict.equal or verdict.outcome in (REFUTED, TOO_SMALL) or gives_up(verdict)
+    is_dropped = (
+        verdict.equal or verdict.outcome in ("refuted", "too small to matter") or gives_up(verdict)
+    )
     return "dropped" if is_dropped else "undecided"

@@ -67,14 +67,16 @@ def _section(experiment: Experiment, key: str) -> dict[str, Any]:
 
     It has a line on each idea, and a table of arms × scenes for each quantity.
     """
-    trials, notes = experiment.trials, list[str]()
+    trials, notes, comparison = experiment.trials, list[str](), compare(experiment)
     tables: list[Table] = []
     try:
         rows = ("init", "densify", *swept_settings(trials))
-        tables = list(_by_quantity(build_table(experiment, rows=rows, columns=("scene",))))
+        table = build_table(experiment, rows=rows, columns=("scene",), comparison=comparison)
+        # the metrics that were asked about come first
+        asked = {answer.verdict.quantity.heading for answer in comparison.answers}
+        tables = sorted(_by_quantity(table), key=lambda one: one.title not in asked)
     except InputError as error:
         notes.append(f"No table: {error}")
-    comparison = compare(experiment)
     facts = {"trials": str(len(trials))}
     for name, read in FACTS.items():
         facts[name] = ", ".join(map(str, sorted(set(map(read, trials)))))

@@ -8,14 +8,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from gsbench.analysis.quantities import COSTS, relative_change
 from gsbench.analysis.questions import FIRST_LOOK
 from gsbench.analysis.results import read_experiment
 from gsbench.analysis.sentences import sentence
 from gsbench.analysis.verdicts import judge
 from gsbench.app.command import compose_trials, require_waiting, run_trials
-from gsbench.claims.gate import asked_difference
-from gsbench.claims.ledger import Book, read_ledger, result_of
-from gsbench.claims.stopping import Needed, SequentialTest, finished_trials
+from gsbench.claims.ledger import SCREEN, Book, read_ledger, result_of
+from gsbench.claims.stopping import Needed, SequentialTest, asked_difference, finished_trials
 from gsbench.config.command_words import typed_permissions
 from gsbench.config.compose import Trial
 from gsbench.config.overrides import key_of
@@ -25,10 +25,7 @@ from gsbench.files import checked_runs_folder, make_runs_folder
 from gsbench.launch.record import planned_rows
 from gsbench.runs.commands import (
     BASELINE,
-    CONFIRMATION,
     ERROR_RATE,
-    LOND,
-    SCREENING,
     Command,
     History,
     Idea,
@@ -79,17 +76,9 @@ def new(options: argparse.Namespace, home: Path) -> int:
     """Declare a ledger; the same command again changes nothing."""
     baseline, trials = _compose(home, options.settings, options.settings, BASELINE)
     values, metric = next(iter(trials.values())).values, options.metric
-    sign, least = asked_difference(metric, options.least, values)
+    terms = asked_difference(metric, options.least, values)
     EvalConfig(**values["eval"] | {"primary": metric})  # raises if it is not computed
-    opened = Ledger(
-        metric=metric,
-        sign=sign,
-        least=least[0],
-        relative=least[1],
-        ideas=options.ideas,
-        rate=options.fdr,
-        seeds=_seeds(trials),
-    )
+    opened = Ledger(**terms, ideas=options.ideas, rate=options.fdr, seeds=_seeds(trials))
 
     def make(history: History) -> Command | None:
         if (history.ledger, history.ideas.get(BASELINE)) == (opened, baseline):
@@ -124,14 +113,19 @@ def try_idea(options: argparse.Namespace, home: Path) -> int:
         )
     asked = _compose(home, words[1], typed, options.idea, against)[0]
     idea, fails = _begin(home, asked), ""
-    for rule in (SCREENING, LOND):
+
+    def promotion(_: History) -> Command | None:
+        test = read_ledger(home).next_test(idea)
+        return command_now(questions=(test,)) if test else None
+
+    for rule in ("screening", "lond"):
         book = read_ledger(home)
         question = book.questions[idea]
         if question.rule == rule and book.result(idea) in ("begun", "failed"):
             seeds = f"seed={','.join(map(str, next(iter(question.seeds.values()))))}"
             sides = [_compose(home, _merged(own, [seeds]), typed)[1] for own in words]
             fails = _train(question, {**sides[0], **sides[1]})
-            append(home, lambda history: _promotion(history, home, idea))
+            append(home, promotion)
     book = read_ledger(home)
     facts, line = _facts(book, idea), book.line(idea)
     if fails:
@@ -153,7 +147,7 @@ def confirm(options: argparse.Namespace, home: Path) -> int:
     ]
     (old, trials), *ideas = sides
     seeds, level = _seeds(trials), ERROR_RATE / len(ideas)
-    asked = [book.ask(one, old, CONFIRMATION, seeds, level) for one, _ in ideas]
+    asked = [book.ask(one, old, "confirmation", seeds, level) for one, _ in ideas]
 
     def make(history: History) -> Command | None:
         read_ledger(home).check_untouched(asked)
@@ -229,19 +223,11 @@ def _begin(home: Path, idea: Idea) -> str:
         if name in book.ideas:
             name = f"{name}-{len(book.ideas)}"
         own = replace(idea, name=name)
-        return command_now(idea=own, questions=(book.screening(own).with_id(history.head),))
+        asked = book.ask(own, book.ideas[own.against], "screening", book.opened.seeds, 2 * SCREEN)
+        return command_now(idea=own, questions=(asked.with_id(history.head),))
 
     append(home, make)
     return name
-
-
-def _promotion(history: History, home: Path, idea: str) -> Command | None:
-    """The test of an idea that looks better, unless it has one."""
-    book = read_ledger(home)
-    verdict = book.verdicts[idea]
-    if idea in book.tests or not verdict.final or result_of(verdict) != "kept":
-        return None
-    return command_now(questions=(book.test(idea).with_id(history.head),))
 
 
 # ---- trials of the ledger's words
@@ -293,18 +279,20 @@ def _permitted_words(idea: Idea, typed: Sequence[str]) -> list[str]:
     if needed := set(typed_permissions(idea.words)) - allowed:
         names = ",".join(sorted(needed | allowed))
         raise InputError(f"{idea.name} runs code of yours: add allow_targets=[{names}]")
-    tracking = [word for word in typed if key_of(word).startswith("tracking")]
-    chosen = "tracking" in map(key_of, tracking)  # recorded settings are of another tracker
-    kept = [one for one in idea.words if not (chosen and key_of(one).startswith("tracking"))]
-    return _merged(kept, tracking)
+    # recorded settings may be of another tracker
+    tracking = [word for word in typed if _is_tracking(word)]
+    return [*(word for word in idea.words if not (tracking and _is_tracking(word))), *tracking]
+
+
+def _is_tracking(word: str) -> bool:
+    return key_of(word).startswith("tracking")
 
 
 def _merged(words: Sequence[str], changes: Sequence[str]) -> list[str]:
     """The words with ``changes``: each replaces the word of the same key, ``~KEY`` removes it."""
     own = {key_of(word): word for word in words}
     for word in changes:
-        known = own.pop(key_of(word), None)
-        if known is None or not word.startswith("~"):
+        if own.pop(key_of(word), None) is None or not word.startswith("~"):
             own[key_of(word)] = word
     return list(own.values())
 
@@ -332,7 +320,8 @@ def _train(question: Question, trials: Trials) -> str:
 def _facts(book: Book, idea: str) -> dict[str, Any]:
     """The known facts of an idea, for programs."""
     verdict, test = book.verdicts[idea], book.tests.get(idea)
-    interval = verdict.interval
+    interval, pairs = verdict.interval, verdict.pairs
+    change = relative_change(*pairs.sides, COSTS["gaussians"][1])
     known = {
         "idea": idea,
         "against": book.ideas[idea].against,
@@ -340,10 +329,10 @@ def _facts(book: Book, idea: str) -> dict[str, Any]:
         "test_seeds": test and next(iter(test.seeds.values())),
         "result": book.result(idea),
         "reason": book.why(idea),
-        "seeds": verdict.pairs.seeds,
+        "seeds": pairs.seeds,
         "difference": interval
         and {"mean": verdict.mean, "low": interval.low, "high": interval.high},
-        "gaussians": book.ratio(idea),
+        "gaussians": change and 1 + change.of_totals,
     }
     return {name: fact for name, fact in known.items() if fact is not None}
 

@@ -7,7 +7,6 @@ import sys
 from collections.abc import Mapping, Sequence
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from gsbench.analysis.addresses import CELL, trials_of_arm
 from gsbench.analysis.cells import (
@@ -19,6 +18,7 @@ from gsbench.analysis.cells import (
     where_words,
     with_variants,
 )
+from gsbench.analysis.comparison import Comparison, chosen, compare, joined
 from gsbench.analysis.fairness import fairness_table
 from gsbench.analysis.pairs import BASELINE
 from gsbench.analysis.paper import (
@@ -43,9 +43,6 @@ from gsbench.runs.experiments import list_experiments
 from gsbench.runs.package_code import edited
 from gsbench.verbs.arguments import WHERE, ArgumentParser, Rows, names, path
 from gsbench.words import some_of, split_outside_brackets
-
-if TYPE_CHECKING:
-    from gsbench.analysis.comparison import Comparison
 
 TRIALS, JSON = "trials", "json"
 FAIRNESS = "fairness"
@@ -121,17 +118,14 @@ def _format_of(out: Path | None) -> str:
 
 def _comparison(
     experiments: Sequence[Experiment], trials: Sequence[TrialResult], where: Mapping[str, str]
-) -> "Comparison":
+) -> Comparison:
     """The verdicts of one experiment or two, about the chosen trials."""
-    # here, since SciPy is slow to import
-    from gsbench.analysis.comparison import chosen, compare, joined
-
     comparison = joined([compare(experiment) for experiment in experiments])
     return chosen(comparison, trials, where_words(where)) if where else comparison
 
 
 def _tables(
-    comparison: "Comparison", trials: Sequence[TrialResult], options: argparse.Namespace
+    comparison: Comparison, trials: Sequence[TrialResult], options: argparse.Namespace
 ) -> dict[str, str]:
     """The texts of the tables, by the ending of their file's name."""
     experiment, layout, metrics = comparison.experiment, options.layout, options.metrics
@@ -153,7 +147,7 @@ def _tables(
     return {f"{end}.{suffix}": writer(table) for end, table in named.items()}
 
 
-def _fairness_sheets(comparison: "Comparison", format_name: str) -> dict[str, str]:
+def _fairness_sheets(comparison: Comparison, format_name: str) -> dict[str, str]:
     """The fairness sheets of all compared pairs of arms."""
     experiment = comparison.experiment
     if not comparison.pairs:
@@ -260,8 +254,6 @@ def explain_cell(address: str, runs: Path) -> str:
 
 def _verdicts_on(experiment: Experiment, arm: Arm) -> list[str]:
     """The badges and sentences of the questions about an arm, on either side."""
-    from gsbench.analysis.comparison import compare  # here, since SciPy is slow to import
-
     answers = [one for one in compare(experiment).answers if arm in (one.arm, one.baseline)]
     return [answer.line for answer in answers] or ["none: it is compared with no other arm"]
 

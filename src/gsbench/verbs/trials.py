@@ -1,4 +1,4 @@
-"""Verbs about the trials of an experiment: ``gsbench status``, ``retry`` and ``sync``."""
+"""Verbs about trials of an experiment: ``gsbench status``, ``retry``, ``declare`` and ``sync``."""
 
 from __future__ import annotations
 
@@ -15,13 +15,14 @@ from pathlib import Path
 from rich.live import Live
 from rich.text import Text
 
-from gsbench.config.command_words import makes_other_trials, typed_permissions
+from gsbench.config.command_words import makes_other_trials, parse, typed_permissions
 from gsbench.config.compose import Trial, compose_one
 from gsbench.config.overrides import key_of
 from gsbench.errors import GsbenchError, InputError
+from gsbench.files import checked_runs_folder, make_runs_folder
 from gsbench.launch.dry_run import describe_plan
 from gsbench.launch.progress import SPEED, progress_frame
-from gsbench.launch.record import remove
+from gsbench.launch.record import check_looks, check_questions, planned_rows, record, remove
 from gsbench.launch.states import (
     STATES,
     TrialState,
@@ -234,6 +235,32 @@ def recompose(
             f"{files.label} was entered from renders: give the command of `gsbench evaluate` again"
         )
     return Trial(values, ())
+
+
+def declare(argv: Sequence[str], runs: Path) -> int:
+    """Run the verb; raises InputError for a wrong sweep."""
+    parser = ArgumentParser(
+        "declare",
+        "It writes the questions of a sweep and trains nothing: for loops and arrays of jobs that "
+        "train its trials one by one. Each of these commands then asks nothing more.",
+        {"settings* KEY=VALUE": "as of a sweep", "--config-dir FOLDER": "as of a sweep"},
+    )
+    parser.add_argument("-m", "--multirun", action="store_true", help="is understood")
+    parser.parse_args(argv)
+    from gsbench.app.command import compose_trials  # here, since it loads Hydra
+
+    words, _, _ = parse(argv)  # the words of a command
+    trials = compose_trials(words, multirun=True)
+    if any(trial.values["launch"]["stop_when_decided"] for trial in trials):
+        check_looks(trials, planned_rows(trials))
+    check_questions(trials)
+    make_runs_folder(checked_runs_folder(trials[0].values["runs"]))
+    questions = record(trials)  # which says them
+    print(
+        f"{trials[0].values['name']}: {counted(len(trials), 'trial')} and "
+        f"{counted(len(questions), 'question')}"
+    )
+    return 0
 
 
 def sync(argv: Sequence[str], runs: Path) -> int:
