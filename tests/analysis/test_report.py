@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 from plyfile import PlyData
 
-from gsbench.analysis.images import _jpeg_uri, choose_views, read_compared, texture_energy
+from gsbench.analysis.images import choose_views, jpeg_uri, read_compared, texture_energy
 from gsbench.analysis.pairs import Pairs, pair_trials
 from gsbench.analysis.quantities import quantity
 from gsbench.analysis.report.build import _forest, build_report, search_summary, trial_figures
@@ -488,7 +488,7 @@ def test_costs_are_listed_under_the_verdict(page):
 
 
 def test_a_wide_picture_is_shown_smaller():
-    uri = _jpeg_uri(np.zeros((10, 2400, 3), dtype=np.uint8))
+    uri = jpeg_uri(np.zeros((10, 2400, 3), dtype=np.uint8))
     with Image.open(io.BytesIO(base64.b64decode(uri.partition(",")[2]))) as shown:
         assert shown.size == (1200, 5)
 

@@ -208,6 +208,23 @@ def test_the_exit_code_of_gate_is_its_result(
     assert len(old) == 4
 
 
+def test_one_training_shows_that_the_sides_cannot_be_compared(runs, tmp_path, monkeypatch, refused):
+    trained = []
+
+    def train(planned, asks):
+        trained.extend(planned)
+        for trial in planned:
+            write_as(trial, psnr=26, _resolution=[640, 480])
+        return 0
+
+    monkeypatch.setattr("gsbench.verbs.gate.run_trials", train)
+    trials(tmp_path / "old", 0, 0.01, scenes=("courtyard",))
+    write_archive(load_experiment(tmp_path / "old", "gate"), tmp_path / "exp.zip")
+    line = refused("gate exp.zip scene=courtyard init=sfm densify=adc")
+    assert "courtyard: the arms differ in resolution" in line  # the one line on stderr
+    assert len(trained) == 1
+
+
 @pytest.mark.parametrize(
     "words, effect, code",
     [

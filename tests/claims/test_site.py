@@ -58,6 +58,15 @@ def test_the_first_page_has_arms_scenes_claims_and_working_links(tmp_path):
     assert "https://" not in page
 
 
+def test_the_table_of_the_metric_that_was_asked_about_is_open(tmp_path):
+    runs, file = tmp_path / "runs", tmp_path / "exp.zip"
+    write_runs(runs)
+    ask_about(runs, metric="ssim")
+    write_archive(load_experiment(runs, "exp"), file)
+    page = site(tmp_path, file)
+    assert re.findall(r"<details open><summary>([^<]*): arms", page) == ["SSIM ↑"]
+
+
 def test_a_table_of_many_metrics_is_split_into_one_for_each(tmp_path):
     write_runs(tmp_path)
     table = build_table(loaded(tmp_path), columns=("scene",), metrics=("psnr", "ssim", "flip"))

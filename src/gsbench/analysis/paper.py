@@ -65,6 +65,10 @@ class Published:
     tables: Mapping[str, PrintedTable]
     contradictions: Sequence[str] = ()
 
+    @property
+    def setup_words(self) -> str:
+        return " ".join(f"The paper on {topic}: it {words}." for topic, words in self.setup.items())
+
 
 def published_names() -> list[str]:
     """The names of the papers whose numbers ship with gsbench."""
@@ -157,12 +161,8 @@ def paper_tables(
         return printed.find(scene, papers_init[arm.init], arm.densify, key)
 
     title = f"{title}, difference from the printed values"
-    below = " ".join(notes), _setup_words(paper)
+    below = " ".join(notes), paper.setup_words
     return [measured, _differences(title, "paper", trials, scenes, compared, find, below)]
-
-
-def _setup_words(paper: Published) -> str:
-    return " ".join(f"The paper on {topic}: it {words}." for topic, words in paper.setup.items())
 
 
 def _run_as(init: str, inits: set[str]) -> str:
@@ -202,7 +202,7 @@ def published_table(trials: Sequence[TrialResult], name: str) -> Table:
         of_paper = printed.arms[0] if len(printed.arms) == 1 else (arm.init, arm.densify)
         return printed.find(scene, *of_paper, key)
 
-    below = " ".join(notes), _setup_words(paper)
+    below = " ".join(notes), paper.setup_words
     return _differences(
         f"Difference from {name}", name, own, scenes, printed.quantities, find, below
     )
@@ -232,7 +232,7 @@ def _differences(
             if printed and cell.mean is not None:
                 mark = agreement(cell, printed)
                 marks[mark] += 1
-                decimals = max(one.decimals, _decimals(printed))
+                decimals = max(one.decimals, len(printed.partition(".")[2]))
                 change = signed(cell.mean - float(printed), f".{decimals}f")
                 entry = TableEntry(f"{change} {mark}", cell=cell)
             entries += [TableEntry(printed or ""), entry]
@@ -252,10 +252,6 @@ def _differences(
     return Table(title, ("scene", "init", "densify"), tuple(columns), tuple(rows), below)
 
 
-def _decimals(printed: str) -> int:
-    return len(printed.partition(".")[2])
-
-
 def agreement(cell: Cell, printed: str) -> str:
     """The mark of a measured cell: ``=``, ``≈`` or ``≠``.
 
@@ -263,7 +259,7 @@ def agreement(cell: Cell, printed: str) -> str:
     ``≈`` if its interval overlaps the range, else ``≠``. A single trial has no interval.
     """
     assert cell.mean is not None
-    value, half = float(printed), 0.5 * 10.0 ** -_decimals(printed)
+    value, half = float(printed), 0.5 * 10.0 ** -len(printed.partition(".")[2])
     low, high = value - half, value + half
     if low <= cell.mean <= high:
         return ROUNDING

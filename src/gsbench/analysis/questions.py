@@ -195,37 +195,27 @@ def ask(
         row for row in planned if not asked.split or row.config.get("scene.split") == asked.split
     ]
     if asked.named:
-        drafts = [
-            _named_draft(number, *one, planned, asked, measured)
-            for number, one in enumerate(asked.named, 1)
-        ]
+        drafts = []
+        for number, (named, sign, (least, relative)) in enumerate(asked.named, 1):
+            ideas, baselines = (named.rows(word, planned) for word in (named.idea, named.baseline))
+            arms = baselines[0].arm, ideas[0].arm
+            question = draft(*arms, [*baselines, *ideas], asked, measured)
+            drafts.append(
+                replace(
+                    question,
+                    metric=named.metric or asked.metric,
+                    sign=sign,  # type: ignore[arg-type]
+                    least=least,
+                    relative=relative,
+                    name=f"{named.idea}-{number}",
+                    says=named.says,
+                    where=named.where,
+                )
+            )
     else:
         pairs = choose_pairs(planned, asked, measured)
         drafts = [draft(*pair, planned, asked, measured) for pair in pairs]
     return _with_levels(drafts, planned, asked, measured, history)
-
-
-def _named_draft(
-    number: int,
-    named: NamedQuestion,
-    sign: int,
-    least: tuple[float | None, bool],
-    planned: Sequence[Trained],
-    asked: Asked,
-    measured: Sequence[Trained],
-) -> Question:
-    ideas, baselines = (named.rows(word, planned) for word in (named.idea, named.baseline))
-    question = draft(baselines[0].arm, ideas[0].arm, [*baselines, *ideas], asked, measured)
-    return replace(
-        question,
-        metric=named.metric or asked.metric,
-        sign=sign,  # type: ignore[arg-type]
-        least=least[0],
-        relative=least[1],
-        name=f"{named.idea}-{number}",
-        says=named.says,
-        where=named.where,
-    )
 
 
 def choose_pairs(

@@ -298,11 +298,10 @@ def median_interval(values: Array, level: float) -> Interval | None:
 def sign_test_needs(scenes: int, level: float) -> int | None:
     """The fewest of ``scenes`` with one sign for which the sign test has p ≤ ``level``, or None."""
     return next(
-        (agree for agree in range(scenes // 2 + 1, scenes + 1) if _sign_p(agree, scenes) <= level),
+        (
+            agree
+            for agree in range(scenes // 2 + 1, scenes + 1)
+            if 2 * float(special.bdtrc(agree - 1, scenes, 0.5)) <= level
+        ),
         None,
     )
-
-
-def _sign_p(agree: int, count: int) -> float:
-    """The two-sided p of the sign test if ``agree`` of ``count`` have the same sign."""
-    return min(1.0, 2 * float(special.bdtrc(agree - 1, count, 0.5))) if agree else 1.0

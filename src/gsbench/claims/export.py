@@ -92,13 +92,9 @@ def write_archive(
     files |= _searches(experiment.folder, kept)
     check_size(sum(map(len, files.values())))
     _write_zip(out, experiment.name, dict(sorted(files.items())))
-    return left_out, _open(experiment)
-
-
-def _open(experiment: Experiment) -> str:
     answers = compare(newest_code(experiment)).answers
     is_open = [verdict.is_open for one in answers for verdict in (one.verdict, *one.others)]
-    return f"open: {sum(is_open)} of {len(is_open)}" if any(is_open) else ""
+    return left_out, f"open: {sum(is_open)} of {len(is_open)}" if any(is_open) else ""
 
 
 def _write_zip(out: Path, name: str, files: Mapping[str, bytes]) -> None:

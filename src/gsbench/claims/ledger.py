@@ -116,9 +116,10 @@ class Book:
     def failure(self, idea: str) -> str:
         """The reason why an idea has no result, since its trials failed; "" otherwise."""
         own = self.ideas[idea].digests
-        measured = {digest for digest, _ in self.experiment.history.results}
-        measured |= {one.digest for one in self.experiment.trials}
-        for one in self.experiment.unfinished:
+        experiment = self.experiment
+        measured = {digest for digest, _ in experiment.history.results}
+        measured |= {one.digest for one in experiment.trials}
+        for one in experiment.unfinished:
             is_own = one.failed and own.get(one.scene) == one.digest
             if is_own and measured.isdisjoint(own.values()):
                 return TrialFolder(one.path).failure().reason
@@ -129,8 +130,7 @@ class Book:
             return "failed"
         verdict = self.verdicts[idea]
         found = result_of(verdict)
-        ended = verdict.final and (found != "kept" or idea in self.tests)
-        return found if ended else "begun"
+        return found if verdict.final and (found != "kept" or idea in self.tests) else "begun"
 
     def why(self, idea: str) -> str:
         """The reason of a result."""
@@ -143,16 +143,16 @@ class Book:
 
     def line(self, idea: str) -> str:
         """``larger_splits against baseline: kept: better; psnr +0.5 (…); 3 new seeds, level …``"""
-        verdict, test, facts = self.verdicts[idea], self.tests.get(idea), [self.why(idea)]
-        if not facts[0].startswith(result := self.result(idea)):  # such as undecided
-            facts[0] = f"{result}: {facts[0]}"
+        verdict, test = self.verdicts[idea], self.tests.get(idea)
+        text, result, seeds = self.why(idea), self.result(idea), verdict.pairs.seeds
+        if not text.startswith(result):  # such as undecided
+            text = f"{result}: {text}"
         if shown := numbers(verdict):
-            seeds = verdict.pairs.seeds
             where = f"{counted(seeds, 'seed')} of all ideas"
             if test:
                 where = f"{counted(seeds, 'new seed')}, level {50 * test.level:.2g} %"
-            facts += [f"{self.opened.metric} {shown}", where]
-        return f"{idea} against {self.ideas[idea].against}: {'; '.join(facts)}"
+            text += f"; {self.opened.metric} {shown}; {where}"
+        return f"{idea} against {self.ideas[idea].against}: {text}"
 
     @property
     def kept(self) -> list[str]:
@@ -181,9 +181,8 @@ class Book:
     def describe(self) -> list[str]:
         """Two lines: what decides, and how many of the planned ideas were tried and kept."""
         opened = self.opened
-        better = "more" if opened.sign > 0 else "less"
         return [
-            f"{opened.metric} decides: {better} is better, and "
+            f"{opened.metric} decides: {'more' if opened.sign > 0 else 'less'} is better, and "
             f"{least_text(opened.least, opened.relative)} is the least that matters. At most "
             f"{100 * opened.rate:g} % of the kept ideas are expected to be no better.",
             f"{self.tried} of {opened.ideas} planned ideas were tried, and {len(self.kept)} kept, "
@@ -224,7 +223,5 @@ def result_of(verdict: Verdict) -> Result:
     """The result by a verdict; an undecided idea may change with more seeds."""
     if verdict.outcome == "supported":
         return "kept"
-    is_dropped = (
-        verdict.equal or verdict.outcome in ("refuted", "too small to matter") or gives_up(verdict)
-    )
-    return "dropped" if is_dropped else "undecided"
+    is_open = verdict.outcome == "undecided" and not (verdict.equal or gives_up(verdict))
+    return "undecided" if is_open else "dropped"

@@ -18,7 +18,7 @@ from gsbench.claims.ledger import SCREEN, Book, read_ledger, result_of
 from gsbench.claims.stopping import Needed, SequentialTest, asked_difference, finished_trials
 from gsbench.config.command_words import typed_permissions
 from gsbench.config.compose import Trial
-from gsbench.config.overrides import key_of
+from gsbench.config.overrides import changed_words, key_of
 from gsbench.errors import GsbenchError, InputError
 from gsbench.eval.options import EvalConfig
 from gsbench.files import checked_runs_folder, make_runs_folder
@@ -40,8 +40,8 @@ from gsbench.settings import OpenFraction, is_folder_name
 from gsbench.verbs.arguments import ArgumentParser, number, whole_number
 from gsbench.words import listed
 
-EXIT_CODES = {"kept": 0, "dropped": 1, "failed": 1, "undecided": 3, "begun": 3}
-IDEAS, MOST_IDEAS, RATE = 40, 10_000, 0.1
+EXIT_CODES = {"kept": 0, "dropped": 1, "failed": 1}
+UNDECIDED = 3
 GIVEN = ("name", "runs", "eval.primary")  # settings that the ledger sets itself
 # An idea may change how a model is made, not what it is measured on.
 OF_IDEAS = ("densify", "init", "train", "raster")
@@ -104,7 +104,7 @@ def try_idea(options: argparse.Namespace, home: Path) -> int:
         if re.split("[./]", key)[0] not in OF_IDEAS + OF_RUNS:
             raise InputError(f"{key}: an idea may change {listed(OF_IDEAS)}, not what decides")
     start = _permitted_words(book.ideas[against], typed)
-    words = (start, _merged(start, typed))
+    words = (start, changed_words(start, typed))
     # The idea's new seeds need new trials of the baseline, so it must be what it was.
     if _compose(home, start, typed)[0].digests != book.ideas[against].digests:
         raise InputError(
@@ -123,7 +123,7 @@ def try_idea(options: argparse.Namespace, home: Path) -> int:
         question = book.questions[idea]
         if question.rule == rule and book.result(idea) in ("begun", "failed"):
             seeds = f"seed={','.join(map(str, next(iter(question.seeds.values()))))}"
-            sides = [_compose(home, _merged(own, [seeds]), typed)[1] for own in words]
+            sides = [_compose(home, changed_words(own, [seeds]), typed)[1] for own in words]
             fails = _train(question, {**sides[0], **sides[1]})
             append(home, promotion)
     book = read_ledger(home)
@@ -133,7 +133,7 @@ def try_idea(options: argparse.Namespace, home: Path) -> int:
         facts |= {"result": "failed", "reason": why}
         line = f"{idea}: failed: {why}"
     print(json.dumps(facts | _left(book)) if options.json else f"{line}\n{book.describe()[1]}")
-    return EXIT_CODES[facts["result"]]
+    return EXIT_CODES.get(facts["result"], UNDECIDED)
 
 
 def confirm(options: argparse.Namespace, home: Path) -> int:
@@ -142,7 +142,7 @@ def confirm(options: argparse.Namespace, home: Path) -> int:
     if not book.kept:
         raise InputError("no idea was kept, so there is nothing to confirm")
     sides = [
-        _compose(home, _merged(_permitted_words(book.ideas[one], typed), typed), typed, one)
+        _compose(home, changed_words(_permitted_words(book.ideas[one], typed), typed), typed, one)
         for one in (BASELINE, *book.kept)
     ]
     (old, trials), *ideas = sides
@@ -186,8 +186,8 @@ OPTIONS: dict[str, tuple[Any, ...]] = {  # their actions, and rows of `ArgumentP
     "settings* KEY=VALUE": ("new, try, confirm", "as of a sweep"),
     "--metric NAME": ("new", "decides, such as lpips_squeeze (psnr)", str, "psnr"),
     "--least SIZE": ("new", "the least difference that matters, as 0.1 or 10%% (the metric's)"),
-    "--ideas N": ("new", f"the most that are tried ({IDEAS})", whole_number(MOST_IDEAS), IDEAS),
-    "--fdr RATE": ("new", f"false discovery rate, 0 to 1 ({RATE})", number(OpenFraction), RATE),
+    "--ideas N": ("new", "the most that are tried (40)", whole_number(10_000), 40),
+    "--fdr RATE": ("new", "false discovery rate, 0 to 1 (0.1)", number(OpenFraction), 0.1),
     "--against IDEA": ("try", "a kept idea to start from (the baseline)", str, BASELINE),
     "--as=idea NAME": ("try", "the idea's name (default: densify.name)", str, ""),
     "--json": ("try, show", "print JSON"),
@@ -206,19 +206,18 @@ def _begin(home: Path, idea: Idea) -> str:
         book = read_ledger(home)
         if idea.digests in (book.ideas[BASELINE].digests, book.ideas[idea.against].digests):
             raise InputError(f"the idea is {idea.against} itself: give it other settings or code")
-        same = [
-            one.name
-            for one in book.ideas.values()
-            if (one.identity, one.against) == (idea.identity, idea.against)
-        ]
+        same = ""
+        for one in book.ideas.values():
+            if (one.identity, one.against) == (idea.identity, idea.against):
+                same = one.name
         # other ideas may have taken the place of one that failed
-        if (not same or book.failure(same[0])) and book.tried >= book.opened.ideas:
+        if (not same or book.failure(same)) and book.tried >= book.opened.ideas:
             raise InputError(
                 f"all {book.opened.ideas} planned ideas were tried, so the error rate is spent: "
                 "begin another ledger, with another baseline or other captures"
             )
         if same:
-            name = same[0]
+            name = same
             return None
         if name in book.ideas:
             name = f"{name}-{len(book.ideas)}"
@@ -279,22 +278,8 @@ def _permitted_words(idea: Idea, typed: Sequence[str]) -> list[str]:
     if needed := set(typed_permissions(idea.words)) - allowed:
         names = ",".join(sorted(needed | allowed))
         raise InputError(f"{idea.name} runs code of yours: add allow_targets=[{names}]")
-    # recorded settings may be of another tracker
-    tracking = [word for word in typed if _is_tracking(word)]
-    return [*(word for word in idea.words if not (tracking and _is_tracking(word))), *tracking]
-
-
-def _is_tracking(word: str) -> bool:
-    return key_of(word).startswith("tracking")
-
-
-def _merged(words: Sequence[str], changes: Sequence[str]) -> list[str]:
-    """The words with ``changes``: each replaces the word of the same key, ``~KEY`` removes it."""
-    own = {key_of(word): word for word in words}
-    for word in changes:
-        if own.pop(key_of(word), None) is None or not word.startswith("~"):
-            own[key_of(word)] = word
-    return list(own.values())
+    tracking = [word for word in typed if key_of(word).startswith("tracking")]
+    return changed_words(idea.words, tracking)
 
 
 def _train(question: Question, trials: Trials) -> str:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from gsbench.errors import InputError
-from gsbench.raster.executors import AUTO, EXECUTORS, names, resolve
+from gsbench.raster.executors import AUTO, EXECUTORS, missing_tools, names, resolve
 from gsbench.runs.trial_record import RasterProof
 from gsbench.scene.rules import MIN_SIZE
 from gsbench.system.install import install_command, version_of
@@ -219,16 +219,8 @@ def check_devices() -> Iterator[Finding]:
             yield Finding("note", "rasterizer", f"{name} {executor.obstacle(devices[-1])}")
     chosen = " and ".join(f"{resolve('auto', device).name} on {device}" for device in devices)
     yield Finding("ok", "rasterizer", f"raster=auto is {chosen}")
-    yield from check_triton()
-
-
-def check_triton() -> Iterator[Finding]:
-    """Findings about the compiler that raster=triton needs at its first run on a GPU."""
-    from gsbench.raster.executors import missing_tools
-
     # Triton comes with torch for CUDA: without it there is no GPU to run it on.
-    missing = missing_tools() if version_of("triton") else []
-    if missing:
+    if version_of("triton") and (missing := missing_tools()):
         text = f"at its first run on a GPU it needs {' and '.join(missing)}"
         yield Finding("note", "triton", text)
 

@@ -30,7 +30,6 @@ from gsbench.analysis.paper import (
 )
 from gsbench.analysis.quantities import Quantity, quantity
 from gsbench.analysis.results import (
-    Arm,
     Experiment,
     TrialResult,
     load_experiment,
@@ -98,7 +97,9 @@ def tables(argv: Sequence[str], runs: Path) -> int:
     if options.format == TRIALS:
         texts = {"-trials.csv": csv_of(to_frame(trials))}
     else:
-        comparison = _comparison(experiments, trials, where)
+        comparison = joined([compare(experiment) for experiment in experiments])
+        if where:
+            comparison = chosen(comparison, trials, where_words(where))
         if options.format == JSON:
             texts = {f".{JSON}": json.dumps(comparison.to_json(), indent=1) + "\n"}
         else:
@@ -114,14 +115,6 @@ def _format_of(out: Path | None) -> str:
             if out.suffix.lower() == f".{suffix}":
                 return name
     return "md"
-
-
-def _comparison(
-    experiments: Sequence[Experiment], trials: Sequence[TrialResult], where: Mapping[str, str]
-) -> Comparison:
-    """The verdicts of one experiment or two, about the chosen trials."""
-    comparison = joined([compare(experiment) for experiment in experiments])
-    return chosen(comparison, trials, where_words(where)) if where else comparison
 
 
 def _tables(
@@ -157,14 +150,10 @@ def _fairness_sheets(comparison: Comparison, format_name: str) -> dict[str, str]
     suffix, writer = FORMATS[format_name]
     sheets = {}
     for first, second in comparison.pairs:
-        end = f"-{FAIRNESS}-{_as_file(second)}-{_as_file(first)}.{suffix}"
+        arms = (re.sub(r"[^\w.=-]+", "_", str(arm)) for arm in (second, first))
+        end = f"-{FAIRNESS}-{'-'.join(arms)}.{suffix}"
         sheets[end] = writer(fairness_table(comparison.trials, first, second))
     return sheets
-
-
-def _as_file(arm: Arm) -> str:
-    """An arm, with its variant, as part of a file's name."""
-    return re.sub(r"[^\w.=-]+", "_", str(arm))
 
 
 def _write(texts: Mapping[str, str], out: Path | None, name: str) -> None:
@@ -239,7 +228,10 @@ def explain_cell(address: str, runs: Path) -> str:
     ]
     if cell.reason:
         lines.append(f"  not available: {cell.reason}")
-    lines += ["", "Verdicts", *(f"  {line}" for line in _verdicts_on(experiment, trials[0].arm))]
+    answers = compare(experiment).answers
+    about = [one.line for one in answers if trials[0].arm in (one.arm, one.baseline)]
+    about = about or ["none: it is compared with no other arm"]
+    lines += ["", "Verdicts", *(f"  {line}" for line in about)]
     conditions = trials[0].conditions.items()
     lines += ["", "Conditions", *(f"  {key}: {value}" for key, value in conditions)]
     lines += _trials_lines(trials, shown)
@@ -250,12 +242,6 @@ def explain_cell(address: str, runs: Path) -> str:
     if left_out := [*(line for line in experiment.faults if line.startswith(start)), *versions]:
         lines += ["", "Left out", *(f"  {line}" for line in left_out)]
     return "\n".join(lines)
-
-
-def _verdicts_on(experiment: Experiment, arm: Arm) -> list[str]:
-    """The badges and sentences of the questions about an arm, on either side."""
-    answers = [one for one in compare(experiment).answers if arm in (one.arm, one.baseline)]
-    return [answer.line for answer in answers] or ["none: it is compared with no other arm"]
 
 
 def _trials_at(experiment: Experiment, scene: str, word: str) -> list[TrialResult]:

@@ -17,7 +17,7 @@ from rich.text import Text
 
 from gsbench.config.command_words import makes_other_trials, parse, typed_permissions
 from gsbench.config.compose import Trial, compose_one
-from gsbench.config.overrides import key_of
+from gsbench.config.overrides import changed_words, key_of
 from gsbench.errors import GsbenchError, InputError
 from gsbench.files import checked_runs_folder, make_runs_folder
 from gsbench.launch.dry_run import describe_plan
@@ -212,15 +212,10 @@ def recompose(
         if Path(planned.cwd).is_dir():
             # relative paths were meant from there, and the trials are run from there
             os.chdir(planned.cwd)
-        replaced = {PERMISSIONS, *map(key_of, changes)}
-        kept = [word for word in planned.words if key_of(word) not in replaced]
-        added = set(changes) - set(planned.words)
-        if any(change.startswith("launch=") for change in added):
-            # Planned settings of a launcher were meant for the other one.
-            kept = [word for word in kept if not word.startswith("launch.")]
+        kept = [word for word in planned.words if key_of(word) != PERMISSIONS]
         # Modules are not taken from planned.cwd: somebody else's plan would name a folder of
         # theirs.
-        trial = compose_one([*kept, *changes], typed=changes, modules=modules)
+        trial = compose_one(changed_words(kept, changes), typed=changes, modules=modules)
         return Trial(trial.values | {"runs": str(runs)}, trial.overrides)
     files, allowed = TrialFolder(folder), typed_permissions(changes)
     if any(key_of(change) != PERMISSIONS for change in changes):

@@ -205,7 +205,19 @@ def _forest(verdict: Verdict) -> str:
 
 def provenance(trials: Sequence[TrialResult]) -> Table:
     """One row per trial: its folder, conditions, hashes, code, machine and versions."""
-    facts_by_trial = {trial.label: _facts_of(trial) for trial in trials}
+    facts_by_trial = {}
+    for trial in trials:
+        record = trial.record
+        versions = (f"{name} {version}" for name, version in record.versions.items())
+        facts_by_trial[trial.label] = {
+            "raster": record.raster,
+            "protocol": record.protocol,
+            "iterations": str(record.iterations),
+            **{f"{key} hash": value[:12] for key, value in record.hashes.items()},
+            "code": ", ".join(trial.code_texts),
+            "machine": trial.machine or "",
+            "versions": ", ".join(versions),
+        }
     names = dict.fromkeys(itertools.chain(*facts_by_trial.values()))
     columns = tuple(Column("", name, ("provenance", name)) for name in names)
     rows = []
@@ -213,19 +225,6 @@ def provenance(trials: Sequence[TrialResult]) -> Table:
         entries = tuple(TableEntry(facts.get(name, "")) for name in names)
         rows.append(Row((label,), entries))
     return Table("Trials", ("trial",), columns, tuple(rows), wrapped=True)
-
-
-def _facts_of(trial: TrialResult) -> dict[str, str]:
-    record = trial.record
-    return {
-        "raster": record.raster,
-        "protocol": record.protocol,
-        "iterations": str(record.iterations),
-        **{f"{key} hash": value[:12] for key, value in record.hashes.items()},
-        "code": ", ".join(trial.code_texts),
-        "machine": trial.machine or "",
-        "versions": ", ".join(f"{name} {version}" for name, version in record.versions.items()),
-    }
 
 
 def search_summary(home: Path) -> tuple[str, str] | None:

@@ -102,7 +102,14 @@ def volume_charts(
     notes = []
     for arm in arms:
         try:
-            volumes = np.concatenate([*map(_volumes_in_training, trials_of(trials, arm))])
+            # in the cubed units of their training
+            volumes = np.concatenate(
+                [
+                    log10_volumes(trial.path / layout.POINT_CLOUD)
+                    + 3 * math.log10(trial.record.to_training.scale)
+                    for trial in trials_of(trials, arm)
+                ]
+            )
         except InputError as error:
             notes.append(f"{arm}: no histogram, {error}")
             continue
@@ -122,13 +129,6 @@ def volume_charts(
         for title, own in lines.items()
     ]
     return list(filter(None, charts)), notes
-
-
-def _volumes_in_training(trial: TrialResult) -> NDArray[np.float64]:
-    """log10 of the volumes [N] of a trial's Gaussians, in its training's cubed units."""
-    return log10_volumes(trial.path / layout.POINT_CLOUD) + 3 * math.log10(
-        trial.record.to_training.scale
-    )
 
 
 def log10_volumes(path: Path) -> NDArray[np.float64]:
