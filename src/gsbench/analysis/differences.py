@@ -213,15 +213,15 @@ def compared_trials(trials: Iterable[TrialResult], first: Arm, second: Arm) -> l
     by_arm = group_by(trials, "arm")
     ones, others = by_arm[first], by_arm[second]
     here, there = (group_by(own, "scene") for own in (ones, others))
-    shared = [_first_pair(own, there[scene]) for scene, own in here.items() if scene in there]
-    return shared or [_first_pair(ones, others)]
-
-
-def _first_pair(ones: Sequence[TrialResult], others: Sequence[TrialResult]) -> TrialPair:
-    """The first trials of one seed, else the first ones."""
-    of_seed = {trial.seed: trial for trial in reversed(others)}
-    pairs = ((one, of_seed[one.seed]) for one in ones if one.seed in of_seed)
-    return next(pairs, (ones[0], others[0]))
+    pairs = []
+    for mine, theirs in [
+        *((own, there[scene]) for scene, own in here.items() if scene in there),
+        (ones, others),
+    ]:
+        of_seed = {trial.seed: trial for trial in reversed(theirs)}
+        same = ((one, of_seed[one.seed]) for one in mine if one.seed in of_seed)
+        pairs.append(next(same, (mine[0], theirs[0])))
+    return pairs[:-1] or pairs
 
 
 def ingredients_note(names: Sequence[str], first: Arm, second: Arm) -> Note:

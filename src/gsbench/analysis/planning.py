@@ -158,6 +158,8 @@ def fewest_seeds(
 ) -> list[Design]:
     """The designs with a power of `POWER`, one per number of ``scenes``, with the fewest seeds.
 
+    Those with the fewest trials come first.
+
     A number of scenes is left out if it needs more than ``most`` seeds, or no fewer seeds than
     fewer scenes do. The power rises with the number of seeds.
     """
@@ -171,7 +173,7 @@ def fewest_seeds(
             enough = power(Design(count, middle)) >= POWER
             low, high = (low, middle) if enough else (middle + 1, high)
         chosen.append(Design(count, high))
-    return chosen
+    return sorted(chosen, key=lambda design: (design.trials, design.scenes))
 
 
 def sweep_power(
@@ -182,19 +184,15 @@ def sweep_power(
 
 
 def sweep_designs(difference: float, noise: Components, level: float = ALPHA) -> list[Design]:
-    """The designs of sweeps with a power of `POWER`, those with the fewest trials first."""
+    """The designs of sweeps with a power of `POWER`, as `fewest_seeds` gives them."""
     power = partial(sweep_power, difference=difference, noise=noise, level=level)
-    return cheapest_first(fewest_seeds(power, range(1, MAX_SCENES + 1)))
+    return fewest_seeds(power, range(1, MAX_SCENES + 1))
 
 
 def designs_like_these(difference: float, noise: Components) -> list[Design]:
     """The same for the statement on scenes like these, from `MIN_SCENES` scenes on."""
     power = partial(power_like_these, difference=difference, components=noise)
-    return cheapest_first(fewest_seeds(power, range(MIN_SCENES, MAX_SCENES + 1)))
-
-
-def cheapest_first(designs: Iterable[Design]) -> list[Design]:
-    return sorted(designs, key=lambda design: (design.trials, design.scenes))
+    return fewest_seeds(power, range(MIN_SCENES, MAX_SCENES + 1))
 
 
 def seeds_needed(deviation: float, scenes: int, difference: float) -> int | None:

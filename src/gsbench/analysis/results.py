@@ -217,7 +217,10 @@ def newest_code(experiment: Experiment) -> Experiment:
 
     def fold(made: Sequence[TrialResult], now: TrialResult | None, name: str) -> None:
         older.extend(made)
-        change = _change_of_code(made[0], now) if now else Change("code", name, now="newer")
+        change = Change("code", name, now="newer")
+        if now:  # the first part in which they differ
+            parts = dict.fromkeys([*now.code, *made[0].code], "none")
+            change = next(code_changes(parts | made[0].code, (parts | now.code).get))
         earlier = replaced.setdefault((change.name, change.now), {})
         earlier.setdefault(change.made, []).extend(made)
 
@@ -295,12 +298,6 @@ def _newest_first(groups: Mapping[K, Sequence[TrialResult]]) -> list[K]:
     return sorted(groups, key=lambda key: max(one.finished for one in groups[key]), reverse=True)
 
 
-def _change_of_code(made: TrialResult, newest: TrialResult) -> Change:
-    """The first part of the code in which two trials differ."""
-    parts = dict.fromkeys([*newest.code, *made.code], "none")
-    return next(code_changes(parts | made.code, (parts | newest.code).get))
-
-
 def _versions_line(part: str, now: str, earlier: Mapping[str, Sequence[TrialResult]]) -> str:
     """``sw: 6 trials of sfm-mine made by earlier versions of mine: 3fa9c1d2 (4), …``"""
     trials = [trial for made in earlier.values() for trial in made]
@@ -371,7 +368,12 @@ def read_trial(path: Path, runs_dir: Path, settings: Configurations) -> TrialRes
                 f"damaged, {change}: `{command('retry', record.experiment)}` repairs it"
             )
     except FileNotFoundError:
-        raise UnusableError(_why_unfinished(path)) from None
+        why = f"unfinished, no {RESULTS} yet"
+        if (path / FAILED).exists():
+            why = f"failed, {folder.failure().reason}"
+        elif not (path / CONFIG).is_file():
+            why = f"{FOREIGN}, not a trial"
+        raise UnusableError(why) from None
     except DamagedError as error:
         state = "unfinished" if isinstance(error, UnfinishedError) else "damaged"
         raise UnusableError(f"{state}, {error.path.name} {error.reason}") from None
@@ -389,11 +391,3 @@ def read_trial(path: Path, runs_dir: Path, settings: Configurations) -> TrialRes
         if value != name:
             raise UnusableError(f"{FOREIGN}, its {RESULTS} is of {key} {value!r}")
     return TrialResult(path, match["hash"], record, settings=settings)
-
-
-def _why_unfinished(path: Path) -> str:
-    if (path / FAILED).exists():
-        return f"failed, {TrialFolder(path).failure().reason}"
-    return (
-        f"unfinished, no {RESULTS} yet" if (path / CONFIG).is_file() else f"{FOREIGN}, not a trial"
-    )

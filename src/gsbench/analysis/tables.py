@@ -92,7 +92,12 @@ def build_table(
     shown_best = winners(comparison)
     bold = _best(cells, quantities, shown_best, varied)
     shown, notes = _rows(cells, bold, quantities), list[Note]()
-    if "scene" in rows and len(scenes) > 1 and _have_unlike_scenes(varied):
+    # scenes of an arm may have different conditions or versions of the code
+    unlike = any(
+        conditions_between_scenes(of_arm) or differing_code(of_arm)
+        for of_arm in group_by(varied, "arm").values()
+    )
+    if "scene" in rows and len(scenes) > 1 and unlike:
         notes.append(Note.of("no mean"))
     elif "scene" in rows and len(scenes) > 1:
         place = list(rows).index("scene")
@@ -244,15 +249,6 @@ def _means(
         labels = (*row[:scene_index], label, *row[scene_index:])
         cells[labels, column, quantity.key] = make_cell(averaged, quantity, own_scenes, expected)
     return cells if most_scenes else {}
-
-
-def _have_unlike_scenes(trials: Sequence[TrialResult]) -> bool:
-    """Return whether the scenes of an arm have different conditions or versions of the code.
-
-    ``trials`` have their variants.
-    """
-    by_arm = group_by(trials, "arm").values()
-    return any(conditions_between_scenes(of_arm) or differing_code(of_arm) for of_arm in by_arm)
 
 
 def _reading_notes(

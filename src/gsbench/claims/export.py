@@ -72,7 +72,11 @@ def write_archive(
     """
     left_out = list(experiment.warnings)
     unfinished = {one.path for one in experiment.unfinished if one.path.is_dir()}
-    files, kept = _of_experiment(experiment.folder), list[TrialResult]()
+    files, kept, home = dict[str, bytes](), list[TrialResult](), experiment.folder
+    if (home / COMMANDS).is_file():
+        files[f"{home.name}/{COMMANDS}"] = _shared_commands(home)
+    if (home / DECLARED).is_file():
+        files[f"{home.name}/{DECLARED}"] = read_bytes(home / DECLARED)
     for trial in (*experiment.trials, *experiment.older):
         try:
             files |= _of_trial(trial, pictures)
@@ -89,7 +93,7 @@ def write_archive(
             with suppress(InputError):  # a trial whose pictures cannot be read
                 measures = PixelMeasures(error_textured=textured_error(trial)).to_json()
                 files[f"{_folder(trial.path)}/{FROM_PIXELS}"] = _page(measures)
-    files |= _searches(experiment.folder, kept)
+    files |= _searches(home, kept)
     check_size(sum(map(len, files.values())))
     _write_zip(out, experiment.name, dict(sorted(files.items())))
     answers = compare(newest_code(experiment)).answers
@@ -134,16 +138,6 @@ def _of_unfinished(path: Path) -> dict[str, bytes]:
     if TrialFolder(path).state() in ("failed", "damaged"):
         reason = without_folders(TrialFolder(path).failure().reason)
         files[f"{folder}/{FAILED}"] = _page({"status": "failed", "message": reason})
-    return files
-
-
-def _of_experiment(home: Path) -> dict[str, bytes]:
-    """The experiment's own records."""
-    files = {}
-    if (home / COMMANDS).is_file():
-        files[f"{home.name}/{COMMANDS}"] = _shared_commands(home)
-    if (home / DECLARED).is_file():
-        files[f"{home.name}/{DECLARED}"] = read_bytes(home / DECLARED)
     return files
 
 

@@ -60,7 +60,11 @@ def ablate(argv: Sequence[str], runs: Path) -> int:
     switches = choose_switches(declared, options.switches, densify)
     grids = []
     for run in runs_to_train(switches):
-        off = _settings(off_settings(run, switches), values["densify"])
+        # a key that the densifier lacks needs Hydra's plus
+        off = {
+            f"{'' if key in values['densify'] else '+'}densify.{key}": value_text(value)
+            for key, value in off_settings(run, switches).items()
+        }
         settings = [f"{key}={value}" for key, value in off.items()]
         check_parts(compose_trials([*words, *settings], multirun=True)[:1], on_this_machine=False)
         if off in grids:
@@ -103,14 +107,6 @@ def _only_densifier(trials: Sequence[Trial]) -> str:
             "ablate needs one initialiser and one densifier: only scene and seed may list values"
         )
     return str(trials[0].values["densify"]["name"])
-
-
-def _settings(off: dict[str, Any], densify: dict[str, Any]) -> dict[str, str]:
-    """The settings that turn parts off; a key that the densifier lacks needs Hydra's plus."""
-    return {
-        f"{'' if key in densify else '+'}densify.{key}": value_text(value)
-        for key, value in off.items()
-    }
 
 
 def declared_switches(

@@ -81,7 +81,13 @@ def _result(options: argparse.Namespace) -> str:
     with tempfile.TemporaryDirectory() as folder:
         archived = unpack_archive(options.archive, Path(folder)).trials
         baseline = _baseline(select_trials(archived, dict(options.where)), by_scene)
-        seeds = _seeds(baseline, options.seeds)
+        of_scenes = ({trial.seed for trial in own} for own in baseline.values())
+        shared = sorted(set.intersection(*of_scenes))
+        if options.seeds is not None and not 0 < options.seeds <= len(shared):
+            raise InputError(
+                f"--seeds {options.seeds}: the archive has {len(shared)} seeds of all scenes"
+            )
+        seeds = shared[: options.seeds]
         question = declare_gate(options.metric, options.least, baseline, seeds, example.values)
         trials = {
             (scene, NEW, seed): with_seed(trial, seed)
@@ -142,16 +148,6 @@ def _baseline(
             )
         baseline[scene] = old
     return baseline
-
-
-def _seeds(baseline: Mapping[str, Sequence[TrialResult]], most: int | None) -> list[int]:
-    """The seeds that all scenes have, ``most`` at most; raises InputError if there are fewer."""
-    shared = sorted(
-        set.intersection(*({trial.seed for trial in trials} for trials in baseline.values()))
-    )
-    if most is not None and not 0 < most <= len(shared):
-        raise InputError(f"--seeds {most}: the archive has {len(shared)} seeds of all scenes")
-    return shared[:most]
 
 
 def ask_gate(question: Question, baseline: ReadTrials, new: ReadTrials) -> SequentialTest:

@@ -30,7 +30,6 @@ from gsbench.analysis.paper import (
 )
 from gsbench.analysis.quantities import Quantity, quantity
 from gsbench.analysis.results import (
-    Experiment,
     TrialResult,
     load_experiment,
 )
@@ -216,7 +215,11 @@ def explain_cell(address: str, runs: Path) -> str:
         raise InputError(f"{address!r} is not {CELL}")
     name, scene, metric, arm = parts
     experiment = load_experiment(runs, name)
-    trials = _trials_at(experiment, scene, arm)
+    of_scene = [trial for trial in with_variants(experiment.trials) if trial.scene == scene]
+    if not of_scene:
+        scenes = ", ".join(sorted({trial.scene for trial in experiment.trials}))
+        raise InputError(f"experiment {name!r} has no scene {scene!r}; it has {scenes}")
+    trials = trials_of_arm(of_scene, arm, f" of {scene}")
     shown = quantity(metric, trials)
     check_averageable(trials, f"scene={scene} {arm}")
     expected = len(experiment.seeds)
@@ -242,15 +245,6 @@ def explain_cell(address: str, runs: Path) -> str:
     if left_out := [*(line for line in experiment.faults if line.startswith(start)), *versions]:
         lines += ["", "Left out", *(f"  {line}" for line in left_out)]
     return "\n".join(lines)
-
-
-def _trials_at(experiment: Experiment, scene: str, word: str) -> list[TrialResult]:
-    """The trials of a scene and of the one arm that ``word`` names."""
-    of_scene = [trial for trial in with_variants(experiment.trials) if trial.scene == scene]
-    if not of_scene:
-        scenes = ", ".join(sorted({trial.scene for trial in experiment.trials}))
-        raise InputError(f"experiment {experiment.name!r} has no scene {scene!r}; it has {scenes}")
-    return trials_of_arm(of_scene, word, f" of {scene}")
 
 
 def _trials_lines(trials: Sequence[TrialResult], shown: Quantity) -> list[str]:

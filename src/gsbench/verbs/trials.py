@@ -74,7 +74,11 @@ def status(argv: Sequence[str], runs: Path) -> int:
     _say_what_is_lost(home)
     trials = states_now(home)
     if options.verify:
-        trials = [_verified(trial) for trial in trials]
+        for number, trial in enumerate(trials):
+            if trial.state in ("done", "superseded"):
+                fault = TrialFolder(trial.folder).fault_when_read()
+                if fault is not None:
+                    trials[number] = replace(trial, state="damaged", note=str(fault))
     if options.forget_superseded:
         superseded = [trial for trial in trials if trial.state == "superseded"]
         remove(home, [trial.folder for trial in superseded])
@@ -100,14 +104,6 @@ def _say_what_is_lost(home: Path) -> None:
     """Print a line for each fault of the plan: what it lists may be missing from the states."""
     for fault in read_history(home).faults:
         print(f"left out: {fault}", file=sys.stderr)
-
-
-def _verified(trial: TrialState) -> TrialState:
-    """The state after all files of a finished trial were read; damaged if one has changed."""
-    if trial.state not in ("done", "superseded"):
-        return trial
-    fault = TrialFolder(trial.folder).fault_when_read()
-    return trial if fault is None else replace(trial, state="damaged", note=str(fault))
 
 
 def _watch(runs: Path, experiment: str) -> None:

@@ -36,7 +36,7 @@ from gsbench.analysis.verdicts import Verdict
 from gsbench.eval.facts import find_metric
 from gsbench.parsing import read_if_sound
 from gsbench.runs import layout
-from gsbench.runs.experiments import Arm, TuningRecord
+from gsbench.runs.experiments import TuningRecord
 from gsbench.scene.images import read_image
 from gsbench.words import command, counted, signed
 
@@ -128,34 +128,23 @@ def compare_arms(trials: Sequence[TrialResult], judged: Answer) -> dict[str, Any
     first, second = judged.baseline, judged.arm
     verdicts = [judged.verdict, *judged.metrics]
     views, faults = choose_views(pair_trials(trials, first, second))
-    return {
+    baseline, other = trials_of(trials, first), trials_of(trials, second)
+    both: dict[str, Any] = {"caveats": "", "fairness": None, "facts": []}
+    if baseline and other:  # neither is awaited
+        unlike = [*counts_notes(trials, [(first, second)]), *caveats(trials, first, second)]
+        both = {
+            "caveats": " ".join(texts(unlike)),
+            "fairness": fairness_table(trials, first, second),
+            "facts": [*_costs(baseline, other), *between_scenes_notes(baseline, other)],
+        }
+    return both | {
         "judged": judged,
         "title": f"{second} against {first}",
         "verdicts": verdicts,
         "has_like_these": judged.verdict.like_these is not None,
-        **_settings_of_both(trials, first, second),
         "forests": [_forest(verdict) for verdict in verdicts],
         "views": views,
         "notes": texts([*judged.verdict.notes, *faults]),
-    }
-
-
-def _settings_of_both(trials: Sequence[TrialResult], first: Arm, second: Arm) -> dict[str, Any]:
-    """Differences between the settings and the costs of two arms; none while one is awaited."""
-    baseline, other = trials_of(trials, first), trials_of(trials, second)
-    if not (baseline and other):
-        return {"caveats": "", "fairness": None, "facts": []}
-    return {
-        "caveats": " ".join(
-            texts(
-                [
-                    *counts_notes(trials, [(first, second)]),
-                    *caveats(trials, first, second),
-                ]
-            )
-        ),
-        "fairness": fairness_table(trials, first, second),
-        "facts": [*_costs(baseline, other), *between_scenes_notes(baseline, other)],
     }
 
 
