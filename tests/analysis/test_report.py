@@ -28,7 +28,6 @@ from gsbench.analysis.report.charts import (
 from gsbench.analysis.report.curves import (
     _logged_histograms,
     _threshold,
-    _volumes_in_training,
     event_table,
     histogram,
     log10_volumes,
@@ -232,9 +231,7 @@ def test_volumes_are_those_of_the_ellipsoids(experiment):
     volumes = 4 / 3 * np.pi * scales.prod(axis=0)
     found = log10_volumes(path)
     assert found == pytest.approx(np.log10(volumes), abs=1e-6)
-    record = SimpleNamespace(to_training=SimpleNamespace(scale=10.0))
-    enlarged = _volumes_in_training(SimpleNamespace(path=path.parent, record=record))
-    assert enlarged == pytest.approx(found + 3)
+    assert log10_volumes(path, 10.0) == pytest.approx(found + 3)
     shares = histogram(np.append(found, -np.inf))
     assert sum(share for _, share in shares) == pytest.approx(1)
     assert sum(share for volume, share in shares if volume > 1e-4) == pytest.approx(

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import statistics
 from collections import Counter
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -28,7 +28,6 @@ from gsbench.words import value_words
 if TYPE_CHECKING:
     import pandas as pd
 
-K = TypeVar("K", bound=Hashable)
 C = TypeVar("C", Planned, TrialResult)
 
 IDENTITY = ("experiment", "scene", "init", "densify", "seed")

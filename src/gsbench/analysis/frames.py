@@ -22,14 +22,14 @@ from gsbench.eval.facts import find_metric
 from gsbench.parsing import Count, Record, Text
 from gsbench.runs.commands import Command, History, Question
 from gsbench.runs.experiments import Arm
-from gsbench.runs.layout import SEED as SEED_MARK
+from gsbench.runs.layout import SEED
 from gsbench.runs.trial_record import MetricRecord, TrialRecord
 from gsbench.words import did_you_mean, listed
 
 if TYPE_CHECKING:
     import pandas as pd
 
-METHOD, SCENE, SEED = COLUMNS = ("method", "scene", "seed")
+COLUMNS = ("method", "scene", "seed")
 DIRECTIONS = {"": 0, "higher": 1, "lower": -1}
 BETTER = {sign: word for word, sign in DIRECTIONS.items()}
 
@@ -137,7 +137,7 @@ def _absent(
 
 def _place(folder: Path, scene: str, method: str, seed: int) -> Path:
     """A path of a row, as the folder of a trial is called."""
-    return folder / scene / method.replace("/", "_") / f"row{SEED_MARK}{seed}"
+    return folder / scene / method.replace("/", "_") / f"row{SEED}{seed}"
 
 
 def _question(

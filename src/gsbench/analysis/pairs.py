@@ -52,10 +52,6 @@ class Pairs:
     relative: bool = False  # compare logarithms
 
     @property
-    def scenes(self) -> tuple[str, ...]:
-        return tuple(row.scene for row in self.rows)
-
-    @property
     def seeds(self) -> int:
         """The number of seeds that all scenes have."""
         return min((len(row.seeds) for row in self.rows), default=0)

@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from importlib.resources import files
+from pathlib import Path
 
 import yaml
 
@@ -23,6 +23,7 @@ from gsbench.words import did_you_mean, signed
 OWN = "_own"
 STAND_FOR = {"dim_paper": "dim"}  # our initialiser -> the paper's initialiser that it repeats
 CONFIDENCE = 0.95
+FOLDER = Path(__file__).with_name("published")
 PAPER = "volumetric"  # the paper of the method
 PRINTED_NAMES = {"adc": "3DGS", "volumetric": "Ours", "sfm": "SfM", "dim": "DIM"}
 # marks of measured cells beside printed numbers (`agreement`)
@@ -72,10 +73,7 @@ class Published:
 
 def published_names() -> list[str]:
     """The names of the papers whose numbers ship with gsbench."""
-    folder = files("gsbench.analysis").joinpath("published")
-    return sorted(
-        file.name.removesuffix(".yaml") for file in folder.iterdir() if file.name.endswith(".yaml")
-    )
+    return sorted(file.stem for file in FOLDER.glob("*.yaml"))
 
 
 @cache
@@ -87,8 +85,7 @@ def load_published(name: str = PAPER) -> Published:
             f"no published numbers {name!r}{did_you_mean(name, names)} (there are: "
             f"{', '.join(names)})"
         )
-    file = files("gsbench.analysis").joinpath(f"published/{name}.yaml")
-    content = yaml.safe_load(file.read_text(encoding="utf-8"))
+    content = yaml.safe_load((FOLDER / f"{name}.yaml").read_text("utf-8"))
     tables = {
         table: PrintedTable(**printed | {"arms": list(map(tuple, printed["arms"]))})
         for table, printed in content["tables"].items()

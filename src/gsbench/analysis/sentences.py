@@ -44,7 +44,7 @@ def least_words(verdict: Verdict) -> str:
 def badge(verdict: Verdict) -> str:
     """The verdict in one or two words: ``BETTER``, ``TOO SMALL``, ``RUNNING 3/6``."""
     if verdict.is_open and not verdict.untestable:
-        return f"{verdict.state.upper()} {verdict.done}/{verdict.wanted}"
+        return f"{verdict.state.upper()} {verdict.done}/{verdict.question.trials}"
     if not verdict.is_tested:
         return verdict.state.removesuffix(" beforehand").upper()
     if verdict.outcome == "refuted" and not verdict.question.sign:
@@ -114,7 +114,7 @@ def reason(verdict: Verdict) -> str:
 
 def _waits(verdict: Verdict) -> str:
     """Why a question has no verdict yet, and the command that goes on."""
-    count = f"{verdict.done} of {counted(verdict.wanted, 'trial')}"
+    count = f"{verdict.done} of {counted(verdict.question.trials, 'trial')}"
     if verdict.state == "running":
         return f"no verdict before all its trials are done: {count}"
     if verdict.question.rule in ("table", "declared table"):

@@ -92,11 +92,6 @@ class Verdict:
         """Return whether it waits for trials of its question."""
         return self.state in ("running", "stopped")
 
-    @property
-    def wanted(self) -> int:
-        """The number of the question's trials."""
-        return self.question.trials
-
     @cached_property
     def scenes(self) -> list[SceneRow]:
         """The estimates of single scenes."""

@@ -213,8 +213,12 @@ def as_files(name: str, contents: Mapping[str, bytes]) -> dict[str, bytes]:
         return [json.loads(line) for line in contents.get(member, b"").decode().splitlines()]
 
     texts: dict[str, str] = {}
-    for line in lines("results.jsonl"):
-        texts[f"{line['folder']}/{RESULTS}"] = json.dumps(line["results"])
+    for member, file, part in (
+        ("results.jsonl", RESULTS, "results"),
+        ("from_pixels.jsonl", FROM_PIXELS, "measures"),
+    ):
+        for line in lines(member):
+            texts[f"{line['folder']}/{file}"] = json.dumps(line[part])
     for line in lines("configurations.jsonl"):
         for folder, seed in line["trials"]:
             values = line["configuration"] | {"seed": seed}
@@ -222,8 +226,6 @@ def as_files(name: str, contents: Mapping[str, bytes]) -> dict[str, bytes]:
     for line in lines("unfinished.jsonl"):
         texts[f"{line['folder']}/{CONFIG}"] = yaml.safe_dump(line["configuration"])
         texts[f"{line['folder']}/{FAILED}"] = "{}"
-    for line in lines("from_pixels.jsonl"):
-        texts[f"{line['folder']}/{FROM_PIXELS}"] = json.dumps(line["measures"])
     frame = pd.read_csv(io.BytesIO(contents[PER_VIEW]), dtype=str, keep_default_na=False)
     for folder, own in frame.groupby("trial", sort=False):
         views = own.drop(columns="trial").to_csv(index=False, lineterminator="\n")

@@ -170,11 +170,12 @@ class Book:
             if one.rule == "confirmation" and not any(map(one.covers, asked)):
                 earlier |= one.digests.keys()
         data = {one.scene: one.record.hashes.get("data") for one in self.experiment.trials}
-        seen = {data[scene] for scene in earlier & data.keys()}
-        used = {one for one in asked[0].digests if one in earlier or data.get(one, "") in seen}
-        if used:
+        seen = {data.get(scene) for scene in earlier}
+        if used := sorted(
+            one for one in asked[0].digests if one in earlier or data.get(one, one) in seen
+        ):
             raise InputError(
-                f"{listed(sorted(used))} was seen by the ideas, or by an earlier confirmation: "
+                f"{listed(used)} was seen by the ideas, or by an earlier confirmation: "
                 "confirm on other captures"
             )
 

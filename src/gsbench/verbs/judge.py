@@ -11,21 +11,19 @@ from typing import TYPE_CHECKING
 from gsbench.analysis.frames import (
     COLUMNS,
     DIRECTIONS,
-    METHOD,
     Declared,
     compare_methods,
 )
 from gsbench.errors import InputError
 from gsbench.files import require_regular, writable_output, write_text
-from gsbench.parsing import one_line, read_typed
+from gsbench.parsing import Count, one_line, read_typed
 from gsbench.runs.experiments import DEFAULT_METRIC
-from gsbench.verbs.arguments import ArgumentParser, Rows, comma_separated, names, path, whole_number
+from gsbench.verbs.arguments import ArgumentParser, Rows, comma_separated, names, number, path
 from gsbench.words import counted, listed, printable
 
 if TYPE_CHECKING:
     import pandas as pd
 
-MOST_SEED = 10**9
 ROWS: Rows = {
     "results? RESULTS": ("a table or a folder", path),
     "settings* KEY=VALUE": "eval.… for a folder of renders",
@@ -45,7 +43,7 @@ ROWS: Rows = {
     "--scenes A,B": ("with --declare", names),
     "--seeds 0,1": (
         "with --declare",
-        comma_separated(lambda text: whole_number(MOST_SEED)(text) if text != "0" else 0),
+        comma_separated(number(Count)),
     ),
 }
 
@@ -81,7 +79,7 @@ def judge(argv: Sequence[str], runs: Path) -> int:
         from gsbench.analysis.tables import build_table
 
         table = build_table(comparison.experiment, rows=("scene", "densify"), comparison=comparison)
-        print(to_markdown(replace(table, row_headings=("scene", METHOD))), end="")
+        print(to_markdown(replace(table, row_headings=("scene", "method"))), end="")
     if options.out is not None:
         from gsbench.analysis.report.build import build_report
 

@@ -1,15 +1,14 @@
 """``gsbench ledger``: many ideas under one false discovery rate (docs/night.md)."""
 
-import argparse
 import json
 import re
+from argparse import Namespace
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from gsbench.analysis.quantities import COSTS, relative_change
-from gsbench.analysis.questions import FIRST_LOOK
 from gsbench.analysis.results import read_experiment
 from gsbench.analysis.sentences import sentence
 from gsbench.analysis.verdicts import judge
@@ -41,7 +40,6 @@ from gsbench.verbs.arguments import ArgumentParser, number, whole_number
 from gsbench.words import listed
 
 EXIT_CODES = {"kept": 0, "dropped": 1, "failed": 1}
-UNDECIDED = 3
 GIVEN = ("name", "runs", "eval.primary")  # settings that the ledger sets itself
 # An idea may change how a model is made, not what it is measured on.
 OF_IDEAS = ("densify", "init", "train", "raster")
@@ -72,12 +70,12 @@ def ledger(argv: Sequence[str], runs: Path) -> int:
     return ACTIONS[action](options, runs / options.name)
 
 
-def new(options: argparse.Namespace, home: Path) -> int:
+def new(options: Namespace, home: Path) -> int:
     """Declare a ledger; the same command again changes nothing."""
     baseline, trials = _compose(home, options.settings, options.settings, BASELINE)
-    values, metric = next(iter(trials.values())).values, options.metric
-    terms = asked_difference(metric, options.least, values)
-    EvalConfig(**values["eval"] | {"primary": metric})  # raises if it is not computed
+    values = next(iter(trials.values())).values
+    terms = asked_difference(options.metric, options.least, values)
+    EvalConfig(**values["eval"] | {"primary": options.metric})  # raises if it is not computed
     opened = Ledger(**terms, ideas=options.ideas, rate=options.fdr, seeds=_seeds(trials))
 
     def make(history: History) -> Command | None:
@@ -95,7 +93,7 @@ def new(options: argparse.Namespace, home: Path) -> int:
     return 0
 
 
-def try_idea(options: argparse.Namespace, home: Path) -> int:
+def try_idea(options: Namespace, home: Path) -> int:
     """Run one idea until it is decided; an idea that was decided before is only shown."""
     book, typed, against = read_ledger(home), options.settings, options.against
     if against not in (allowed := [BASELINE, *book.kept]):
@@ -133,10 +131,10 @@ def try_idea(options: argparse.Namespace, home: Path) -> int:
         facts |= {"result": "failed", "reason": why}
         line = f"{idea}: failed: {why}"
     print(json.dumps(facts | _left(book)) if options.json else f"{line}\n{book.describe()[1]}")
-    return EXIT_CODES.get(facts["result"], UNDECIDED)
+    return EXIT_CODES.get(facts["result"], 3)
 
 
-def confirm(options: argparse.Namespace, home: Path) -> int:
+def confirm(options: Namespace, home: Path) -> int:
     """Train the baseline and the kept ideas on captures that no idea has seen."""
     book, typed = read_ledger(home), options.settings
     if not book.kept:
@@ -151,9 +149,9 @@ def confirm(options: argparse.Namespace, home: Path) -> int:
 
     def make(history: History) -> Command | None:
         read_ledger(home).check_untouched(asked)
-        known = [one for one in history.questions if any(map(one.covers, asked))]
-        own = tuple(one.with_id(history.head) for one in asked)
-        return None if known else command_now(questions=own)
+        if any(one.covers(new) for one in history.questions for new in asked):
+            return None
+        return command_now(questions=tuple(one.with_id(history.head) for one in asked))
 
     append(home, make)
     for _, trials in sides:
@@ -168,7 +166,7 @@ def confirm(options: argparse.Namespace, home: Path) -> int:
     return 0
 
 
-def show(options: argparse.Namespace, home: Path) -> int:
+def show(options: Namespace, home: Path) -> int:
     """Print the ledger."""
     book = read_ledger(home)
     if options.json:
@@ -263,8 +261,8 @@ def _compose(
 
 def _seeds(trials: Trials) -> tuple[int, ...]:
     seeds = tuple(dict.fromkeys(seed for _, _, seed in trials))
-    if len(seeds) < FIRST_LOOK:
-        raise InputError(f"a ledger needs at least {FIRST_LOOK} seeds, such as seed=0,1,2,3,4,5")
+    if len(seeds) < 2:
+        raise InputError("a ledger needs at least 2 seeds, such as seed=0,1,2,3,4,5")
     return seeds
 
 
@@ -305,8 +303,8 @@ def _train(question: Question, trials: Trials) -> str:
 def _facts(book: Book, idea: str) -> dict[str, Any]:
     """The known facts of an idea, for programs."""
     verdict, test = book.verdicts[idea], book.tests.get(idea)
-    interval, pairs = verdict.interval, verdict.pairs
-    change = relative_change(*pairs.sides, COSTS["gaussians"][1])
+    interval = verdict.interval
+    change = relative_change(*verdict.pairs.sides, COSTS["gaussians"][1])
     known = {
         "idea": idea,
         "against": book.ideas[idea].against,
@@ -314,7 +312,7 @@ def _facts(book: Book, idea: str) -> dict[str, Any]:
         "test_seeds": test and next(iter(test.seeds.values())),
         "result": book.result(idea),
         "reason": book.why(idea),
-        "seeds": pairs.seeds,
+        "seeds": verdict.pairs.seeds,
         "difference": interval
         and {"mean": verdict.mean, "low": interval.low, "high": interval.high},
         "gaussians": change and 1 + change.of_totals,

@@ -2,12 +2,11 @@
 ``bench`` (how fast it is)."""
 
 import argparse
-import itertools
 import json
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -67,17 +66,8 @@ def doctor(argv: Sequence[str], runs: Path) -> int:
     if options.json or options.raster != AUTO or options.device != "auto":
         raise InputError("doctor: --raster, --device and --json belong to --prove")
     code = 0
-    if options.words:
-        checks: tuple[Iterable[Finding], ...] = (check_scene(options.words),)
-    else:
-        checks = (
-            check_packages(),
-            check_devices(),
-            check_proofs(),
-            check_weights(),
-            check_runs(runs),
-        )
-    for verdict, topic, text in itertools.chain(*checks):
+    findings = check_scene(options.words) if options.words else check_machine(runs)
+    for verdict, topic, text in findings:
         print(f"{verdict:<5} {topic:<12} {text}")
         if verdict == "bad":
             code = 1
@@ -140,6 +130,15 @@ def check_scene(words: Sequence[str]) -> Iterator[Finding]:
         f"{counted(len(capture.image_names), 'photograph')}, {len(capture.test_names)} for testing"
         f" ({capture.held_out}); odd: {', '.join(one.rule for one in odd) or 'nothing'}",
     )
+
+
+def check_machine(runs: Path) -> Iterator[Finding]:
+    """Findings about all that gsbench uses on this machine."""
+    yield from check_packages()
+    yield from check_devices()
+    yield from check_proofs()
+    yield from check_weights()
+    yield from check_runs(runs)
 
 
 def check_proofs() -> Iterator[Finding]:

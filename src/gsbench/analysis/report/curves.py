@@ -105,11 +105,9 @@ def volume_charts(
     notes = []
     for arm in arms:
         try:
-            # in the cubed units of their training
             volumes = np.concatenate(
                 [
-                    log10_volumes(trial.path / layout.POINT_CLOUD)
-                    + 3 * math.log10(trial.record.to_training.scale)
+                    log10_volumes(trial.path / layout.POINT_CLOUD, trial.record.to_training.scale)
                     for trial in trials_of(trials, arm)
                 ]
             )
@@ -134,8 +132,10 @@ def volume_charts(
     return list(filter(None, charts)), notes
 
 
-def log10_volumes(path: Path) -> NDArray[np.float64]:
+def log10_volumes(path: Path, scale: float = 1.0) -> NDArray[np.float64]:
     """log10 of the volumes ``4/3 π s1 s2 s3`` [N] of a 3DGS PLY, whose scales are logs.
+
+    ``scale`` is that of the training, in whose cubed units the volumes are.
 
     Raises `InputError` for a file that cannot be read as a 3DGS PLY.
     """
@@ -148,7 +148,7 @@ def log10_volumes(path: Path) -> NDArray[np.float64]:
         )
     except (OSError, ValueError, KeyError, PlyParseError) as error:
         raise InputError(f"{path} is not a readable 3DGS PLY ({error})") from None
-    return np.asarray(LOG10_SPHERE + logs / math.log(10))
+    return np.asarray(LOG10_SPHERE + logs / math.log(10) + 3 * math.log10(scale))
 
 
 def histogram(volumes: NDArray[np.float64]) -> Curve:
