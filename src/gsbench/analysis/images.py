@@ -6,7 +6,6 @@ import itertools
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -207,7 +206,9 @@ def jpeg_uri(image: NDArray[np.uint8]) -> str:
     """A picture as a JPEG data URI; PNG would make the page ten times as large."""
     picture = Image.fromarray(image)
     picture.thumbnail((WIDEST, WIDEST))
-    return _data_uri(picture, "jpeg", quality=92, subsampling=0)
+    buffer = io.BytesIO()
+    picture.save(buffer, format="jpeg", quality=92, subsampling=0)
+    return f"data:image/jpeg;base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"
 
 
 def read_truth(trial: TrialResult, view: str) -> Pixels | None:
@@ -215,17 +216,6 @@ def read_truth(trial: TrialResult, view: str) -> Pixels | None:
     with suppress(InputError):
         return read_image(trial.path / GROUND_TRUTH / f"{view}.png")
     return None
-
-
-def png_uri(image: Pixels) -> str:
-    """A lossless PNG as a data URI."""
-    return _data_uri(Image.fromarray(image), "png", optimize=True)
-
-
-def _data_uri(picture: Image.Image, kind: str, **options: Any) -> str:
-    buffer = io.BytesIO()
-    picture.save(buffer, format=kind, **options)
-    return f"data:image/{kind};base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"
 
 
 def read_compared(one: TrialResult, other: TrialResult, view: str) -> list[Pixels]:

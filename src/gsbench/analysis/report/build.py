@@ -13,7 +13,7 @@ from gsbench.analysis.cells import select_trials, where_words
 from gsbench.analysis.comparison import Answer, chosen, compare
 from gsbench.analysis.differences import between_scenes_notes
 from gsbench.analysis.fairness import caveats, counts_notes, fairness_table
-from gsbench.analysis.images import choose_views, png_uri
+from gsbench.analysis.images import choose_views, jpeg_uri
 from gsbench.analysis.notes import texts
 from gsbench.analysis.pairs import pair_trials
 from gsbench.analysis.paper import layout_of, load_published, paper_tables
@@ -116,7 +116,7 @@ def trial_figures(trials: Sequence[TrialResult]) -> list[tuple[str, str]]:
     for group in group_by(trials, "scene", "arm").values():
         trial = group[0]
         for path in sorted((trial.path / layout.FIGURES).glob("*.png")):
-            key = path.stem.replace("_", " "), trial.scene, png_uri(read_image(path))
+            key = path.stem.replace("_", " "), trial.scene, jpeg_uri(read_image(path))
             sources.setdefault(key, []).append(f"{trial.init}-{trial.densify}, seed {trial.seed}")
     return [
         (f"{name}: {scene}, {'; '.join(arms)}", uri) for (name, scene, uri), arms in sources.items()
