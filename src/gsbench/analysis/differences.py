@@ -213,15 +213,13 @@ def compared_trials(trials: Iterable[TrialResult], first: Arm, second: Arm) -> l
     by_arm = group_by(trials, "arm")
     ones, others = by_arm[first], by_arm[second]
     here, there = (group_by(own, "scene") for own in (ones, others))
+    shared = [(own, there[scene]) for scene, own in here.items() if scene in there]
     pairs = []
-    for mine, theirs in [
-        *((own, there[scene]) for scene, own in here.items() if scene in there),
-        (ones, others),
-    ]:
+    for mine, theirs in shared or [(ones, others)]:
         of_seed = {trial.seed: trial for trial in reversed(theirs)}
         same = ((one, of_seed[one.seed]) for one in mine if one.seed in of_seed)
         pairs.append(next(same, (mine[0], theirs[0])))
-    return pairs[:-1] or pairs
+    return pairs
 
 
 def ingredients_note(names: Sequence[str], first: Arm, second: Arm) -> Note:

@@ -359,9 +359,9 @@ class UnusableError(Exception):
 
 def read_trial(path: Path, runs_dir: Path, settings: Configurations) -> TrialResult:
     """Read and check one trial folder; raises `UnusableError`."""
+    folder = TrialFolder(path)
     try:
         require_no_links(runs_dir, path, below=True)
-        folder = TrialFolder(path)
         record = folder.record()
         if change := folder.change():
             raise UnusableError(

@@ -92,14 +92,14 @@ def build_table(
     shown_best = winners(comparison)
     bold = _best(cells, quantities, shown_best, varied)
     shown, notes = _rows(cells, bold, quantities), list[Note]()
+    has_means = "scene" in rows and len(scenes) > 1
     # scenes of an arm may have different conditions or versions of the code
-    unlike = any(
+    if has_means and any(
         conditions_between_scenes(of_arm) or differing_code(of_arm)
         for of_arm in group_by(varied, "arm").values()
-    )
-    if "scene" in rows and len(scenes) > 1 and unlike:
+    ):
         notes.append(Note.of("no mean"))
-    elif "scene" in rows and len(scenes) > 1:
+    elif has_means:
         place = list(rows).index("scene")
         means = _means(groups, place, row_labels, column_labels, quantities, scenes, expected)
         best = _best(means, quantities, shown_best, varied)
