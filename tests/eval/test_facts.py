@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsbench.eval.evaluator import MEASURES, Evaluator
+from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.facts import (
     FPS,
     METRICS,
@@ -38,7 +38,6 @@ def test_the_evaluator_has_exactly_the_metrics_of_the_table():
     of_images = {facts.key for facts in METRICS}
     assert values.keys() | evaluator.unavailable.keys() == of_images
     assert set(known_keys()) == of_images | {FPS.key}
-    assert set(MEASURES) == of_images
     assert all(f"lpips_{protocol.lpips}" in known_keys() for protocol in PROTOCOLS.values())
     assert set(lpips_variants()) == {"vgg_raw", "vgg", "alex", "squeeze"}
 

@@ -191,7 +191,6 @@ def test_options_of_a_proof_need_prove(tmp_path, words, message):
         ("--count 0", "--count: must be a whole number in "),
         ("--count 5,x", "--count: must be a whole number in "),
         ("--ply nowhere.ply", "nowhere.ply does not exist"),
-        ("--kernels", "has no place in the table: add --json"),
         ("--raster cpu,auto", "name those to time"),
     ],
 )
@@ -213,7 +212,7 @@ def test_bench_times_what_the_words_name(monkeypatch, capsys):
     words = split("--raster cpu,reference --size 16x32,32x16 --count 7,8")
     assert machine.bench([*words, "--no-memory", "--repeats", "3"]) == 0
     rasters, settings, *others = asked
-    assert (rasters, others) == (["cpu", "reference"], [3, False, False])
+    assert (rasters, others) == (["cpu", "reference"], [3, False])
     assert [(one.scene, one.size, one.count, one.ply) for one in settings] == [
         ("trained", size, count, None) for size in ("16x32", "32x16") for count in (7, 8)
     ]

@@ -223,7 +223,7 @@ def check_devices() -> Iterator[Finding]:
 def check_weights() -> Iterator[Finding]:
     """Findings about the weights of networks that are here; nothing is downloaded."""
     from gsbench.eval.lpips import BACKBONES
-    from gsbench.init.networks.options import EXTRACTOR_WEIGHTS, LIGHTGLUE_WEIGHTS
+    from gsbench.init.dim import EXTRACTOR_WEIGHTS, LIGHTGLUE_WEIGHTS
     from gsbench.weights import MissingWeightsError, find_weights
 
     wanted = {f"LPIPS {name}": backbone.features for name, backbone in BACKBONES.items()}
@@ -270,15 +270,12 @@ def bench(argv: Sequence[str], _runs: Path | None = None) -> int:
         "--repeats N": ("turns that count (default 5)", count, 5),
         "--threads N": ("CPU threads (default: as many as torch takes)", count),
         "--json": "print JSON",
-        "--kernels": "with --json: add the time of each kernel, and of waits for the GPU",
         "--no-memory": "do not measure peak memory, in processes of their own",
     }
     parser = ArgumentParser("bench", "Times are medians of steps that take turns.", rows)
     options = parser.parse_args(argv)
     if options.ply is not None and not options.ply.is_file():
         raise InputError(f"--ply: {options.ply} does not exist")
-    if options.kernels and not options.json:
-        raise InputError("--kernels has no place in the table: add --json")
     rasters = options.raster.split(",")
     if AUTO in rasters:
         raise InputError(f"--raster {AUTO} is a choice among executors: name those to time")
@@ -293,7 +290,7 @@ def bench(argv: Sequence[str], _runs: Path | None = None) -> int:
         for width, height in options.size
         for count in (options.count if ply is None else [0])
     ]
-    found = run_bench(rasters, settings, options.repeats, not options.no_memory, options.kernels)
+    found = run_bench(rasters, settings, options.repeats, not options.no_memory)
     print(json.dumps(found, indent=2) if options.json else table(found))
     return 0
 

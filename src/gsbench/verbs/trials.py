@@ -38,7 +38,7 @@ from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS
 from gsbench.runs.user_code import PERMISSIONS
 from gsbench.system.programs import allow_modules
-from gsbench.tracking.beside import end_with
+from gsbench.tracking.beside import send_beside
 from gsbench.tracking.sync import MirrorError
 from gsbench.tracking.sync import sync as send_missing
 from gsbench.verbs.arguments import ArgumentParser, Rows
@@ -261,8 +261,7 @@ def sync(argv: Sequence[str], runs: Path) -> int:
         "permissions* allow_targets=[mine]": "for trials that a tracker of your own shows",
         "--uri ADDRESS": "such as http://127.0.0.1:5000; default: $MLFLOW_TRACKING_URI, or the "
         "runs folder's",
-        "--trial* SCENE/ARM/FOLDER": "only this trial of the experiment (repeatable)",
-        "--beside PID": ("end soon after this process has ended", int),
+        "--beside SECONDS": ("send the trials that the standard input names, to its end", float),
     }
     options = ArgumentParser("sync", rows=rows).parse_args(argv)
     words = [options.experiment or "", *options.permissions]
@@ -270,16 +269,14 @@ def sync(argv: Sequence[str], runs: Path) -> int:
     if unread := [word for word in words if key_of(word) != PERMISSIONS]:
         raise InputError(f"sync reads only {PERMISSIONS}, not {unread[0]}")
     allow_modules(allowed := typed_permissions(words))
-    if options.beside:
-        end_with(options.beside)
     names = [experiment] if experiment else list_experiments(runs)
     homes = [experiment_home(runs, name) for name in names]
     try:
-        folders: list[TrialFolder] = []
-        for home in homes:
-            places = [TrialFolder(Path(place)) for place in sorted(trial_folders(home))]
-            wanted = {str(home / trial) for trial in options.trial}
-            folders += [one for one in places if not wanted or str(one.path) in wanted]
+        if options.beside is not None:
+            send_beside(sys.stdin, options.beside)
+            return 0
+        places = [place for home in homes for place in sorted(trial_folders(home))]
+        folders = [TrialFolder(Path(place)) for place in places]
         for line in send_missing(folders, options.uri, allowed):
             print(line, flush=True)
     except (MirrorError, OSError) as error:
