@@ -51,7 +51,7 @@ BASELINE = "baseline"  # the name of a ledger's own baseline among its ideas
 ID_CHARACTERS, LINK_CHARACTERS = 12, 16
 LEVELS = 3  # folders of scene, arm and trial
 Place = tuple[str, int]  # scene and seed
-# what gave a question its level: a command, the rules of a ledger, a gate, a table of results
+# sources of a question's level: a command, the rules of a ledger, a gate, a table of results
 # (declared before it, or not), a declaration of gsbench 0.1
 Rule = Literal[
     "command",
