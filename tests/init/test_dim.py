@@ -283,8 +283,8 @@ def test_too_little_gpu_memory_for_extraction_is_reported(courtyard):
 
 
 def test_an_empty_image_has_no_matches():
-    some = features_of(np.eye(3, 8))
-    assert match(mutual_nearest_matcher(0.9, CPU), some, some[:0]).shape == (0, 2)
+    some, none = features_of(np.eye(3, 8)), features_of(np.eye(0, 8))
+    assert match(mutual_nearest_matcher(0.9, CPU), some, none).shape == (0, 2)
 
 
 def test_lightglue_has_no_weights_for_the_small_aliked():
