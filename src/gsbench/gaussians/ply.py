@@ -180,7 +180,7 @@ def _stacked(
 
 def _read_columns(path: Path) -> dict[str, Column]:
     """The columns of a 3DGS PLY, with valid values; raises as `read_ply` does."""
-    content, table = _checked(_content_and_table, path)
+    content, table = _checked(read_ply_data, path)
     names = _check_properties(table, path)
     vertices: dict[str, Column] = {name: table[name] for name in names}
     opacity = vertices["opacity"]
@@ -206,11 +206,6 @@ def _read_columns(path: Path) -> dict[str, Column]:
         vertices |= dict(zip(SCALES, scales.T, strict=True))
         vertices["opacity"] = logits.clip(-MAX_LOGIT, MAX_LOGIT)
     return vertices
-
-
-def _content_and_table(path: Path) -> tuple[PlyData, Any]:
-    content = read_ply_data(path)
-    return content, content["vertex"].data
 
 
 def _check_properties(vertices: Any, path: Path) -> list[str]:
