@@ -46,7 +46,8 @@ def superpoint(weights, **options):
 
 
 def matcher_of(weights):
-    return build_matcher(superpoint(None), [weights], CPU)
+    own = superpoint(None)
+    return build_matcher(own.extraction, own.matching, weights, CPU)
 
 
 def features_of(descriptors, keypoints=0.0, size=(9, 9), file_size=None):
@@ -98,7 +99,7 @@ def test_lightglue_matches_enough_points(few, untrained_weights, tmp_path, caplo
 def test_other_settings_or_images_have_other_file_names(courtyard, tmp_path):
     def paths(extraction, matching, images):
         capture = replace(courtyard, images=images)
-        store = FeatureStore(tmp_path / "work", capture, extraction, matching)
+        store = FeatureStore(tmp_path / "work", capture, extraction, matching, None, None, 1)
         return store.features_path("0000.png"), store.matches_path("0000.png", "0001.png")
 
     same, changed = courtyard.images, tmp_path / "changed"
@@ -223,7 +224,7 @@ def test_detection_settings_are_the_extractors_own_unless_given(
     """The defaults are those of deep-image-matching and the authors."""
     own = Dim(extractor=extractor, matcher="mutual_nearest", weights=tmp_path, download=False)
     monkeypatch.setattr(
-        "gsbench.init.networks.options.find_all_weights",
+        "gsbench.init.dim.find_all_weights",
         lambda files, folder, download: [f.names[0] for f in files],
     )
     assert own.find_weights() == [file]

@@ -236,7 +236,7 @@ def check_triton() -> Iterator[Finding]:
 def check_weights() -> Iterator[Finding]:
     """Findings about the weights of networks that are here; nothing is downloaded."""
     from gsbench.eval.lpips import BACKBONES
-    from gsbench.init.networks.options import EXTRACTOR_WEIGHTS, LIGHTGLUE_WEIGHTS
+    from gsbench.init.dim import EXTRACTOR_WEIGHTS, LIGHTGLUE_WEIGHTS
     from gsbench.weights import MissingWeightsError, find_weights
 
     wanted = {f"LPIPS {name}": backbone.features for name, backbone in BACKBONES.items()}

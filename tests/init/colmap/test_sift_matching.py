@@ -135,7 +135,7 @@ def test_auto_matches_only_the_pairs_that_a_preview_proposes(
     monkeypatch.setattr("gsbench.init.colmap.matches.extract_sift", lambda *_: None)
     options = Sfm(threads=1, pairs="auto")
     job = Job(options, bare_photos, tmp_path, tmp_path, None)
-    counts = options.fill(job, task, no_progress, Timer())
+    counts = options.fill(job, task, no_progress, Timer())["counts"]
     assert counts["pairs_selected"] + counts["pairs_left_out"] == len(pairs)
     assert counts["pairs_left_out"] > 10
     matched = read_matches(task.database)
