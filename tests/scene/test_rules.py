@@ -9,16 +9,14 @@ from PIL import Image
 
 from gsbench.config.compose import compose_one
 from gsbench.runs.config_hash import arm_hash, config_hash
-from gsbench.runs.store import Store
 from gsbench.runs.trial_record import TwinViews
 from gsbench.scene import rules
-from gsbench.scene.load import load_scene
 from gsbench.scene.options import SceneConfig
 from gsbench.scene.rules import BY_ID, RULES, Finding, Rule, check_accept, inspect
 from gsbench.scene.types import Camera, Scene, View
 from gsbench.verbs.machine import doctor
 from tests.helpers import refusal
-from tests.scene.captures import read_colmap, read_photos
+from tests.scene.captures import loaded, read_colmap, read_photos
 from tests.scene.tables import TABLES
 
 
@@ -159,12 +157,12 @@ def test_prepared_views_of_an_accepted_lens_are_judged_again(make_scene, tmp_pat
     plain, accepting = (
         read_colmap("toy", root, accept=accept) for accept in ([], ["lens-turns-back"])
     )
-    scene = load_scene(accepting, accepting.model, Store(tmp_path / "cache"))
-    again = load_scene(accepting, accepting.model, Store(tmp_path / "cache"))
+    scene = loaded(accepting, tmp_path)
+    again = loaded(accepting, tmp_path)
     assert [odd.refused for odd in again.oddities if odd.rule == "lens-turns-back"] == [True]
     assert again.oddities == scene.oddities
     with refusal("turns back inside the picture"):
-        load_scene(plain, plain.model, Store(tmp_path / "cache"))
+        loaded(plain, tmp_path)
 
 
 def test_what_is_accepted_changes_no_hash_of_a_trial():

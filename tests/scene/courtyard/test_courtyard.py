@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from gsbench.runs.store import Store
 from gsbench.scene.colmap import read_model
 from gsbench.scene.courtyard.layout import build_layout
 from gsbench.scene.courtyard.render import (
@@ -16,9 +15,8 @@ from gsbench.scene.courtyard.render import (
     render_view,
     ring_camera,
 )
-from gsbench.scene.load import load_scene
 from tests.scene.cameras import cameras_of
-from tests.scene.captures import read_colmap
+from tests.scene.captures import loaded, read_colmap
 from tests.scene.courtyard.surfaces import fingerprint, surface_distance
 from tests.scene.tables import TABLES
 
@@ -53,7 +51,7 @@ def test_the_colmap_model_has_the_exact_cameras(capture_dir, tmp_path):
         assert_allclose(written[name].translation, camera.translation, atol=1e-12)
         assert (written[name].fx, written[name].cx, written[name].cy) == (camera.fx, 80, 60)
     capture = replace(read_colmap("courtyard", capture_dir), exact_poses=True)
-    assert len(load_scene(capture, capture.model, Store(tmp_path)).train) == 3
+    assert len(loaded(capture, tmp_path).train) == 3
 
 
 @pytest.mark.parametrize("views", [12, 48, 60])
