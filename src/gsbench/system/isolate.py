@@ -173,17 +173,6 @@ def run_isolated(
     raise value
 
 
-def run_with_progress(
-    function: Callable[[Any, Progress], T],
-    job: Any,
-    progress: Progress,
-    what: str,
-    log: Path | None = None,
-) -> T:
-    """Return ``function(job, progress)``, computed by `run_isolated`; its progress is forwarded."""
-    return run_isolated(function, job, what=what, log=log, progress=progress)
-
-
 def python_command(module: str, name: str, *arguments: str) -> list[str]:
     """The command of a fresh interpreter that calls ``name`` of ``module``.
 
