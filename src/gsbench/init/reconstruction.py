@@ -6,7 +6,7 @@ import logging
 import shutil
 from abc import abstractmethod
 from collections import Counter
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -111,13 +111,12 @@ class Reconstruction(ColmapOptions):
 
 def report_unused(options: ColmapOptions) -> None:
     """Write a line on each setting for cameras to be estimated, where cameras are given."""
-    for entry in fields(ColmapOptions):
-        value = getattr(options, entry.name)
-        if entry.name in ("camera", "camera_model", "focal_length") and value != entry.default:
+    for name in ("camera", "camera_model", "focal_length"):
+        if (value := getattr(options, name)) != getattr(ColmapOptions, name):
             logger.warning(
                 "init.%s=%s is not used, since the cameras are given: init.poses=own "
                 "init.intrinsics=estimate estimates them",
-                entry.name,
+                name,
                 value,
             )
 
