@@ -17,7 +17,7 @@ from hydra.core.utils import JobReturn, JobStatus
 from hydra.types import HydraContext
 from omegaconf import DictConfig, OmegaConf, read_write
 
-from gsbench.app.arm_search import Goal, goal_of
+from gsbench.app.goal import Goal, goal_of
 from gsbench.app.grids import GRIDS, run_sweep
 from gsbench.app.hydra_main import FOLDER, run_main, words_for_files, words_for_new_folder
 from gsbench.app.sweep import BASIC, HYDRA_ERRORS, OWN, Ended, Sweep
