@@ -37,7 +37,7 @@ GRIDS_ADVICE = (
 
 
 def run_sweep(sweep: Sweep, run: Run) -> None:
-    """Run all points that the words of ``sweep`` and its files span, perhaps in looks."""
+    """Run the trials of a command by gsbench's own sweeper, perhaps in looks."""
     trials, _ = planned_trials(sweep, run)
     if any(trial.values["launch"]["stop_when_decided"] for trial in trials):
         _run_until_decided(trials, run)
@@ -46,11 +46,13 @@ def run_sweep(sweep: Sweep, run: Run) -> None:
 
 
 def planned_trials(sweep: Sweep, run: Run | None) -> tuple[list[Trial], bool]:
-    """The trials of all points, and whether these are known, or depend on a search to come.
+    """The trials of a command, and whether these are known, or depend on a search to come.
 
     ``hydra.sweeper.tune`` says how intervals are searched first, by trials that ``run`` runs; with
     None, in a dry run, only their plan is printed.
     """
+    if not sweep.multirun:
+        return [sweep.composer.trial(sweep.words)], True
     node = sweep.config.hydra.sweeper
     tune: Any = OmegaConf.to_container(node.tune, resolve=True)
     params: Any = OmegaConf.to_container(node.params, resolve=True) if node.params else {}

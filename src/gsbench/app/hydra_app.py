@@ -60,7 +60,7 @@ class Job:
         # its command has written the questions down
         (outcome,) = self.run([self.trial(config)], asks=False)
         if outcome.status == "failed":  # the launcher passes on what is raised
-            raise _error(outcome)
+            raise outcome.error
 
     def trial(self, config: DictConfig) -> Trial:
         """The trial, with the process as its command's: its folder, its modules, its log."""
@@ -121,9 +121,9 @@ class HydraApp:
             own = [next(rest) for _ in of_job]
             ended = JobReturn(overrides=job, status=JobStatus.COMPLETED)
             try:
-                for trial in own:
-                    if (outcome := by_folder[trial.folder]).status == "failed":
-                        raise _error(outcome)
+                for outcome in (by_folder[trial.folder] for trial in own):
+                    if outcome.status == "failed":
+                        raise outcome.error
                 ended.return_value = self.goal.value(job, own) if self.goal else None
             except GsbenchError as error:
                 ended.return_value, ended.status = error, JobStatus.FAILED
@@ -181,10 +181,6 @@ class HydraApp:
             else Outcome(trial.folder, "done")
             for trial, value in zip(trials, values, strict=True)
         ]
-
-
-def _error(outcome: Outcome) -> GsbenchError:
-    return (InputError if outcome.bad_input else GsbenchError)(outcome.message)
 
 
 # ---- a command

@@ -12,7 +12,7 @@ from gsbench.init.networks.options import NetworkOptions
 from gsbench.init.reconstruction import Job, Reconstruction
 from gsbench.logs import Progress
 from gsbench.scene.types import Capture
-from gsbench.system.isolate import run_with_progress
+from gsbench.system.isolate import run_isolated
 
 if TYPE_CHECKING:
     from gsbench.init.colmap.database import DatabaseTask
@@ -45,7 +45,7 @@ class Dim(Reconstruction, NetworkOptions):
 
     def prepare(self, job: Job, progress: Progress) -> Preparation:
         what = f"{self.name}: features and matches"
-        return run_with_progress(self.compute, job, progress, what=what)
+        return run_isolated(self.compute, job, progress=progress, what=what)
 
     def compute(self, job: Job, progress: Progress) -> Preparation:
         """Compute features and matches by networks; runs in a process without COLMAP."""

@@ -35,7 +35,7 @@ from gsbench.scene.images import read_image
 from gsbench.scene.masks import read_mask
 from gsbench.scene.types import Array, Capture
 from gsbench.settings import AnyPath, check_settings
-from gsbench.system.isolate import run_with_progress
+from gsbench.system.isolate import run_isolated
 
 if TYPE_CHECKING:
     import pycolmap
@@ -67,7 +67,7 @@ class PlacedCloud(Initializer):
             )
         output_dir.mkdir(parents=True, exist_ok=True)
         given = capture, output_dir, reference
-        return run_with_progress(self.build, given, progress, what=self.name)
+        return run_isolated(self.build, given, progress=progress, what=self.name)
 
     def build(self, given: tuple[Capture, Path, Path | None], progress: Progress) -> InitReport:
         """Write the model and the report; runs in the isolated process."""

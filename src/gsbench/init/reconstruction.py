@@ -27,7 +27,7 @@ from gsbench.logs import Progress, no_progress
 from gsbench.scene.images import lens_of
 from gsbench.scene.rules import MIN_IMAGES
 from gsbench.scene.types import Capture
-from gsbench.system.isolate import run_with_progress
+from gsbench.system.isolate import run_isolated
 from gsbench.words import counted, some_of
 
 if TYPE_CHECKING:
@@ -144,7 +144,7 @@ def run_job(job: Job, progress: Progress) -> InitReport:
     """Make features, matches and the model, each in a process of its own."""
     preparation = job.options.prepare(job, progress)
     what, log = job.options.name, job.output_dir / LOG_FILE
-    return run_with_progress(build_model, (job, preparation), progress, what=what, log=log)
+    return run_isolated(build_model, (job, preparation), progress=progress, what=what, log=log)
 
 
 def with_all_pairs(job: Job, progress: Progress, report: InitReport | None) -> InitReport:

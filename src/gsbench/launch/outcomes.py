@@ -36,6 +36,11 @@ class Outcome:
     def label(self) -> str:
         return TrialFolder(self.folder).label
 
+    @property
+    def error(self) -> GsbenchError:
+        """The error of a failed trial."""
+        return (InputError if self.bad_input else GsbenchError)(self.message)
+
 
 def outcome_of_results(folder: Path, results: TrialRecord) -> Outcome:
     """The outcome of a complete trial."""

@@ -40,15 +40,16 @@ PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36  # linux/prctl.h
 # time limit for descendants that SIGKILL does not end, such as those of another user
 SECONDS_TO_END = 5.0
 SECONDS_BETWEEN_LOOKS = 0.01
+SIGNALLED = 128  # plus its number: the exit code of a process that a signal ended
 
 
 def continue_in_child() -> bool:
     """Fork, and return True in the child.
 
     This process does not return: it waits for the child, kills all descendants, and ends with the
-    exit status of the child. All of them also end when the standard input of this process is
-    closed, that is, when its parent is gone. Call it while there is only one thread. Returns False,
-    in this process, on systems without fork.
+    exit code of the child, as shells count (`SIGNALLED`). All of them also end when the standard
+    input of this process is closed, that is, when its parent is gone. Call it while there is only
+    one thread. Returns False, in this process, on systems without fork.
     """
     if not hasattr(os, "fork"):
         return False
@@ -65,8 +66,8 @@ def continue_in_child() -> bool:
     while ended != child:
         ended, status = os.waitpid(-1, 0)  # also reaps adopted orphans
     end_descendants()
-    _exit_as(os.waitstatus_to_exitcode(status))
-    return True
+    code = os.waitstatus_to_exitcode(status)
+    os._exit(code if code >= 0 else SIGNALLED - code)
 
 
 def end_descendants() -> None:
@@ -97,19 +98,6 @@ def _end_with_parent() -> None:
         end_descendants()
         os.killpg(0, signal.SIGKILL)  # also this process, which leads the group
     os._exit(1)
-
-
-def _exit_as(code: int) -> None:
-    """End this process with the exit code of a child (negative: by that signal)."""
-    if code < 0:
-        import resource
-
-        # no second core file beside that of the child
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        with suppress(OSError):
-            signal.signal(-code, signal.SIG_DFL)
-        os.kill(os.getpid(), -code)
-    os._exit(code)
 
 
 def _control(option: int, value: int) -> None:
@@ -171,17 +159,6 @@ def run_isolated(
         return value
     value.add_note(f"raised in the isolated process of {what}:\n{trace}")
     raise value
-
-
-def run_with_progress(
-    function: Callable[[Any, Progress], T],
-    job: Any,
-    progress: Progress,
-    what: str,
-    log: Path | None = None,
-) -> T:
-    """Return ``function(job, progress)``, computed by `run_isolated`; its progress is forwarded."""
-    return run_isolated(function, job, what=what, log=log, progress=progress)
 
 
 def python_command(module: str, name: str, *arguments: str) -> list[str]:
@@ -301,11 +278,9 @@ def _portable(error: Exception) -> Exception:
 
 def describe_exit(code: int) -> str:
     """Describe the unexpected end of a process by its exit code: ``crashed (SIGSEGV)``."""
-    if code < 0:
-        try:
-            name = signal.Signals(-code).name
-        except ValueError:
-            name = f"signal {-code}"
+    number = code - SIGNALLED if code > SIGNALLED else -code
+    with suppress(ValueError):  # not the number of a signal
+        name = signal.Signals(number).name
         return f"crashed ({name}{', perhaps out of memory' if name == 'SIGKILL' else ''})"
     return f"ended early (exit code {code})"
 

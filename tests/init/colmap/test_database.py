@@ -275,7 +275,7 @@ def test_matching_is_divided_over_processes_and_reports_one_sum(database, monkey
             opened.write_matches(*job.parts[0][0], np.array([[3, 4]], dtype=np.uint32))
         progress("match", sum(map(len, job.parts)), None)
 
-    monkeypatch.setattr(matches, "run_with_progress", match)
+    monkeypatch.setattr(matches, "run_isolated", match)
     pairs = list(itertools.combinations(SIZES, 2))
     matches.match_sift(database, pairs, Sfm(threads=3), lambda *state: told.append(state))
     assert (told[0], max(told)) == (("match", 0, 10), ("match", 10, 10))

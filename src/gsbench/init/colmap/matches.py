@@ -28,7 +28,7 @@ import pycolmap
 from gsbench.init.colmap.database import DatabaseTask, image_ids, writable
 from gsbench.init.options import ColmapOptions, SiftOptions
 from gsbench.logs import Progress
-from gsbench.system.isolate import run_with_progress
+from gsbench.system.isolate import run_isolated
 
 MAX_BLOCK = 16  # images on each side of a part; with more, progress would be reported too rarely
 PARTS_PER_PROCESS = 6  # enough that processes end at about the same time
@@ -165,7 +165,7 @@ def _match_in_processes(jobs: Sequence[MatchingJob], count: int, progress: Progr
             matched[index] = done
             progress(phase, sum(matched), count)
 
-        run_with_progress(match_parts, jobs[index], report_sum, what="matching")
+        run_isolated(match_parts, jobs[index], progress=report_sum, what="matching")
 
     with ThreadPoolExecutor(len(jobs)) as pool:
         list(pool.map(run, range(len(jobs))))
