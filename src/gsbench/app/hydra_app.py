@@ -15,15 +15,17 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.plugins import Plugins
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.types import HydraContext
-from omegaconf import DictConfig, OmegaConf, read_write
+from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
 from gsbench.app.goal import Goal, goal_of
 from gsbench.app.grids import GRIDS, run_sweep
 from gsbench.app.hydra_main import FOLDER, run_main, words_for_files, words_for_new_folder
 from gsbench.app.sweep import BASIC, HYDRA_ERRORS, OWN, Ended, Sweep
-from gsbench.config.compose import Trial, check_permitted, trial_of_job
+from gsbench.config.compose import Trial, check_permitted
+from gsbench.config.explain import explained
 from gsbench.config.hydra_setup import installed_nodes
 from gsbench.config.overrides import is_sweep, key_of, task_words
+from gsbench.config.schema import check, plain
 from gsbench.errors import GsbenchError, InputError
 from gsbench.files import checked_runs_folder, storage_errors
 from gsbench.launch.batch import begin
@@ -75,7 +77,10 @@ class Job:
         set_up_logging(hydras.hydra.verbose, has_log)
         typed: Any = OmegaConf.to_container(hydras.hydra.overrides, resolve=False)
         of_hydra = [word for word in typed["hydra"] if key_of(word) not in (MODE, GRIDS)]
-        trial = trial_of_job(config, self.allowed, [*of_hydra, *typed["task"]])
+        overrides = (*of_hydra, *typed["task"])
+        with open_dict(config), explained(overrides):
+            config.allow_targets = list(self.allowed)
+            trial = Trial(check(plain(config)), overrides)
         if has_log:  # Hydra's log lies elsewhere
             log.info("the trial's folder is %s", trial.folder)
         return trial

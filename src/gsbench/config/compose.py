@@ -122,17 +122,14 @@ class Composer:
             self.config.hydra = self._choose(values).hydra
 
     def settings(self, words: Sequence[str]) -> DictConfig:
-        """The configuration of ``words`` without Hydra's node; what it may run is checked."""
+        """The configuration of ``words`` without Hydra's node; trials check what it may run."""
         self._check_words(words)
         chosen = self._choose(words)
         config = OmegaConf.masked_copy(chosen, [str(key) for key in chosen if key != "hydra"])
         OmegaConf.set_struct(config, True)
-        values = [word for word in words if _is_value(word)]
         with explained(words):
-            for word in values:
+            for word in filter(_is_value, words):
                 set_value(config, parse_word(word))
-        if values:
-            check_composed(config, self.allowed, {})
         config[PERMISSIONS] = list(self.allowed)  # any in a file counts nothing
         return config
 
@@ -163,9 +160,7 @@ class Composer:
 
     def trial(self, overrides: Sequence[str]) -> Trial:
         """The single trial of the command's words, which are its ``overrides``."""
-        words = task_words(overrides)
-        trial = self._trial(words, words) or self._trial_of_hydra(words)
-        return replace(trial, overrides=tuple(overrides))
+        return replace(self.trials([task_words(overrides)])[0], overrides=tuple(overrides))
 
     def keep_times(self, config: DictConfig) -> None:
         """Let ``${now:…}`` in ``config`` stand for what it stands for in the trials."""
@@ -187,15 +182,14 @@ class Composer:
             return self._checked(config, None, words, {} if seed is None else {"seed": seed})
         return None
 
-    def _trial_of_hydra(self, words: Sequence[str], number: int | None = None) -> Trial:
+    def _trial_of_hydra(self, words: Sequence[str], number: int) -> Trial:
         """The trial of ``words`` as Hydra composes its job, with its number and its node."""
         with hydra_ready(), explained(words):
             config = self._composed(words)
             with open_dict(config):
                 config[PERMISSIONS] = list(self.allowed)
                 config.hydra.mode = self.config.hydra.mode
-                if number is not None:
-                    config.hydra.job.num, config.hydra.job.id = number, f"job_id_for_{number}"
+                config.hydra.job.num, config.hydra.job.id = number, f"job_id_for_{number}"
             return self._checked(config, config, words, {})
 
     def _checked(
@@ -340,15 +334,6 @@ def typed_address(typed: Sequence[str]) -> tuple[str, ...]:
     with hydra_ready(), explained(words):
         config = hydra.compose(CONFIG_NAME, read_by_gsbench(words))
         return (str(config.tracking.uri),) if config.tracking.get("uri") else ()
-
-
-def trial_of_job(config: DictConfig, allowed: Sequence[str], overrides: Sequence[str]) -> Trial:
-    """The trial of a configuration that Hydra composed for a job, without Hydra's node."""
-    check_composed(config, allowed, {})
-    with open_dict(config):
-        config[PERMISSIONS] = list(allowed)
-    with explained(overrides):
-        return Trial(check(plain(config)), tuple(overrides))
 
 
 def with_seed(trial: Trial, seed: int) -> Trial:
