@@ -4,7 +4,6 @@ Words go one way: Hydra composes once for each choice of groups, the values of s
 set in a copy, and the resolved copy is checked: a trial.
 """
 
-import os
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -31,8 +30,12 @@ from gsbench.config.hydra_setup import (
 from gsbench.config.overrides import bare_key, is_sweep, key_of, parse_word, task_words
 from gsbench.config.permissions import check_texts
 from gsbench.config.schema import ROOT_SETTINGS, Config, check, plain
-from gsbench.config.search_path import check_search_path, read_by_gsbench, searched_folders
-from gsbench.config.strange_files import check_choice, check_places, permitted_to_files
+from gsbench.config.search_path import (
+    check_choice,
+    check_search_path,
+    permitted_to_files,
+    read_by_gsbench,
+)
 from gsbench.config.trust import MADE_NODES, check_composed, check_permissions
 from gsbench.errors import InputError
 from gsbench.runs.trial_folder import TrialFolder
@@ -96,9 +99,8 @@ class Composer:
         # are checked first.
         self.typed = words if typed is None else typed
         self.allowed = typed_permissions(self.typed) + typed_readings(self.typed)
-        packages = check_search_path(words, self.allowed)
-        allow_modules(self.allowed, os.getcwd() if modules is None else modules)
-        check_places(searched_folders(words), packages)
+        allow_modules(self.allowed, modules)
+        check_search_path(words, self.allowed)
         single = [word for word in words if not is_sweep(word)]
         own = task_words(single)
         self.hydra_words = tuple(word for word in single if word not in own)
@@ -132,10 +134,6 @@ class Composer:
                 set_value(config, parse_word(word))
         config[PERMISSIONS] = list(self.allowed)  # any in a file counts nothing
         return config
-
-    def has_key(self, key: str) -> bool:
-        """Return whether the whole configuration has a value for the dotted ``key``."""
-        return OmegaConf.select(self.config, key) is not None
 
     def trials(self, jobs: Sequence[Sequence[str]]) -> list[Trial]:
         """The trials of ``jobs``, each the list of its words.

@@ -35,8 +35,8 @@ def progress_frame(runs: Path, experiment: str) -> pd.DataFrame:
 
     home = experiment_home(runs, experiment)
     # A superseded trial will never be done, so with it no sweep would end.
-    experiment = read_experiment(home)
-    states = [one for one in states_of_experiment(home, experiment) if one.state != "superseded"]
+    found = read_experiment(home)
+    states = [one for one in states_of_experiment(home, found) if one.state != "superseded"]
     names = {path: (arm, path.parents[1].name) for path, arm in arm_names(states).items()}
     columns: dict[str, float] = {"done": 0, "running": 0, "failed": 0, "waiting": 0, SPEED: 0.0}
     rows = {arm: columns.copy() for arm in sorted({arm for arm, _ in names.values()})}
@@ -46,7 +46,7 @@ def progress_frame(runs: Path, experiment: str) -> pd.DataFrame:
         if state.state == "running":
             row[SPEED] += _speed(TrialFolder(state.folder))
     frame = pd.DataFrame.from_dict(rows, orient="index", columns=[*columns])
-    done = [trial for trial in experiment.trials if trial.path in names]
+    done = [trial for trial in found.trials if trial.path in names]
     frame.attrs["seconds_left"] = _seconds_left(states, names, done)
     return frame
 
