@@ -103,6 +103,12 @@ def check_search_path(words: Sequence[str], allowed: Sequence[str]) -> None:
             raise InputError(f"hydra.searchpath names {package}: no such package")
 
 
+def searched_folders(words: Sequence[str]) -> list[Path]:
+    """The user's folders that ``hydra.searchpath`` among ``words`` names."""
+    places = search_places(words)
+    return [Path(place.removeprefix("file://")) for place in places if "pkg://" not in place]
+
+
 # ---- files in these folders
 
 # An entry of a defaults list: a file or a group, perhaps with a package. Its path is written out.
