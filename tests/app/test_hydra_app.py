@@ -182,10 +182,12 @@ def test_another_sweeper_gets_the_mean_over_the_seeds_towards_its_end(
     tmp_path, monkeypatch, sweeper, sign
 ):
     values = {"name": "x", "eval": {"primary": "lpips_vgg", "extra": {}}}
-    composer = SimpleNamespace(trial=lambda words: SimpleNamespace(values=values))
     config = OmegaConf.create({"hydra": {"sweeper": sweeper | {"params": {"seed": "1,2"}}}})
     asked = SimpleNamespace(
-        words=["densify=m"], other_sweeper="optuna", composer=composer, config=config
+        words=["densify=m"],
+        other_sweeper="optuna",
+        trial=lambda words: SimpleNamespace(values=values),
+        config=config,
     )
     goal = goal_of(asked)
     assert goal == Goal("x-tune", "lpips_vgg", -1, sign, ("seed=1", "seed=2"))

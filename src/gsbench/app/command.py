@@ -37,7 +37,7 @@ def launch(argv: list[str]) -> int:
     Raises InputError for a wrong configuration, and for a single trial's bad input.
     """
     words, multirun, is_dry_run = parse(argv)
-    sweep = Sweep.read(words, multirun)
+    sweep = Sweep(words, multirun)
     # Trials run in this block, so only Hydra's errors are about the words.
     with explained(words, HYDRA_ERRORS):
         if is_dry_run:
@@ -67,7 +67,7 @@ def compose_trials(
 
     Only the words ``typed`` by the user (default: all ``words``) give permissions.
     """
-    sweep = Sweep.read(words, multirun, typed)
+    sweep = Sweep(words, multirun, typed)
     with explained(words, HYDRA_ERRORS):
         return trials_of(sweep)[0]
 
@@ -80,7 +80,7 @@ def trials_of(sweep: Sweep) -> tuple[list[Trial], bool]:
     if not sweep.other_sweeper:
         return planned_trials(sweep, None)
     words, is_grid = words_without_sweeper(sweep)
-    trials, are_known = trials_of(Sweep.read(words, is_grid, sweep.composer.typed))
+    trials, are_known = trials_of(Sweep(words, is_grid, sweep.typed))
     return trials, are_known and is_grid
 
 

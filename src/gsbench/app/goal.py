@@ -80,7 +80,7 @@ def goal_of(sweep: Sweep) -> Goal | None:
     }
     lists |= {key_of(word): word for word in sweep.words if is_sweep(word)}
     seeds = grid_points([parse_word(lists["seed"])]) if "seed" in lists else []
-    values = sweep.composer.trial([word for word in sweep.words if not is_sweep(word)]).values
+    values = sweep.trial([word for word in sweep.words if not is_sweep(word)]).values
     metric = metric_and_question(str(values["eval"].get("primary") or ""))[0] or DEFAULT_METRIC
     direction, sign = better_direction(metric, values, "eval.primary"), _sign(node)
     log.info(

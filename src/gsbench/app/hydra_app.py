@@ -98,7 +98,7 @@ class HydraApp:
 
     @property
     def job(self) -> Job:
-        return Job(self.run, self.sweep.composer.allowed)
+        return Job(self.run, self.sweep.allowed)
 
     def __call__(self, config: DictConfig) -> None:
         """Run the single trial of a command without ``-m``."""
@@ -115,7 +115,7 @@ class HydraApp:
     ) -> list[JobReturn]:
         """Run the jobs of another sweeper, for gsbench's launcher; returns their values."""
         of_jobs = [self.goal.jobs_of(job) if self.goal else [list(job)] for job in jobs]
-        trials = self.sweep.composer.trials([words for of_job in of_jobs for words in of_job])
+        trials = self.sweep.trials([words for of_job in of_jobs for words in of_job])
         # a search writes no question
         outcomes = self._launch(trials, context, config, asks=self.goal is None)
         by_folder = {outcome.folder: outcome for outcome in outcomes}
@@ -163,8 +163,8 @@ class HydraApp:
             config.hydra.launcher = files["launcher"]
             config.hydra.runtime.choices["hydra/launcher"] = name
             config.hydra.overrides.hydra = [*words, *(typed or [f"hydra/launcher={name}"])]
-        config.allow_targets = list(self.sweep.composer.allowed)
-        self.sweep.composer.keep_times(config)  # the launcher composes its jobs from it
+        config.allow_targets = list(self.sweep.allowed)
+        self.sweep.keep_times(config)  # the launcher composes its jobs from it
         launcher = Plugins.instance().instantiate_launcher(
             hydra_context=context, task_function=self.job, config=config
         )
@@ -194,7 +194,7 @@ class HydraApp:
 def run_by_hydra(sweep: Sweep, run: RunBatch) -> Ended | None:
     """Run a command by `hydra.main`; None if nothing in it needs Hydra's path."""
     config = sweep.config
-    if not (sweep.composer.hydra_words or sweep.other_sweeper):
+    if not (sweep.hydra_words or sweep.other_sweeper):
         return None
     files = words_for_files(config, sweep.words, sweep.multirun)
     has_plugins = config.hydra.callbacks or config.hydra.hydra_logging.get("root")

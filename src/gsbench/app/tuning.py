@@ -126,12 +126,12 @@ def tuned_jobs(
         return jobs, True
     if not sweep.config.launch.wait:
         raise InputError(f"{TUNE} learns from results, so launch.wait must be true")
-    trials = sweep.composer.trials(jobs)
+    trials = sweep.trials(jobs)
     arms = [trial.folder.parent.name for trial in trials]
     searches = _plan(tune, trials, arms, jobs, intervals)
     if run is None:
         print(_describe(searches, arms))
-    if not _search(sweep.composer, searches, tune.at_once, run):
+    if not _search(sweep, searches, tune.at_once, run):
         print(
             f"then the trials of the sweep ({len(jobs)}) with the values found, which are not "
             "known yet"

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -260,10 +261,10 @@ def _by_autograd(train: Mapping[str, Any]) -> bool:
 def _swept_groups(sweeper: DictConfig) -> set[str]:
     """The groups of which a sweep in a file lists choices or settings."""
     raw: Any = OmegaConf.to_container(sweeper, resolve=False)
-    params, grids = raw.get("params"), raw.get("grids")
-    nodes = [params, *(grids if isinstance(grids, list) else [])]
-    keys = [str(key) for node in nodes if isinstance(node, dict) for key in node]
-    return {bare_key(key).partition(".")[0] for key in keys}
+    grids = raw.get("grids")
+    nodes = [raw.get("params"), *(grids if isinstance(grids, list) else ())]
+    keys = chain(*(node for node in nodes if isinstance(node, dict)))
+    return {bare_key(str(key)).partition(".")[0] for key in keys}
 
 
 def _is_value(word: str) -> bool:
@@ -281,10 +282,11 @@ def _choices(words: Sequence[str]) -> dict[str, str]:
 def _without_seed(words: Sequence[str]) -> tuple[tuple[str, ...], int | None]:
     """The words without the seed, and the seed; all words and None unless it is a plain number."""
     seeds = [word for word in words if key_of(word) == "seed"]
-    seed: Any = parse_word(seeds[-1]).value() if len(seeds) == 1 else None
-    if not isinstance(seed, int) or not seeds[0].startswith("seed="):
-        return tuple(words), None
-    return tuple(word for word in words if word != seeds[0]), seed
+    if len(seeds) == 1 and seeds[0].startswith("seed="):
+        seed: Any = parse_word(seeds[0]).value()
+        if isinstance(seed, int):
+            return tuple(word for word in words if word != seeds[0]), seed
+    return tuple(words), None
 
 
 def set_value(config: DictConfig, override: Override) -> None:

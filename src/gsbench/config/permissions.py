@@ -115,10 +115,10 @@ def _import_advice(error: BaseException) -> str:
 
 
 def packages_allowed_at(place: Sequence[str]) -> tuple[str, ...]:
-    """The packages of gsbench whose classes a setting at ``place`` may name without permission."""
+    """gsbench's packages and classes that a setting at ``place`` may name without permission."""
     if len(place) == 1 and place[0] in COMPONENTS:
         own = f"{PACKAGE}.{place[0]}"
-        return (own, f"{PACKAGE}.external") if place[0] == "densify" else (own,)
+        return (own, *EXTERNAL) if place[0] == "densify" else (own,)
     if len(place) == 3 and tuple(place[:2]) == ("eval", "extra"):
         return (f"{PACKAGE}.eval",)
     return ()
