@@ -12,8 +12,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
 
 from gsbench.app import command, hydra_app, hydra_main, sweep
-from gsbench.app.goal import Goal, goal_of
-from gsbench.app.hydra_app import Job, words_without_sweeper
+from gsbench.app.hydra_app import Goal, Job, goal_of, words_without_sweeper
 from gsbench.app.hydra_main import words_for_files, words_for_new_folder
 from gsbench.errors import GsbenchError, InputError
 from gsbench.launch.outcomes import Outcome
