@@ -29,7 +29,7 @@ import yaml
 from gsbench.config.schema import GROUP_SCHEMAS, Config
 from gsbench.parsing import adapter
 from gsbench.runs.trial_record import TrialRecord
-from gsbench.scene.rules import ABOVE_ZERO, RULES
+from gsbench.scene.rules import RULES
 from gsbench.settings import MISSING, describe, option_fields
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -233,7 +233,7 @@ def as_markdown(text: str) -> str:
 def limits(values: tuple[float, float]) -> str:
     """A range of values in words, to four digits."""
     low, high = (f"{round(value, 9):.4g}" for value in values)
-    if values == ABOVE_ZERO:
+    if 0 < values[0] < 1e-300:
         return "above 0"
     if math.isinf(values[0]):
         return "" if math.isinf(values[1]) else f"at most {high}"

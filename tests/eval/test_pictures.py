@@ -159,7 +159,6 @@ def test_what_lowers_values_is_told_in_one_line(pairs, harm, of_render, said, ca
     if said is not None:
         assert re.search(said, lines[0])
         assert caplog.messages == [f"theirs: {lines[0]}"]
-    assert len({rule.id for rule in pictures.RULES}) == len(pictures.RULES)
 
 
 def test_a_photograph_on_its_side_is_named_if_the_sizes_differ(pairs):

@@ -10,11 +10,12 @@ from PIL import Image
 from gsbench.config.compose import compose_one
 from gsbench.runs.config_hash import arm_hash, config_hash
 from gsbench.runs.store import Store
+from gsbench.runs.trial_record import TwinViews
 from gsbench.scene import rules
 from gsbench.scene.load import load_scene
 from gsbench.scene.options import SceneConfig
 from gsbench.scene.rules import BY_ID, RULES, Finding, Rule, check_accept, inspect
-from gsbench.scene.types import Camera, Scene, Twins, View
+from gsbench.scene.types import Camera, Scene, View
 from gsbench.verbs.machine import doctor
 from tests.helpers import refusal
 from tests.scene.captures import read_colmap, read_photos
@@ -31,7 +32,7 @@ def views(places=(-1.0, 0.0, 1.0, 2.0), level=200, **changes):
 
 
 def scene(twins=None, **changes):
-    return Scene("toy", views(**changes), views((0.5,)), twins=twins or Twins())
+    return Scene("toy", views(**changes), views((0.5,)), twins=twins or TwinViews())
 
 
 def value(number, **facts):
@@ -100,12 +101,12 @@ ROWS = {
     ),
     "copies-in-pixels": (
         scene(),
-        scene(Twins(left_out={"a": "b"})),
+        scene(TwinViews(left_out={"a": "b"})),
         r"1 training view left out, .*: a \(b is used\)",
     ),
     "near-twins": (
         scene(),
-        scene(Twins(near={"a": "b"})),
+        scene(TwinViews(near={"a": "b"})),
         r"1 of 1 test view with a near twin in training: a \(b\)",
     ),
     "far-camera": (
@@ -172,6 +173,17 @@ ROWS = {
         Facts(color_spread=0.9, first_color=(9, 9, 9)),
         r"the colour \(9, 9, 9\)",
     ),
+    **{
+        name: (value(0), value(1), said)
+        for name, said in {
+            "transparent-render": r"1 render with transparent pixels .* \(a.png\)",
+            "lossy-render": "1 render compressed as JPEG",
+            "palette-render": "1 render with a palette",
+            "grey-render": "1 render in grey",
+            "turned": "1 photograph of another EXIF orientation",
+            "transparent-photograph": "1 photograph with transparent pixels, which are blended",
+        }.items()
+    },
 }
 
 
@@ -193,7 +205,7 @@ def test_a_rule_is_silent_up_to_its_limit_and_names_what_is_beyond(name):
 
 
 RULE = Rule(
-    "odd", "read", lambda raw: raw, (0, 1), "{value:g} of {names:few}", "take {low}", (0, 2)
+    "odd", lambda raw: raw, (0, 1), "read", "{value:g} of {names:few}", "take {low}", (0, 2)
 )
 
 

@@ -14,7 +14,7 @@ from gsbench.pipeline.steps.scene import CaptureSource, masked_capture, masking_
 from gsbench.scene import transforms
 from gsbench.scene.colmap import read_model, read_reference
 from gsbench.scene.options import SceneConfig
-from gsbench.scene.transforms import HARMLESS, REFUSED, read_transforms
+from gsbench.scene.transforms import KEYS, read_transforms
 from tests.helpers import change_json, read_json, refusal
 from tests.scene.cameras import cameras_of
 from tests.scene.captures import read_with_step
@@ -289,7 +289,7 @@ WRONG_KEYS = [
     ({"ply_file_path": "/etc/passwd"}, OUTSIDE),
     ({"ply_file_path": "p.ply"}, "names p.ply, which is not there"),
 ]
-REFUSED_ROWS = [(key, f"{key}: {reason}") for key, reason in REFUSED.items()]
+REFUSED_ROWS = [(key, f"{key}: {reason}") for key, reason in KEYS["refused"].items()]
 SIZE = {"w": 20, "h": 15}
 MATRIX, ROW = r"frames\.1\.transform_matrix is ", r"frames\.1\.transform_matrix\.0 is "
 WRONG_FRAMES = [
@@ -468,11 +468,11 @@ def test_higher_coefficients_distort_as_in_opencv(tmp_path, said):
         assert_allclose(seen, wanted, atol=1e-9)
 
 
-@pytest.mark.parametrize("key", sorted(HARMLESS | set(REFUSED)))
+@pytest.mark.parametrize("key", sorted([*KEYS["harmless"], *KEYS["refused"]]))
 def test_known_keys_without_effect_are_ignored_without_a_warning(tmp_path, key, caplog):
     wanted = cameras(tmp_path / "in")
     values = (None,) if key.startswith("transform_matrix") else (None, 0, False, [0.0, 0.0])
-    for value in (*values, *([1.5, "text", [1.0]] if key in HARMLESS else [])):
+    for value in (*values, *([1.5, "text", [1.0]] if key in KEYS["harmless"] else [])):
         assert cameras(tmp_path / "in", **{key: value}) == wanted
     assert not caplog.text
 

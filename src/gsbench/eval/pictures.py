@@ -4,7 +4,7 @@ Photographs of a capture are read by `gsbench.scene.images.read_image`. A render
 measurement, so nothing is blended or cut here, and what lowers its values is told.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from gsbench.logs import Progress, no_progress
 from gsbench.runs.trial_record import Oddity
 from gsbench.scene.images import EXIF_ORIENTATION, open_image, read_image
 from gsbench.scene.masks import read_mask
-from gsbench.scene.rules import Finding, Rule, at_most, settle
+from gsbench.scene.rules import Finding, inspect
 
 # A view of so many pixels takes half a minute; a file of some kB may claim more.
 MAX_PIXELS = 64_000_000
@@ -88,62 +88,26 @@ def read_picture(path: Path, is_render: bool) -> NDArray[np.uint8]:
 Looks = Sequence[tuple[str, Look, Look]]  # a view, its render, its photograph
 
 
-def _where(applies: Callable[[Look, Look], bool]) -> Callable[[Looks], Iterable[Finding]]:
-    """A measure that finds the views to whose render and photograph something ``applies``."""
-    return lambda looks: [Finding(1, [view]) for view, *both in looks if applies(*both)]
-
-
-def _row(id: str, applies: Callable[[Look, Look], bool], say: str, mend: str) -> Rule:
-    return Rule(id, "pictures", _where(applies), at_most(0), f"{say} ({{names:few}})", mend)
-
-
-# Rows of the table of rules (`gsbench.scene.rules`) about pictures; all may be measured.
-RULES = (
-    _row(
-        "transparent-render",
-        lambda render, _: render.transparent,
-        "{count:n render} with transparent pixels (alpha below 1), whose colours are measured as "
-        "they are stored",
-        "blend them over the background of the photographs first if they are not",
+# Tests of a render and its photograph, by the ids of the rules about pictures
+ODD: Mapping[str, Callable[[Look, Look], bool]] = {
+    "transparent-render": lambda render, _: render.transparent,
+    "lossy-render": lambda render, _: render.lossy,
+    "palette-render": lambda render, _: render.mode == "P",
+    "grey-render": lambda render, truth: render.is_grey and not truth.is_grey,
+    "turned": lambda render, truth: (
+        (render.orientation in UPRIGHT) != (truth.orientation in UPRIGHT)
     ),
-    _row(
-        "lossy-render",
-        lambda render, _: render.lossy,
-        "{count:n render} compressed as JPEG or WebP, which lowers every value",
-        "write PNG",
-    ),
-    _row(
-        "palette-render",
-        lambda render, _: render.mode == "P",
-        "{count:n render} with a palette of at most 256 colours, which lowers every value",
-        "write RGB",
-    ),
-    _row(
-        "grey-render",
-        lambda render, truth: render.is_grey and not truth.is_grey,
-        "{count:n render} in grey, of photographs in colour",
-        "check that they are no depth maps or masks",
-    ),
-    _row(
-        "turned",
-        lambda render, truth: (render.orientation in UPRIGHT) != (truth.orientation in UPRIGHT),
-        "{count:n photograph} of another EXIF orientation than the render: one of the two is "
-        "stored on its side, and both are compared as stored",
-        "turn its pixels",
-    ),
-    _row(
-        "transparent-photograph",
-        lambda _, truth: truth.transparent,
-        "{count:n photograph} with transparent pixels, which are blended over black",
-        "blend them over the background of the renders first if that is another",
-    ),
-)
+    "transparent-photograph": lambda _, truth: truth.transparent,
+}
 
 
 def find_odd_pictures(looks: Looks, where: str) -> tuple[Oddity, ...]:
     """Log and return what is odd: one line for each rule that applies to some views."""
-    judged = (rule.judge(looks) for rule in RULES)
-    return settle([found for found in judged if found is not None], where)
+    found = {
+        rule: [Finding(1, [view]) for view, *both in looks if applies(*both)]
+        for rule, applies in ODD.items()
+    }
+    return inspect("pictures", found, where)
 
 
 @dataclass(frozen=True)

@@ -12,14 +12,15 @@ from statistics import fmean
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from gsbench.config.compose import Trial
+from gsbench.errors import InputError
 from gsbench.launch.states import ask_queue, labels_of, state_in_queue, summary_of
 from gsbench.parsing import DamagedError
 from gsbench.runs.layout import RESULTS, TRIAL_GLOB
 from gsbench.runs.nested import sha256_of
 from gsbench.runs.trial_folder import TrialFolder
+from gsbench.scene.images import image_size
 from gsbench.scene.names import IMAGE_SUFFIXES
 from gsbench.scene.options import downscaled_size
 from gsbench.system.resources import available_threads, installed_gpus
@@ -205,9 +206,8 @@ def _first_size(path: str, images: str) -> tuple[int, int] | None:
     for place in (folder / images, folder) if path else ():
         for file in _files(place):
             try:
-                with Image.open(file) as picture:  # reads the header alone
-                    return picture.size
-            except (OSError, ValueError, Image.DecompressionBombError):
+                return image_size(file)
+            except InputError:
                 continue
     return None
 

@@ -54,7 +54,8 @@ def state_of(package: str) -> str:
 def _contents(package: str) -> dict[str, bytes]:
     """The content of a package's files by their paths below gsbench."""
     path = PACKAGE / package
-    files = [path] if path.suffix else sorted(path.rglob("*.py"))
+    # a table of data beside the code determines numbers, too
+    files = [path] if path.suffix else sorted([*path.rglob("*.py"), *path.rglob("*.yaml")])
     return {
         file.relative_to(PACKAGE).as_posix(): file.read_bytes() for file in files if file.is_file()
     }

@@ -187,14 +187,14 @@ def views_step(
         cameras: dict[str, Camera] = {}
         changes: dict[str, ImageToPrepare] = {}
         models = _model_cameras(capture, model_dir)
-        for index, (name, (model, _)) in enumerate(models.items()):
+        for index, (name, (lens, _)) in enumerate(models.items()):
             target, mask = folder / f"{index:05d}.png", capture.masks.get(name)
-            image = ImageToPrepare(capture.images / name, model, target, mask, **shrinking)
-            size = model.width, model.height
-            if model.distorted or image.final_size(*size) != size:
+            image = ImageToPrepare(capture.images / name, lens, target, mask, **shrinking)
+            size = lens.width, lens.height
+            if lens.distorted or image.final_size(*size) != size:
                 changes[name] = image
             else:
-                cameras[name] = to_pinhole(model)
+                cameras[name] = to_pinhole(lens)
         lenses = {name: image.camera for name, image in changes.items() if image.camera.distorted}
         odd = inspect("lens", lens_findings(lenses), f"scene {capture.name}", capture.accept)
         prepared = prepare_all(list(changes.values()), progress)

@@ -7,6 +7,7 @@ from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from gsbench.files import require_regular
 from gsbench.normalization import IDENTITY, find_normalization
 from gsbench.parsing import text_of
 from gsbench.scene.colmap_files import model_files, require_subfolder
-from gsbench.scene.hold_out import SplitLists, hold_out, reference_camera, select_images
+from gsbench.scene.hold_out import SplitLists, hold_out, select_images
 from gsbench.scene.images import check_picture_names
 from gsbench.scene.masks import check_masks, find_masks
 from gsbench.scene.names import match
@@ -47,11 +48,10 @@ def hold_out_views(raw: RawCapture, options: SceneConfig, lists: SplitLists) -> 
     train, test = (_resolve(wanted, names, raw.folder) for wanted in lists)
     if train is not None and test is not None:
         names = sorted({*train, *test})
-    cameras = (
-        (lambda chosen: [reference_camera(*by_name[name].posed) for name in chosen])
-        if raw.has_cameras
-        else None
-    )
+
+    def cameras(chosen: Sequence[str]) -> list[Any]:
+        return [by_name[name] for name in chosen]
+
     split = hold_out(select_images(names, options.max_images), options, (train, test), cameras)
     roles: dict[str, Role] = dict.fromkeys(split.train, "train")
     roles.update((name, "test") for name in split.test)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from gsbench.errors import InputError
 from gsbench.normalization import IDENTITY, Normalization
-from gsbench.runs.trial_record import Oddity
+from gsbench.runs.trial_record import Oddity, TwinViews
 
 Array = NDArray[np.float64]
 
@@ -113,18 +113,6 @@ def to_pinhole(camera: CameraModel) -> Camera:
 
 
 @dataclass(frozen=True)
-class Twins:
-    """Photographs that occur twice (`gsbench.scene.twins`).
-
-    ``left_out`` maps each photograph that is not used to the one that it copies. ``near`` maps a
-    test view to the training view that looks nearly the same, and is used.
-    """
-
-    left_out: Mapping[str, str] = field(default_factory=dict)
-    near: Mapping[str, str] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
 class Capture:
     """Photographs on disk, and the cameras that came with them, if any.
 
@@ -195,7 +183,7 @@ class Scene:
     name: str
     train: tuple[View, ...]
     test: tuple[View, ...]
-    twins: Twins = field(default_factory=Twins)
+    twins: TwinViews = field(default_factory=TwinViews)
     oddities: tuple[Oddity, ...] = ()
 
     @cached_property

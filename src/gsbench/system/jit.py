@@ -124,8 +124,15 @@ def _turn() -> Iterator[None]:
 
 
 def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile ``function`` into the kernels that call it."""
-    return njit(nogil=True, error_model="numpy", forceinline=True, _nrt=False)(function)
+    """Compile ``function`` into the kernels that call it; Python itself cannot call it."""
+    return njit(
+        nogil=True,
+        error_model="numpy",
+        forceinline=True,
+        no_cpython_wrapper=True,  # without the two ways in from outside, kernels compile faster
+        no_cfunc_wrapper=True,
+        _nrt=False,
+    )(function)
 
 
 class _Announcement(event.Listener):

@@ -8,7 +8,6 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from gsbench.eval.facts import find_metric
 from gsbench.runs import layout
@@ -18,6 +17,7 @@ from gsbench.runs.nested import flatten, sha256_of
 from gsbench.runs.rows import read_rows
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import TrialRecord
+from gsbench.scene.images import read_image
 from gsbench.words import command, markdown_code, markdown_text
 
 NOTE = "note"  # the tag that describes a finished trial, in Markdown
@@ -247,22 +247,17 @@ class TrackedTrial:
         rendered, photographed, wrong = PICTURE_KINDS
         pictures: dict[str, Array] = {}
         for path in self.folder.pictures(layout.RENDERS)[:count]:
-            render = _read_picture(path)
+            render = read_image(path)
             pictures[picture_key(path.stem, rendered)] = render
             photograph = self.folder.path / layout.GROUND_TRUTH / path.name
             if not photograph.exists():
                 continue
-            truth = _read_picture(photograph)
+            truth = read_image(photograph)
             pictures[picture_key(path.stem, photographed)] = truth
             if truth.shape == render.shape:
                 error = np.abs(render.astype(np.int16) - truth.astype(np.int16))
                 pictures[picture_key(path.stem, wrong)] = error.astype(np.uint8)
         return pictures
-
-
-def _read_picture(path: Path) -> Array:
-    with Image.open(path) as image:
-        return np.asarray(image.convert("RGB"))
 
 
 def _seconds(record: Mapping[str, float]) -> float:
