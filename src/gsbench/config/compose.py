@@ -105,8 +105,7 @@ class Composer:
         single = [word for word in words if not is_sweep(word)]
         own = task_words(single)
         self.hydra_words = tuple(word for word in single if word not in own)
-        self._check_texts(single)  # before any of them is resolved
-        self._check_words(self.hydra_words)
+        self._check_words(single)  # before any of them is resolved
         self._chosen: dict[tuple[str, ...], DictConfig] = {}
         self._times: dict[str, Any] = {}  # what ${now:…} stands for, the same in all trials
         # The settings of a group whose choices are listed, here or in a file, are checked with each
@@ -241,16 +240,12 @@ class Composer:
 
     def _check_words(self, words: Sequence[str]) -> None:
         """Refuse words that would resolve what is not allowed, or leave the folder of a group."""
-        self._check_texts(words)
         for word in words:
+            override = parse_word(word)
+            value: Any = override.value()
+            check_texts({override.key_or_group: value}, self.allowed)
             if not _is_value(word):
-                check_choice(word, str(parse_word(word).value()))
-
-    def _check_texts(self, words: Sequence[str]) -> None:
-        for word in words:
-            if "${" in word:
-                override = parse_word(word)
-                check_texts({override.key_or_group: override.value()}, self.allowed)
+                check_choice(word, str(value))
 
 
 def _by_autograd(train: Mapping[str, Any]) -> bool:
