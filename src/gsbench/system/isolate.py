@@ -111,8 +111,8 @@ T = TypeVar("T")
 
 _BOOTSTRAP = (
     "import json, sys; path, own = json.loads(sys.argv[1]); sys.path[:] = path; "
-    "from gsbench.system.programs import adopt_modules; adopt_modules(own); from {module} "
-    "import {name}; {name}()"
+    "from gsbench.system.programs import adopt_modules; adopt_modules(own); "
+    "from gsbench.system.isolate import _child; _child()"
 )
 # time limit for a child to end the programs that it started, before it is killed
 _SECONDS_TO_END = 10.0
@@ -161,30 +161,14 @@ def run_isolated(
     raise value
 
 
-def python_command(module: str, name: str, *arguments: str) -> list[str]:
-    """The command of a fresh interpreter that calls ``name`` of ``module``.
-
-    The interpreter has the module search path of this process. The function has no parameters;
-    ``arguments`` are in ``sys.argv[2:]``.
-    """
-    search_path = json.dumps([sys.path, allowed_modules()])
-    # -P: a stranger's capture in the current folder may have a json.py, which must not be imported.
-    return [
-        sys.executable,
-        "-P",
-        "-c",
-        _BOOTSTRAP.format(module=module, name=name),
-        search_path,
-        *arguments,
-    ]
-
-
 def _run_child(call: bytes, output: IO[bytes], progress: Progress) -> tuple[int, Any]:
     """Run the ``call`` in a child; returns its exit code and its result, None without one.
 
     It is ended on any exception, as Ctrl-C.
     """
-    command = python_command("gsbench.system.isolate", "_child", str(len(call)))
+    search_path = json.dumps([sys.path, allowed_modules()])
+    # -P: a stranger's capture in the current folder may have a json.py, which must not be imported.
+    command = [sys.executable, "-P", "-c", _BOOTSTRAP, search_path]
     # In its own session, the child does not receive Ctrl-C. The parent does and ends it: one
     # traceback, not two. After the call nothing is written to the pipe at stdin. When it closes,
     # the child ends, because the parent wants it or is gone.
@@ -200,7 +184,7 @@ def _run_child(call: bytes, output: IO[bytes], progress: Progress) -> tuple[int,
     result = None
     try:
         with suppress(EOFError, pickle.UnpicklingError, BrokenPipeError):  # the child has ended
-            child.stdin.write(call)
+            pickle.dump(call, child.stdin)
             child.stdin.flush()
             while True:
                 content = pickle.load(child.stdout)
@@ -221,15 +205,10 @@ def _run_child(call: bytes, output: IO[bytes], progress: Progress) -> tuple[int,
         except subprocess.TimeoutExpired:
             child.kill()
             child.wait()
-        _end_group(child.pid)
-
-
-def _end_group(leader: int) -> None:
-    """Kill programs that the child left running in its session, the process group ``leader``."""
-    if hasattr(os, "killpg"):
-        # raised if no process is left (on macOS: only zombies)
-        with suppress(ProcessLookupError, PermissionError):
-            os.killpg(leader, signal.SIGKILL)
+        if hasattr(os, "killpg"):  # programs that it left running in its session
+            # raised if no process is left (on macOS: only zombies)
+            with suppress(ProcessLookupError, PermissionError):
+                os.killpg(child.pid, signal.SIGKILL)
 
 
 def _child() -> None:
@@ -239,7 +218,7 @@ def _child() -> None:
     the function itself prints goes to standard error.
     """
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    call = sys.stdin.buffer.read(int(sys.argv[2]))
+    call = pickle.load(sys.stdin.buffer)  # bytes: what they name is imported after the fork
     if not continue_in_child():
         threading.Thread(target=_end_with_parent, daemon=True).start()
     channel, one_at_a_time = os.fdopen(os.dup(1), "wb"), threading.Lock()
