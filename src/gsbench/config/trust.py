@@ -13,6 +13,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from gsbench.config.permissions import (
+    PACKAGE,
     SBATCH_RESOURCES,
     check_launch,
     check_program,
@@ -68,6 +69,8 @@ FREE_KEYS = SBATCH_RESOURCES | {
 FREE_TEXTS = ("ext://sys.stdout", "ext://sys.stderr", "auto", "local")
 # parts of a sweeper that are words of its jobs, checked as such
 SWEPT_TEXTS = ("params", "grids", "search_space")
+# Classes of this form are not imported for the check, since an import may take seconds.
+PUBLIC_CLASS = re.compile(rf"{PACKAGE}\.\w+\.[A-Z]\w*")
 # Settings that a sweep in a file may not vary: its jobs are composed after the check of the whole
 # configuration.
 NOT_SWEPT = re.compile(rf"[\s+~]*(hydra|runs|{PERMISSIONS})\s*([./@:=\[]|$)")
@@ -134,6 +137,9 @@ def check_composed(
             # `densify._target_=gsbench.init.…` is refused.
             own = HYDRAS_CALLBACKS if is_callback else packages_allowed_at(place)
             check_target(value, ".".join(place), allowed, own)
+            if is_allowed(value, (PACKAGE,)) and not PUBLIC_CLASS.fullmatch(value):
+                # refuses names such as gsbench.densify.adc.torch.load
+                load_class(value, ".".join(place), allowed)
         _check_hydra(path, value, typed, allowed)
 
 
