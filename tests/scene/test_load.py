@@ -18,6 +18,7 @@ from gsbench.scene.types import CameraModel
 from gsbench.scene.undistortion import flatten, largest_distortion, lens_findings, undistort
 from tests.helpers import read_json, refusal
 from tests.scene.captures import read_colmap
+from tests.scene.tables import TABLES
 
 WIDTH, HEIGHT = 200, 150
 # Parameters beyond the focal length of 150 px and the centre, where small ones do not fit.
@@ -123,16 +124,7 @@ def test_distortion_below_a_twentieth_of_a_pixel_is_ignored_and_above_it_is_not(
 
 @pytest.mark.parametrize(
     "name, params, share",
-    [
-        ("SIMPLE_RADIAL", (90, 80, 60, -0.35), 0.68),
-        ("SIMPLE_RADIAL", (150, 80, 60, -0.1), 0.0),
-        ("SIMPLE_RADIAL", (90, 80, 60, 0.35), 0.0),
-        ("RADIAL", (80, 80, 60, -0.3, 0.03), 0.49),
-        ("OPENCV", (90, 90, 80, 60, -0.35, 0, 0, 0), 0.68),
-        ("OPENCV_FISHEYE", (60, 60, 80, 60, -0.05, -0.1, 0, 0), 0.35),
-        ("OPENCV_FISHEYE", (60, 60, 80, 60, -0.01, 0, 0, 0), 0.0),
-        ("FOV", (90, 90, 80, 60, 0.9), 0.0),
-    ],
+    TABLES["lenses that turn back"],
 )
 def test_lenses_that_turn_back_inside_the_picture_are_refused(
     name, params, share, caplog, in_process
