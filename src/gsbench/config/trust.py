@@ -18,6 +18,7 @@ from gsbench.config.permissions import (
     check_launch,
     check_program,
     check_target,
+    check_texts,
     is_allowed,
     is_external,
     load_class,
@@ -128,6 +129,8 @@ def check_composed(
         path = (*place, key)
         if usual.get(path) == value:
             continue
+        if not isinstance(value, dict | list):  # files of packages were not looked at before
+            check_texts({key: value}, allowed, ".".join(place))
         if key in SPECIAL_KEYS:  # `_partial_` makes a function of anything, to be called later
             raise InputError(f"{'.'.join(path)}: gsbench makes no objects this way: leave it out")
         # The schema or Hydra reports a target that is no text.
