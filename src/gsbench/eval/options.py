@@ -19,11 +19,12 @@ from gsbench.eval.facts import (
     lpips_variants,
 )
 from gsbench.eval.protocol import PROTOCOLS
-from gsbench.eval.regions import DISTANCE, DISTANCES
 from gsbench.runs.experiments import AT, QUESTIONS, metric_and_question
 from gsbench.settings import MISSING, FolderName, PathName, check_settings
 from gsbench.words import did_you_mean
 
+DISTANCE = "distance"  # the value of ``eval.regions`` that asks for `DISTANCES`
+DISTANCES = ("near", "middle", "far")
 METRIC_NAME = re.compile(r"[a-z][a-z0-9_]*")
 # keys of metrics, the column of views, and the protocol's LPIPS
 RESERVED_NAMES = (*known_keys(), "view", "lpips")

@@ -5,6 +5,7 @@ photograph>.png``, beside ``info.json`` (`save_predictions` of nerfbaselines 1.2
 has them in ``predictions/``.
 """
 
+import shutil
 import tarfile
 import tempfile
 import zipfile
@@ -21,7 +22,6 @@ from gsbench.words import readable_bytes
 RENDERED, PHOTOGRAPHS = "color", "gt-color"
 # Archives may come from strangers: this stops one that unpacks to far more than test views need.
 MAX_TOTAL_BYTES = 20 << 30
-CHUNK = 1 << 20
 PNG = ".png"
 
 
@@ -41,8 +41,11 @@ def opened_renders(place: Path) -> Iterator[tuple[Path, Path | None]]:
     if not place.exists():
         raise InputError(f"{place} is not a folder of renders")
     require_regular(place)
-    if kind := _kind_of(place):
-        raise InputError(f"{place} is {kind}")
+    with place.open("rb") as file:
+        start = file.read(len(GIT_LFS))
+    for first, kind in OTHERS.items():
+        if start.startswith(first):
+            raise InputError(f"{place} is {kind}")
     with tempfile.TemporaryDirectory(prefix="gsbench-") as scratch:
         try:
             _unpack(place, Path(scratch))
@@ -59,12 +62,6 @@ MODEL = "a model: gsbench scene=SCENE init=ply init.path=FILE train=none densify
 PICTURE = "one picture: give its folder"
 # By the first bytes of a file that is no archive: what it is, and what to do.
 OTHERS = {GIT_LFS: LFS_REMEDY, b"ply": MODEL, b"\x89PNG": PICTURE, b"\xff\xd8": PICTURE}
-
-
-def _kind_of(place: Path) -> str:
-    with place.open("rb") as file:
-        start = file.read(len(GIT_LFS))
-    return next((kind for first, kind in OTHERS.items() if start.startswith(first)), "")
 
 
 def _unpack(archive: Path, scratch: Path) -> None:
@@ -86,12 +83,13 @@ def _unpack(archive: Path, scratch: Path) -> None:
                 for member in tar
                 if member.isfile()
             }
-        for name, target in _wanted(archive, {key: files[key][0] for key in files}).items():
-            size, open_file = files[name]
-            content = open_file()
+        for name, place in _wanted(archive, {key: files[key][0] for key in files}).items():
+            (scratch / place).parent.mkdir(parents=True, exist_ok=True)
+            content = files[name][1]()
             assert content is not None  # of a regular file
-            with content:
-                _write(content, scratch / target, size)
+            # At most the size that the archive says is unpacked, and a wrong size is an error.
+            with content, (scratch / place).open("wb") as file:
+                shutil.copyfileobj(content, file)
 
 
 def _wanted(archive: Path, sizes: dict[str, int]) -> dict[str, Path]:
@@ -123,16 +121,3 @@ def _wanted(archive: Path, sizes: dict[str, int]) -> dict[str, Path]:
             f"{readable_bytes(MAX_TOTAL_BYTES)}"
         )
     return both[0]
-
-
-def _write(source: IO[bytes], target: Path, size: int) -> None:
-    """Copy exactly ``size`` bytes; raises ValueError for a member with more or fewer."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with target.open("wb") as file:
-        left = size
-        while left and (piece := source.read(min(CHUNK, left))):
-            file.write(piece)
-            left -= len(piece)
-        # A small number in the directory of an archive may hide gigabytes.
-        if left or source.read(1):
-            raise ValueError(f"{target.name} has another size than the archive says")

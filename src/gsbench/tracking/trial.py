@@ -56,14 +56,6 @@ def picture_key(view: str, kind: str) -> str:
     return f"{NOT_IN_A_KEY.sub('_', view)}/{kind}"
 
 
-def arm_name(densify: str, init: str) -> str:
-    """The name of an arm.
-
-    The densifier is compared most often. It comes first, since trackers cut long names at the end.
-    """
-    return f"{densify} · {init}"
-
-
 def eval_name(key: str) -> str:
     """The name of a metric of the test views, with its unit: ``eval/psnr_dB``."""
     facts = find_metric(key)
@@ -131,8 +123,12 @@ class TrackedTrial:
 
     @property
     def arm(self) -> str:
-        """The name of the trial's arm."""
-        return arm_name(self.values["densify"]["name"], self.values["init"]["name"])
+        """The name of the trial's arm.
+
+        The densifier is compared most often. It comes first, since trackers cut long names at the
+        end.
+        """
+        return f"{self.values['densify']['name']} · {self.values['init']['name']}"
 
     @property
     def label(self) -> str:

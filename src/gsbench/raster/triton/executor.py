@@ -51,8 +51,7 @@ from gsbench.raster.triton.lists import (
     make_lists,
     sort_by_depth,
 )
-from gsbench.raster.triton.projection import backproject, project, sum_units
-from gsbench.raster.triton.splitting import store_splitting
+from gsbench.raster.triton.projection import backproject, project, store_splitting, sum_units
 from gsbench.scene.types import Camera
 
 EXTRA_KERNELS = {"splitting_matrix": store_splitting}  # each writes an extra output
