@@ -14,7 +14,7 @@ from gsbench.errors import InputError
 from gsbench.launch.states import STATES, TrialState, arm_names, states_of_experiment
 from gsbench.runs.experiments import experiment_home
 from gsbench.runs.layout import CURVES
-from gsbench.runs.rows import read_rows
+from gsbench.runs.trial_files import read_rows
 from gsbench.runs.trial_folder import TrialFolder
 
 if TYPE_CHECKING:
