@@ -165,11 +165,11 @@ def test_progress_and_output_of_a_function_are_forwarded_to_the_end(functions, t
         told.append((*given, *named.values()))
         raise BrokenPipeError  # a closed terminal stops nothing
 
-    assert isolate.run_isolated(functions.work, 2, progress=report, log=log) == 3
+    assert isolate.run_isolated(functions.work, 2, what="work", log=log, progress=report) == 3
     assert told == [("a", 2, 5, ""), ("b", 1, None, "note")]
     assert log.read_text() == "printed\n"
     with pytest.raises(ValueError, match="three"):
-        isolate.run_isolated(functions.work, 3, progress=report)
+        isolate.run_isolated(functions.work, 3, what="work", progress=report)
     assert told[2:] == [("a", 3, 5, "")]
 
 

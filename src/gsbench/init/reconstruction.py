@@ -101,7 +101,7 @@ class Reconstruction(ColmapOptions):
         for folder in (output_dir, work):
             folder.mkdir(parents=True, exist_ok=True)
         job, log = Job(self, capture, output_dir, work, reference), output_dir / LOG_FILE
-        report = run_isolated(build_model, job, progress=progress, what=self.name, log=log)
+        report = run_isolated(build_model, job, what=self.name, log=log, progress=progress)
         if work_dir is None:
             shutil.rmtree(work)
         for warning in report.warnings:
