@@ -116,8 +116,10 @@ def test_views_have_depth_in_the_units_of_the_training(make_scene, tmp_path):
         Image.fromarray(np.full((4, 4), value, np.uint16)).save(path)
     capture = replace(
         capture,
-        depths={name: tmp_path / f"{name}.png" for name in (first, second)},
-        more={first: {"normals": capture.images / first}},
+        beside={
+            "depth": {name: tmp_path / f"{name}.png" for name in (first, second)},
+            "normals": {first: capture.images / first},
+        },
         normalization=Normalization(scale=2.0),
     )
     kinds = ["depth", "normals"]
@@ -137,7 +139,7 @@ def test_depth_that_no_view_knows_is_refused(make_scene, tmp_path, caplog):
     capture = read_colmap("x", make_scene())
     first = capture.image_names[0]
     np.save(tmp_path / "a.npy", np.full((30, 40), -1.0))
-    capture = replace(capture, depths={first: tmp_path / "a.npy"})
+    capture = replace(capture, beside={"depth": {first: tmp_path / "a.npy"}})
     with refusal("scene.beside=depth: no view has a known depth"):
         load_scene(capture, capture.model, Store(tmp_path / "cache"), beside=["depth"])
     assert "scene.beside=depth: only 1 of 6 photographs have it" in caplog.text

@@ -62,9 +62,9 @@ def test_files_of_the_photographs_names_in_folders_beside_them_are_columns(tmp_p
             write(tmp_path / place / f"{k}.{ending}", b"any")
     capture = read_photos("a", tmp_path)
     names = [f"cam/{k}.jpg" for k in range(3)]
-    assert capture.depths == {name: tmp_path / f"depth/{name[:-3]}npy" for name in names}
-    assert capture.more == {
-        name: {"normals": tmp_path / f"normals/{name[:-3]}png"} for name in names
+    assert capture.beside == {
+        "depth": {name: tmp_path / f"depth/{name[:-3]}npy" for name in names},
+        "normals": {name: tmp_path / f"normals/{name[:-3]}png" for name in names},
     }
     alone = read_photos("a", photographs(tmp_path / "alone", "images/cam/{}.jpg"))
     assert alone.fingerprint == capture.fingerprint

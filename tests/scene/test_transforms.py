@@ -227,7 +227,7 @@ def test_masks_and_depth_maps_that_frames_name_are_columns_of_the_record(tmp_pat
         Image.new("L", (40, 30), 255).save(folder / "masks" / "images" / f"{k}.png.png")
     found = capture_of(folder, tmp_path / "a")
     assert found.masks == {"images/1.png": folder / "masks/1.png"}
-    assert found.depths == {"images/1.png": folder / "d/1.npy"}
+    assert found.beside == {"depth": {"images/1.png": folder / "d/1.npy"}}
     found = capture_of(folder, tmp_path / "b", masks="masks")
     assert found.masks["images/2.png"] == folder / "masks/images/2.png.png"
 

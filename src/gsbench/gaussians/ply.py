@@ -180,7 +180,7 @@ def _stacked(
 
 def _read_columns(path: Path) -> dict[str, Column]:
     """The columns of a 3DGS PLY, with valid values; raises as `read_ply` does."""
-    content, table = _checked(_content_and_table, path)
+    content, table = _checked(read_ply_data, path)
     names = _check_properties(table, path)
     vertices: dict[str, Column] = {name: table[name] for name in names}
     opacity = vertices["opacity"]
@@ -200,17 +200,12 @@ def _read_columns(path: Path) -> dict[str, Column]:
         _warn_of_activated(vertices, path)
         elements = [element.name for element in content]
         report_header([*content.comments, *content.obj_info], elements, path)
-    for name in filter(is_filter, table.dtype.names):
+    for name in [name for name in table.dtype.names or () if is_filter(name)]:
         logits, sizes = _stacked({**vertices, name: table[name]}, ["opacity", name]).T
         scales, logits = filtered(_stacked(vertices, SCALES), logits, sizes, path)
         vertices |= dict(zip(SCALES, scales.T, strict=True))
         vertices["opacity"] = logits.clip(-MAX_LOGIT, MAX_LOGIT)
     return vertices
-
-
-def _content_and_table(path: Path) -> tuple[PlyData, Any]:
-    content = read_ply_data(path)
-    return content, content["vertex"].data
 
 
 def _check_properties(vertices: Any, path: Path) -> list[str]:

@@ -130,22 +130,27 @@ def _how_to_unpack(path: Path) -> str:
     return f"unpack it with npx @playcanvas/splat-transform {path.name} out.ply"
 
 
-def read_ply_data(path: Path) -> PlyData:
-    """Return the content of a PLY file.
+def read_ply_data(path: Path) -> tuple[PlyData, NDArray[Any]]:
+    """Return the content of a PLY file, and the table of its vertices.
 
     Unlike plyfile, it accepts a byte order mark and comments with characters beyond ASCII. Raises
-    ValueError as `read_header` does, and other errors of `gsbench.files.DAMAGE`.
+    as `read_header` does, ValueError without vertices, and other errors of `gsbench.files.DAMAGE`.
     """
     header = read_header(path)
     with path.open("rb") as stream:
         marked = stream.read(len(codecs.BOM_UTF8)) == codecs.BOM_UTF8
-    try:
-        if header.isascii() and not marked:
-            return PlyData.read(str(path))
+    source: Any = str(path)
+    if marked or not header.isascii():
         content = path.read_bytes().removeprefix(codecs.BOM_UTF8)
-        return PlyData.read(io.BytesIO(NOT_ASCII.sub(b"?", header) + content[len(header) :]))
+        source = io.BytesIO(NOT_ASCII.sub(b"?", header) + content[len(header) :])
+    try:
+        data = PlyData.read(source)
     except PlyParseError as error:
         raise ValueError(str(error)) from error
+    if "vertex" not in data:
+        elements = ", ".join(element.name for element in data)
+        raise ValueError(f"it has no element vertex, only {elements or 'a header'}")
+    return data, data["vertex"].data
 
 
 FILTER = "filter_3D"

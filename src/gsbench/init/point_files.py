@@ -58,7 +58,8 @@ def read_points(path: Path) -> tuple[Array, NDArray[np.uint8] | None]:
     require_regular(path)
     try:
         if suffix == ".ply":
-            columns = _read_ply(path)
+            _, vertices = read_ply_data(path)
+            columns: Columns = {name: vertices[name] for name in vertices.dtype.names or ()}
         elif suffix in TEXT_SUFFIXES:
             columns = _read_table(path)
         else:
@@ -90,15 +91,6 @@ def _other_format(path: Path) -> str:
         return f"it is {kind}"
     known = ", ".join((".ply", *TEXT_SUFFIXES))
     return f"known are {known}: convert it to PLY, for example with CloudCompare"
-
-
-def _read_ply(path: Path) -> Columns:
-    content = read_ply_data(path)
-    if "vertex" not in content:
-        elements = ", ".join(element.name for element in content)
-        raise ValueError(f"it has no element vertex, only {elements or 'a header'}")
-    vertices = content["vertex"].data
-    return {name: vertices[name] for name in vertices.dtype.names or ()}
 
 
 def _read_table(path: Path) -> Columns:

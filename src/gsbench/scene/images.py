@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,12 +20,10 @@ from PIL import Image, UnidentifiedImageError
 from gsbench.errors import InputError
 from gsbench.files import GIT_LFS, LFS_REMEDY, MAX_NAME_BYTES, require_regular
 from gsbench.scene.names import FILES, IMAGE_SUFFIXES
-from gsbench.scene.options import Backdrop
+from gsbench.scene.options import Backdrop, Resample
 from gsbench.words import counted, is_one_line, some_of
 
 log = logging.getLogger(__name__)
-
-Resample = Literal["lanczos", "area", "bicubic"]
 
 # photographs and videos that are not read, and how they are called
 NOT_READ = {suffix: kind for kind, own in FILES["not_read"].items() for suffix in own}

@@ -120,9 +120,10 @@ class Capture:
     ``test_names`` are the held-out ones. ``held_out`` describes in words how they were chosen.
     ``model`` is a COLMAP sparse folder with reference cameras, or None for bare photographs;
     ``exact_poses`` says that its poses are the truth (a procedural scene), not an estimate.
-    ``masks`` are mask files by image name; it is empty if every pixel counts. ``depths`` are depth
-    maps and ``more`` other files of a photograph by kind, by image name. ``fingerprint`` is a
-    sha256 over names and contents of the selected images, their masks and the model. ``read_from``
+    ``masks`` are mask files by image name; it is empty if every pixel counts. ``beside`` are other
+    files of the photographs by kind (``depth`` and names of folders), by image name.
+    ``fingerprint`` is a sha256 over names and contents of the selected images, their masks and the
+    model. ``read_from``
     are further files of the user that the cameras were read from. ``advised_normalization`` maps
     the given coordinates to those in which the scene should be trained
     (`gsbench.scene.colmap.normalize_capture`). ``normalization`` is the map that was applied to
@@ -140,8 +141,7 @@ class Capture:
     fingerprint: str
     held_out: str = ""
     masks: Mapping[str, Path] = field(default_factory=dict)
-    depths: Mapping[str, Path] = field(default_factory=dict)
-    more: Mapping[str, Mapping[str, Path]] = field(default_factory=dict)
+    beside: Mapping[str, Mapping[str, Path]] = field(default_factory=dict)
     read_from: tuple[Path, ...] = ()
     advised_normalization: Normalization = IDENTITY
     normalization: Normalization = IDENTITY

@@ -51,11 +51,7 @@ class Features:
         height, width = mask.shape
         columns, rows = np.floor(self.colmap_keypoints).astype(np.int64).T  # [K] each
         kept = mask[rows.clip(0, height - 1), columns.clip(0, width - 1)]
-        return self[kept]
-
-    def __getitem__(self, chosen: slice | NDArray[np.bool_]) -> Features:
-        """The features with the ``chosen`` indices."""
-        arrays = self.keypoints[chosen], self.descriptors[chosen], self.scores[chosen]
+        arrays = self.keypoints[kept], self.descriptors[kept], self.scores[kept]
         return Features(*arrays, self.network_size, self.file_size)
 
 

@@ -114,7 +114,8 @@ def region_masks(capture: Capture, parts: Parts) -> dict[str, dict[str, Path]]:
 
 
 def _sensor_depths(capture: Capture) -> dict[str, Path]:
-    return {name: capture.depths[name] for name in capture.test_names if name in capture.depths}
+    depths = capture.beside.get(DEPTH, {})
+    return {name: depths[name] for name in capture.test_names if name in depths}
 
 
 # Read before the training, to refuse a scene, and after it. The fingerprint covers its content.
