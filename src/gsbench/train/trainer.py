@@ -529,9 +529,9 @@ def fast_steps(
 
     kernels = loss.implementation(device)
     direct = None
-    fits = type(rasterizer) is TritonRasterizer and rasterizer.direct_steps
-    if fits and isinstance(kernels, TritonLoss):
-        direct = DirectStep(rasterizer, kernels, background, True, options.visible_adam)
+    ours = rasterizer if type(rasterizer) is TritonRasterizer else None
+    if ours and ours.direct_steps and isinstance(kernels, TritonLoss):
+        direct = DirectStep(ours, kernels, background, True, options.visible_adam)
     return direct, TritonAdam()
 
 
