@@ -26,7 +26,7 @@ from gsbench.logs import Progress, no_progress
 from gsbench.scene.images import lens_of
 from gsbench.scene.rules import MIN_IMAGES
 from gsbench.scene.types import Capture
-from gsbench.system.isolate import run_with_progress
+from gsbench.system.isolate import run_isolated
 from gsbench.words import counted, some_of
 
 if TYPE_CHECKING:
@@ -101,7 +101,7 @@ class Reconstruction(ColmapOptions):
         for folder in (output_dir, work):
             folder.mkdir(parents=True, exist_ok=True)
         job, log = Job(self, capture, output_dir, work, reference), output_dir / LOG_FILE
-        report = run_with_progress(build_model, job, progress, what=self.name, log=log)
+        report = run_isolated(build_model, job, what=self.name, log=log, progress=progress)
         if work_dir is None:
             shutil.rmtree(work)
         for warning in report.warnings:
