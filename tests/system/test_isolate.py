@@ -148,7 +148,8 @@ def test_only_the_end_of_a_long_output_is_read(tmp_path, monkeypatch):
     [
         (-9, "crashed (SIGKILL, perhaps out of memory)"),
         (-11, "crashed (SIGSEGV)"),
-        (-99, "crashed (signal 99)"),
+        (139, "crashed (SIGSEGV)"),
+        (255, "ended early (exit code 255)"),
         (0, "ended early (exit code 0)"),
         (7, "ended early (exit code 7)"),
     ],

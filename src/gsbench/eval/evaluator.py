@@ -203,11 +203,8 @@ class Evaluator:
         wanted = {f"{LPIPS}{variant}" for variant in (variants if lpips is None else lpips)}
         wanted |= {facts.key for facts in METRICS if not facts.setting}
         wanted |= {*more, *(["flip"] if flip else [])}
-        self._load_lpips = partial(
-            load_lpips, folder=weights, download=download, device=self.device
-        )
-        # each loaded once, or the error for missing weights
-        self._networks: dict[str, Lpips | MissingWeightsError] = {}
+        self._lpips = weights, download
+        self._networks: dict[str, Lpips | MissingWeightsError] = {}  # each looked for once
         self._metrics: dict[str, Measure] = {}
         for facts in METRICS:
             if facts.setting == MORE and facts.key not in wanted:
@@ -232,7 +229,7 @@ class Evaluator:
         """The LPIPS network ``net``; raises UnavailableError if its weights are missing."""
         if net not in self._networks:
             try:
-                self._networks[net] = self._load_lpips(net)
+                self._networks[net] = load_lpips(net, *self._lpips, self.device)
             except MissingWeightsError as error:
                 self._networks[net] = error
         network = self._networks[net]
