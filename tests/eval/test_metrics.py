@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from gsbench.eval.evaluator import psnr
 from gsbench.eval.flip import flip, flip_map
-from gsbench.eval.metrics import psnr
 from gsbench.eval.ssim import ssim
 from tests.eval.reference import ssim_map
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gsbench.renders.predictions import opened_renders
+from gsbench.renders.sources import opened_renders
 from tests.helpers import refusal, write
 
 VIEWS = ("DSC001", "sub/DSC002")
@@ -136,10 +136,10 @@ def test_files_that_are_no_archive_of_predictions_are_refused(
     wanted = [content for name, content in members.items() if name.split("/")[0] in PLACES]
     total = sum(len(content) for content in wanted) - len(members["color/notes.txt"])
     big = as_zip(members, tmp_path / "big")
-    monkeypatch.setattr("gsbench.renders.predictions.MAX_TOTAL_BYTES", total)
+    monkeypatch.setattr("gsbench.renders.sources.MAX_TOTAL_BYTES", total)
     with opened_renders(big):
         pass
-    monkeypatch.setattr("gsbench.renders.predictions.MAX_TOTAL_BYTES", total - 1)
+    monkeypatch.setattr("gsbench.renders.sources.MAX_TOTAL_BYTES", total - 1)
     with refusal(r"unpacks to .* kB, more than"), opened_renders(big):
         pass
 

@@ -17,7 +17,7 @@ from gsbench.parsing import Amount, Count, Record
 from gsbench.runs.commands import ERROR_RATE, Digest, Question, code_in
 from gsbench.runs.experiments import Arm, unix_time
 from gsbench.runs.layout import DECLARED
-from gsbench.runs.rows import read_rows
+from gsbench.runs.trial_files import read_rows
 
 LATE = "it was declared after the first result"
 

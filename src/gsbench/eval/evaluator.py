@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsbench.errors import InputError, TrainingError
-from gsbench.eval.color_correction import after_correction
 from gsbench.eval.facts import (
     CORRECTED,
     LPIPS,
@@ -27,17 +26,34 @@ from gsbench.eval.facts import (
     lpips_variants,
 )
 from gsbench.eval.flip import flip, flip_map
-from gsbench.eval.images import as_batch, as_unit_range, in_double_precision, replace_ignored
+from gsbench.eval.images import (
+    as_batch,
+    as_unit_range,
+    check_pair,
+    in_double_precision,
+    replace_ignored,
+)
 from gsbench.eval.lpips import Lpips, load_lpips
 from gsbench.eval.metric import MaskedMetric, Measure, Metric, UnavailableError
-from gsbench.eval.metrics import psnr
+from gsbench.eval.more import STRUCTURAL, after_correction, load_structural
 from gsbench.eval.protocol import Protocol
 from gsbench.eval.regions import LEAST_SHARE, Regions
 from gsbench.eval.ssim import ssim
-from gsbench.eval.structure import STRUCTURAL, load_structural
 from gsbench.runs.experiments import AT
 from gsbench.weights import MissingWeightsError
 from gsbench.words import raised
+
+
+def psnr(image: Tensor, target: Tensor) -> Tensor:
+    """Peak signal-to-noise ratio in dB, of the mean squared error over pixels and channels.
+
+    Images are in [0, 1]: [H, W, 3] (the value is a 0-dimensional tensor), or a batch [B, 3, H, W]
+    (the values are [B]). Identical images give infinity, which a protocol replaces in reports.
+    """
+    check_pair(image, target)
+    squared = (image - target).square()
+    mse = squared.mean() if image.ndim == 3 else squared.flatten(1).mean(dim=1)  # [] or [B]
+    return -10.0 * mse.log10()
 
 
 def measure_psnr(protocol: Protocol) -> Measure:
@@ -187,11 +203,8 @@ class Evaluator:
         wanted = {f"{LPIPS}{variant}" for variant in (variants if lpips is None else lpips)}
         wanted |= {facts.key for facts in METRICS if not facts.setting}
         wanted |= {*more, *(["flip"] if flip else [])}
-        self._load_lpips = partial(
-            load_lpips, folder=weights, download=download, device=self.device
-        )
-        # each loaded once, or the error for missing weights
-        self._networks: dict[str, Lpips | MissingWeightsError] = {}
+        self._lpips = weights, download
+        self._networks: dict[str, Lpips | MissingWeightsError] = {}  # each looked for once
         self._metrics: dict[str, Measure] = {}
         for facts in METRICS:
             if facts.setting == MORE and facts.key not in wanted:
@@ -216,7 +229,7 @@ class Evaluator:
         """The LPIPS network ``net``; raises UnavailableError if its weights are missing."""
         if net not in self._networks:
             try:
-                self._networks[net] = self._load_lpips(net)
+                self._networks[net] = load_lpips(net, *self._lpips, self.device)
             except MissingWeightsError as error:
                 self._networks[net] = error
         network = self._networks[net]

@@ -6,7 +6,7 @@ import logging
 import shutil
 from abc import abstractmethod
 from collections import Counter
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,7 +26,7 @@ from gsbench.logs import Progress, no_progress
 from gsbench.scene.images import lens_of
 from gsbench.scene.rules import MIN_IMAGES
 from gsbench.scene.types import Capture
-from gsbench.system.isolate import run_with_progress
+from gsbench.system.isolate import run_isolated
 from gsbench.words import counted, some_of
 
 if TYPE_CHECKING:
@@ -101,7 +101,7 @@ class Reconstruction(ColmapOptions):
         for folder in (output_dir, work):
             folder.mkdir(parents=True, exist_ok=True)
         job, log = Job(self, capture, output_dir, work, reference), output_dir / LOG_FILE
-        report = run_with_progress(build_model, job, progress, what=self.name, log=log)
+        report = run_isolated(build_model, job, what=self.name, log=log, progress=progress)
         if work_dir is None:
             shutil.rmtree(work)
         for warning in report.warnings:
@@ -111,13 +111,12 @@ class Reconstruction(ColmapOptions):
 
 def report_unused(options: ColmapOptions) -> None:
     """Write a line on each setting for cameras to be estimated, where cameras are given."""
-    for entry in fields(ColmapOptions):
-        value = getattr(options, entry.name)
-        if entry.name in ("camera", "camera_model", "focal_length") and value != entry.default:
+    for name in ("camera", "camera_model", "focal_length"):
+        if (value := getattr(options, name)) != getattr(ColmapOptions, name):
             logger.warning(
                 "init.%s=%s is not used, since the cameras are given: init.poses=own "
                 "init.intrinsics=estimate estimates them",
-                entry.name,
+                name,
                 value,
             )
 

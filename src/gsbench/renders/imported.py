@@ -28,7 +28,7 @@ from gsbench.eval.pictures import PicturePair, read_picture
 from gsbench.files import atomic, file_sha256, write_text
 from gsbench.pipeline.results import versions
 from gsbench.pipeline.steps.evaluate import summary_of, write_per_view
-from gsbench.renders.truth import ReferenceImages
+from gsbench.renders.sources import ReferenceImages
 from gsbench.runs.commands import (
     Command,
     History,

@@ -99,7 +99,8 @@ class Mirror:
             # Ctrl-C must reach only the trials' process, which then ends this one
             start_new_session=True,
         )
-        os.set_blocking(process.stdin.fileno(), False)  # type: ignore[union-attr]
+        with suppress(AttributeError):  # Windows, before Python 3.12
+            os.set_blocking(process.stdin.fileno(), False)  # type: ignore[union-attr]
         return process
 
     def __exit__(self, kind: type[BaseException] | None, error: object, trace: object) -> None:

@@ -14,7 +14,7 @@ from gsbench.runs import layout
 from gsbench.runs.commands import read_history
 from gsbench.runs.keys import TRAIN
 from gsbench.runs.nested import flatten, sha256_of
-from gsbench.runs.rows import read_rows
+from gsbench.runs.trial_files import read_rows
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import TrialRecord
 from gsbench.scene.images import read_image

@@ -32,9 +32,9 @@ from gsbench.raster.staged import (
     make_probe,
     raise_for_values,
 )
-from gsbench.raster.triton.executor import Started, TritonFrame, TritonRasterizer, camera_numbers
+from gsbench.raster.triton.executor import TritonFrame, TritonRasterizer, camera_numbers
 from gsbench.raster.triton.launch import Workspace
-from gsbench.raster.triton.lists import UNITS_AT_FIRST, Room, check_pairs
+from gsbench.raster.triton.lists import UNITS_AT_FIRST, Room, Started, check_pairs
 from gsbench.scene.types import Camera
 from gsbench.train.adam_triton import TritonAdam
 from gsbench.train.loss_triton import TritonLoss

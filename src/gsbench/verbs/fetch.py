@@ -57,13 +57,7 @@ def fetch(argv: Sequence[str], runs: Path) -> int:
         f"{dataset.citation}",
         flush=True,
     )
-    try:
-        data.mkdir(parents=True, exist_ok=True)
-    # `data` is a file, or lies in /proc
-    except (FileExistsError, NotADirectoryError, FileNotFoundError) as error:
-        raise InputError(
-            f"{data} cannot be the data folder ({error.strerror}): set {DATA_VARIABLE}"
-        ) from error
+    _make_folder(data)
     with (
         storage_errors(data),
         progress("fetch") as report,
@@ -111,6 +105,16 @@ def listing(datasets: Sequence[PublicDataset], data: Path) -> list[str]:
                     state = "not here"
                 lines.append(f"    {scene:<12}{', '.join(files.parts):<22}{state}")
     return [*lines, f"data folder: {data} ({DATA_VARIABLE})"]
+
+
+def _make_folder(data: Path) -> None:
+    try:
+        data.mkdir(parents=True, exist_ok=True)
+    # `data` is a file, or lies in /proc
+    except (FileExistsError, NotADirectoryError, FileNotFoundError) as error:
+        raise InputError(
+            f"{data} cannot be the data folder ({error.strerror}): set {DATA_VARIABLE}"
+        ) from error
 
 
 def _dataset(catalog: Mapping[str, PublicDataset], name: str) -> PublicDataset:

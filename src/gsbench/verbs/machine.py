@@ -108,7 +108,7 @@ def check_scene(words: Sequence[str]) -> Iterator[Finding]:
     Their lines are logged; what is not usable raises InputError. Photographs without cameras get
     none here, so rules about cameras and views are left to their trial.
     """
-    from gsbench.renders.truth import scene_trial
+    from gsbench.renders.sources import scene_trial
     from gsbench.runs.keys import INIT, TRAIN
 
     trial, views = scene_trial(words), False

@@ -26,9 +26,7 @@ from gsbench.launch.record import check_looks, check_questions, planned_rows, re
 from gsbench.launch.states import (
     STATES,
     TrialState,
-    label_of,
-    names_of,
-    states_now,
+    labels_of,
     states_of_experiment,
     summary_of,
 )
@@ -72,7 +70,7 @@ def status(argv: Sequence[str], runs: Path) -> int:
     if options.watch:
         _watch(runs, options.experiment)
     _say_what_is_lost(home)
-    trials = states_now(home)
+    trials = states_of_experiment(home)
     if options.verify:
         for number, trial in enumerate(trials):
             if trial.state in ("done", "superseded"):
@@ -122,11 +120,11 @@ def _watch(runs: Path, experiment: str) -> None:
 
 def lines_of(trials: list[TrialState], with_done: bool) -> list[str]:
     """A line for each trial not done or in doubt (``with_done``: for each), and a summary."""
-    lines, names = [], names_of(trials)
+    lines, labels = [], labels_of(trials)
     order = [*STATES]
     for trial in sorted(trials, key=lambda trial: order.index(trial.state)):
         if trial.state != "done" or trial.note or with_done:
-            label = label_of(trial.folder, names)
+            label = labels[trial.folder]
             lines.append(f"{trial.state:<8} {label:<50} {_age(trial):>12}  {trial.note}".rstrip())
     return [*lines, summary_of(trial.state for trial in trials)]
 
@@ -137,7 +135,7 @@ def _overview(runs: Path) -> int:
         print(f"no experiment in {runs} yet")
     for name in names:
         _say_what_is_lost(runs / name)
-        states = states_now(runs / name)
+        states = states_of_experiment(runs / name)
         print(f"{name:<20} {summary_of(trial.state for trial in states)}")
     return 0
 

@@ -75,7 +75,7 @@ def test_too_few_or_coinciding_cameras_are_not_aligned(centers):
     assert align_poses(centers, rotations, centers, rotations) is None
 
 
-@pytest.mark.parametrize("degrees", [0.0, 1e-6, 0.05, 30.0, 179.9])
+@pytest.mark.parametrize("degrees", [0.0, 1e-6, 0.05, 30.0, 179.9, 180.0])
 def test_rotation_errors_are_the_angles_by_which_cameras_are_turned(degrees):
     turn = Rotation.from_rotvec(np.radians(degrees) * np.array([0.6, 0.0, 0.8])).as_matrix()
     centers, rotations, moved, turned = poses(4)

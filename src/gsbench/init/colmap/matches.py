@@ -22,14 +22,13 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from itertools import chain
 from pathlib import Path
-from typing import NamedTuple
 
 import pycolmap
 
 from gsbench.init.colmap.database import DatabaseTask, image_ids, writable
 from gsbench.init.options import ColmapOptions, SiftOptions
 from gsbench.logs import Progress
-from gsbench.system.isolate import run_with_progress
+from gsbench.system.isolate import run_isolated
 
 MAX_BLOCK = 16  # images on each side of a part; with more, progress would be reported too rarely
 PARTS_PER_PROCESS = 6  # enough that processes end at about the same time
@@ -39,18 +38,6 @@ COPY = "INSERT INTO main.{0} SELECT * FROM source.{0}"
 MATCHES = [COPY.format(table) for table in ("matches", "two_view_geometries")]
 
 IdPair = tuple[int, int]
-
-
-class MatchingJob(NamedTuple):
-    """Inputs of a matching process: ``parts``, lists of pairs of ids, to match into ``result``.
-
-    ``features`` is the database with keypoints and descriptors. ``result`` is a copy without them.
-    """
-
-    features: Path
-    result: Path
-    parts: list[list[IdPair]]
-    sift: SiftOptions
 
 
 def match_sift(
@@ -80,50 +67,67 @@ def match_sift(
             # COLMAP splits the lines of its pair lists at spaces, which names often contain
             image.name = str(image.image_id)
             opened.update_image(image)
-    jobs = []
-    for index, share in enumerate(distribute_parts(parts, processes)):
-        jobs.append(MatchingJob(database, folder / f"matches-{index}.db", share, sift))
-        shutil.copyfile(empty, jobs[-1].result)
+    shares = distribute_parts(parts, processes)
+    results = [Path(shutil.copyfile(empty, folder / f"{k}.db")) for k in range(len(shares))]
+    matched = [0] * len(shares)
+
+    def run(index: int) -> None:
+        def report_sum(phase: str, done: int, total: int | None, note: str = "") -> None:
+            matched[index] = done
+            progress(phase, sum(matched), len(pairs))
+
+        given = database, results[index], shares[index], sift
+        run_isolated(match_parts, *given, what="matching", progress=report_sum)
+
     progress("match", 0, len(pairs))
-    if len(jobs) == 1:
-        match_parts(jobs[0], progress)
+    if len(shares) == 1:
+        match_parts(database, results[0], shares[0], sift, progress)
     else:
-        _match_in_processes(jobs, len(pairs), progress)
-    for job in jobs:
-        _run_sql(database, *MATCHES, source=job.result)
+        with ThreadPoolExecutor(len(shares)) as pool:
+            list(pool.map(run, range(len(shares))))
+    for result in results:
+        _run_sql(database, *MATCHES, source=result)
     shutil.rmtree(folder)
 
 
-def match_parts(job: MatchingJob, progress: Progress) -> None:
-    """Match and verify the parts in turn. Calls native code that can abort: run it isolated."""
+def match_parts(
+    features: Path,
+    result: Path,
+    parts: Sequence[Sequence[IdPair]],
+    sift: SiftOptions,
+    progress: Progress,
+) -> None:
+    """Match and verify ``parts``, lists of pairs of ids, in turn, into the database ``result``.
+
+    It is a copy, without features, of the database ``features``. Calls native code that can abort:
+    run it isolated.
+    """
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.WARNING)
     options = pycolmap.FeatureMatchingOptions(
         {
             "use_gpu": False,
             "num_threads": 1,  # see the module's docstring
-            "guided_matching": job.sift.guided_matching,
-            "sift": {"max_ratio": job.sift.max_ratio, "cross_check": job.sift.cross_check},
+            "guided_matching": sift.guided_matching,
+            "sift": {"max_ratio": sift.max_ratio, "cross_check": sift.cross_check},
         }
     )
     pairing = pycolmap.ImportedPairingOptions()
-    pairing.match_list_path = job.result.with_suffix(".pairs.txt")
-    done, total = 0, sum(map(len, job.parts))
-    for part in job.parts:
+    pairing.match_list_path = result.with_suffix(".pairs.txt")
+    done, total = 0, sum(map(len, parts))
+    for part in parts:
         images = ", ".join(map(str, {*chain.from_iterable(part)}))
-        features = [
-            f"{COPY.format(table)} WHERE image_id IN ({images})" for table in FEATURE_TABLES
-        ]
-        _run_sql(job.result, *features, source=job.features)
+        copies = [f"{COPY.format(table)} WHERE image_id IN ({images})" for table in FEATURE_TABLES]
+        _run_sql(result, *copies, source=features)
         lines = [f"{first} {second}\n" for first, second in part]
         pairing.match_list_path.write_text("".join(lines))
         pycolmap.match_image_pairs(
-            job.result,
+            result,
             matching_options=options,
             pairing_options=pairing,
-            verification_options=verification_options(job.sift),
+            verification_options=verification_options(sift),
             device=pycolmap.Device.cpu,
         )
-        _run_sql(job.result, *DROP_FEATURES)
+        _run_sql(result, *DROP_FEATURES)
         done += len(part)
         progress("match", done, total)
 
@@ -160,20 +164,6 @@ def _block_size(images: int, processes: int) -> int:
     # k blocks of images make k (k + 1) / 2 parts
     blocks = math.ceil(math.sqrt(2 * PARTS_PER_PROCESS * processes))
     return min(max(math.ceil(images / blocks), 2), MAX_BLOCK)
-
-
-def _match_in_processes(jobs: Sequence[MatchingJob], count: int, progress: Progress) -> None:
-    matched = [0] * len(jobs)
-
-    def run(index: int) -> None:
-        def report_sum(phase: str, done: int, total: int | None, note: str = "") -> None:
-            matched[index] = done
-            progress(phase, sum(matched), count)
-
-        run_with_progress(match_parts, jobs[index], report_sum, what="matching")
-
-    with ThreadPoolExecutor(len(jobs)) as pool:
-        list(pool.map(run, range(len(jobs))))
 
 
 def _run_sql(path: Path, *statements: str, source: Path | None = None) -> None:

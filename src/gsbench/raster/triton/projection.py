@@ -165,27 +165,17 @@ def project(
 
 
 @triton.jit(do_not_specialize=["units", "pairs"])
-def sum_units(
-    pair_ends,
-    unit_widths,
-    unit_blocks,
-    last_slots,
-    status,
-    units,
-    pairs,
-    rows,
-    GROUP: tl.constexpr,
-):
-    """Sum the ``rows`` [pairs, 16] of each unit, which are adjacent, into its first row.
+def sum_units(found, last_slots, units, pairs, rows, GROUP: tl.constexpr):
+    """Sum the ``rows`` [pairs, 16] of each unit of ``found`` (`Units`), into its first row.
 
     Only rows of entries that compositing reached have been written. These are the slots up to
     ``last_slots`` [blocks], because the slots in the list of a block rise.
     """
     unit = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
-    inside = unit < units_that_fit(status, units, pairs)
-    width = tl.load(unit_widths + unit, mask=inside, other=0)
-    first = tl.load(pair_ends + unit, mask=inside, other=0) - width
-    block = tl.load(unit_blocks + unit, mask=inside, other=0)
+    inside = unit < units_that_fit(found.status, units, pairs)
+    width = tl.load(found.widths + unit, mask=inside, other=0)
+    first = tl.load(found.pair_ends + unit, mask=inside, other=0) - width
+    block = tl.load(found.blocks + unit, mask=inside, other=0)
     place = rows + first[:, None] * ROW + tl.arange(0, ROW)[None, :]  # [GROUP, ROW]
     total = tl.zeros([GROUP, ROW], tl.float32)
     for k in range(0, tl.max(width, 0)):
@@ -196,13 +186,13 @@ def sum_units(
 
 
 @triton.jit
-def sum_rows(index, own_rows, where, rows, NUMBERS: tl.constexpr):
+def sum_rows(index, own_rows, found, rows, NUMBERS: tl.constexpr):
     """Sum the first ``NUMBERS`` columns of the ``rows`` of each Gaussian over its units.
 
-    ``own_rows`` is the number of units of each Gaussian, ``where`` are `Rows`. ``sum_units`` has
+    ``own_rows`` is the number of units of each Gaussian, ``found`` are `Units`. ``sum_units`` has
     already summed the pairs of each unit into the row of its first pair.
     """
-    unit = tl.load(where.first_units + index, mask=own_rows > 0, other=0)
+    unit = tl.load(found.first + index, mask=own_rows > 0, other=0)
     zero = tl.zeros_like(own_rows).to(tl.float32)
     # Triton's tuples grow by ``+``; it knows neither ``*`` nor comprehensions.
     sums = ()
@@ -210,8 +200,8 @@ def sum_rows(index, own_rows, where, rows, NUMBERS: tl.constexpr):
         sums = sums + (zero,)  # type: ignore[assignment]  # noqa: RUF005
     for k in range(0, tl.max(own_rows, 0)):
         active = k < own_rows
-        width = tl.load(where.unit_widths + unit + k, mask=active, other=0)
-        slot = tl.load(where.pair_ends + unit + k, mask=active, other=0) - width
+        width = tl.load(found.widths + unit + k, mask=active, other=0)
+        slot = tl.load(found.pair_ends + unit + k, mask=active, other=0) - width
         grown = ()
         for n in tl.static_range(NUMBERS):
             own = tl.load(rows + slot * ROW + n, mask=width > 0, other=0.0)
@@ -245,10 +235,9 @@ def backproject(
     gaussians,
     count,
     camera,
+    projected,
     record_ints,
-    color_slopes,
-    where,
-    status,
+    found,
     units,
     pairs,
     rows,
@@ -261,19 +250,19 @@ def backproject(
     EXTRA: tl.constexpr,
     GROUP: tl.constexpr,
 ):
-    """Write the ``gradients`` of Gaussians that are seen: those with a row in ``where`` (`Rows`).
+    """Write the ``gradients`` of Gaussians that are seen: those with units.
 
     Other gradients are not changed, except that ``g_screen``, ``g_absolute`` and ``g_extra``
     become 0. ``EXTRA`` is the function that writes ``g_extra``, such as `store_splitting`, or None.
-    See `lists_fit` for ``status``, ``units`` and ``pairs``.
+    See `lists_fit` for ``units`` and ``pairs``.
     """
     v = load_camera(camera)
     index = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
     inside = index < count
-    seeable = inside & lists_fit(status, units, pairs)
-    row_count = tl.load(where.counts + index, mask=seeable, other=0)
+    seeable = inside & lists_fit(found.status, units, pairs)
+    row_count = tl.load(projected.row_counts + index, mask=seeable, other=0)
     seen = row_count > 0
-    sums = sum_rows(index, row_count, where, rows, 9 + 2 * ABSOLUTE)
+    sums = sum_rows(index, row_count, found, rows, 9 + 2 * ABSOLUTE)
     h, h_t, h_y, h_tt, h_ty, h_yy, red, green, blue = sums[:9]
     mean = load_vector(gaussians.means, index, seen)
     log_scale = load_vector(gaussians.log_scales, index, seen)
@@ -288,7 +277,8 @@ def backproject(
     )
     store_vector(gradients.sh_dc, index, stretched(g_rgb, F0), seen)
     to, inverse_distance = normalized(offset)
-    tangent = _turned(to, inverse_distance, g_rgb, color_slopes, index, seen, DEGREE)
+    slopes = projected.color_slopes
+    tangent = _turned(to, inverse_distance, g_rgb, slopes, index, seen, DEGREE)
 
     # Repeat the geometry of the forward pass.
     quaternion, inverse_norm, _ = load_quaternion(gaussians.quaternions, index, seen)
