@@ -8,9 +8,10 @@ from gsbench.densify.gns import GNS
 from gsbench.densify.improved_gs import EdgeAware, LongAxis
 from gsbench.densify.lineage import Lineage
 from gsbench.densify.mcmc import MCMC, MRNF
+from gsbench.densify.resgs import ResGS
 from gsbench.densify.scored import FastGS, Taming
 from gsbench.densify.scores import TrainingViews
-from gsbench.densify.splits import ResGS, SteepGS
+from gsbench.densify.steepgs import SteepGS
 from gsbench.densify.volumetric import Volumetric
 from gsbench.events import Cause, RefineEvent
 
