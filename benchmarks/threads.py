@@ -17,6 +17,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import numpy as np
@@ -76,13 +77,15 @@ class Timed:
         """The stages of a step, ms of torch's Adam, and ms of all else."""
         self.stages = []
 
-        def timed(runner: ShardRunner, shards: int, work: Callable[[int, int], None]) -> None:
+        def timed(
+            runner: ShardRunner, shards: int, work: Callable[..., None], *arguments: Any
+        ) -> None:
             times = []
             for shard in range(shards):
                 begin = time.process_time()
-                work(shard, shard + 1)
+                work(shard, shard + 1, *arguments)
                 times.append(1e3 * (time.process_time() - begin))
-            self.stages.append((work.__name__, times))
+            self.stages.append((work.py_func.__name__, times))  # type: ignore[attr-defined]
 
         with mock.patch.object(ShardRunner, "run", timed):
             begin = time.process_time()

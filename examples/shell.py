@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import PositiveFloat, PositiveInt
 
 from gsbench.init.base import PointCloud, Seed
-from gsbench.init.colmap.reconstruct import poses_by_name
+from gsbench.init.colmap.models import training_centers
 from gsbench.init.placed import PlacedCloud
 
 
@@ -22,9 +22,7 @@ class Shell(PlacedCloud):
     seed: Seed = 0
 
     def cloud(self, capture, model):
-        # (centre [3], rotation world to camera [3, 3]) of each image that has a pose
-        poses = poses_by_name(model)
-        centers = np.array([poses[name][0] for name in capture.train_names if name in poses])
+        centers = training_centers(model, capture)  # [V, 3], of those that have a pose
         middle = centers.mean(axis=0)
         reach = np.linalg.norm(centers - middle, axis=1).max()
         directions = np.random.default_rng(self.seed).normal(size=(self.count, 3))

@@ -67,7 +67,7 @@ def gsbench(name: str, words: str, needs: str = "") -> Part:
 
 def bench(name: str, raster: str, count: str, needs: str = "") -> Part:
     at = "16x16 --repeats 1" if TINY else "1600x1060 --repeats 10"
-    words = f"bench --raster {raster} --count {count} --kernels --json --size {at}"
+    words = f"bench --raster {raster} --count {count} --json --size {at}"
     return gsbench(f"bench-{name}", words, needs)
 
 
@@ -336,9 +336,6 @@ def table(results: Path) -> str:
         for row in read(file, list)
     ]
     lines += ["", *markdown(BENCHED, rows)]
-    for row in rows:
-        profile = json.dumps({key: row.get(key) for key in ("kernels_ms", "waits", "waits_ms")})
-        lines += ["", f"{row['part']}, {row['raster']}, {row['count']}: {profile}"]
     rows = []
     for folder in sorted(results.glob("train-*/")):
         record = read(folder / "results.json", dict) | {"training": folder.name}

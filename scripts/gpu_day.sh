@@ -14,7 +14,7 @@
 #   Apache-2.0; cub::Max, which CUDA 13 no longer has, is replaced). It packs 39 MiB: wheels for
 #   Python 3.12 on x86-64, the 200 images that a trial takes, their cloud, and the weights.
 # run: the proof (50 s); the contract test and the test of equal bits (50 s); benchmarks.host (15 s);
-#   bench --kernels at 100,000, 1 and 3 million Gaussians (75 s), and with and without split lists
+#   bench at 100,000, 1 and 3 million Gaussians (75 s), and with and without split lists
 #   (60 s); Faster-GS in turns with ours (30 s, benchmarks/faster_gs.py); three trainings of bonsai
 #   side by side (150 s); gsplat (50 s); compute-sanitizer (35 s). If a part ends early, later ones
 #   get its time. Results are written to $OUT every 20 s and when a part ends.

@@ -31,17 +31,17 @@ from scipy import special
 
 from gsbench.analysis.planning import (
     Components,
-    Purpose,
     deviation_range,
     estimate_components,
+    sweep_designs,
 )
 from gsbench.analysis.questions import plan_looks
 from gsbench.analysis.results import Arm, TrialResult, Unfinished
-from gsbench.analysis.statistics import REFUTED, SUPPORTED, Region
+from gsbench.analysis.statistics import Region
 from gsbench.analysis.verdicts import judge
-from gsbench.claims import gate as gates
 from gsbench.runs.commands import Question
 from gsbench.runs.trial_record import TrialRecord
+from gsbench.verbs import gate as gates
 
 # If no bad training is seen, nothing tells such an arm from a better one (docs/verdict.md).
 ONE_ARM_LIMIT = 0.22
@@ -128,7 +128,7 @@ def question(
         seeds=dict.fromkeys(names, tuple(range(seeds))),
         looks=looks,
         level=level,
-        rule="simulated",
+        rule="declaration",
     )
 
 
@@ -189,7 +189,7 @@ def sweep(
         at = plan_looks(seeds) if looks else ()
         asked = [question(f"arm{k}", scenes, seeds, 0.05 / count, at) for k in range(count)]
         outcomes = {judge(made, one).outcome for one in asked}
-        return float(bool(outcomes & {SUPPORTED, *(() if effect else (REFUTED,))}))
+        return float(bool(outcomes & {"supported", *(() if effect else ("refuted",))}))
 
     return draw
 
@@ -210,7 +210,7 @@ def failing(finish: bool) -> Draw:
         done = [*baseline, *(one for one in arm if one not in lost)]
         missing = [Unfinished(one.path, one.digest, failed=True) for one in lost]
         verdict = judge(done, asked, missing)
-        return float(verdict.outcome == SUPPORTED)
+        return float(verdict.outcome == "supported")
 
     return draw
 
@@ -232,7 +232,7 @@ def like_these(scenes: int) -> Draw:
         made += trials("arm0", 25 + effects + rng.normal(0, part, shape))
         verdict = judge(made, question("arm0", scenes, 3))
         assert verdict.like_these is not None
-        return float(verdict.like_these.outcome == (REFUTED if gains else SUPPORTED))
+        return float(verdict.like_these.outcome == ("refuted" if gains else "supported"))
 
     return draw
 
@@ -323,11 +323,8 @@ def nights_at_once(noise: tuple[float, ...], correlation: float, most: bool = Fa
 # ---- plans
 
 
-PURPOSES = {"sweep": Purpose(), "looks": Purpose(looks=True), "gate": Purpose(looks=True)}
-
-
-def planned(command: str, difference: float, ratio: float = 1.0) -> Draw:
-    """A command with the design that `plan` names; 1 if it shows the difference.
+def planned(difference: float, ratio: float = 1.0) -> Draw:
+    """A sweep with the design that `plan` names; 1 if it shows the difference.
 
     The deviations of trainings are known; the first of three scenes is ``ratio`` times as noisy.
     """
@@ -335,12 +332,8 @@ def planned(command: str, difference: float, ratio: float = 1.0) -> Draw:
     within = float(np.sqrt((noise**2).mean()))
     shares = tuple(sorted(noise**2 / within**2))
     known = Components(between=None, within=within, scenes=3, trials=9, shares=shares)
-    designs = PURPOSES[command].designs(difference, known)
-    seeds = min(one.seeds for one in designs if one.scenes == 3)
-    if command == "gate":
-        return gate(3, seeds, difference, gates.WORSE)
-    effect = difference / (within / math.sqrt(3 * seeds))
-    return sweep(3, seeds, ratio, effect, looks=command == "looks")
+    seeds = min(one.seeds for one in sweep_designs(difference, known) if one.scenes == 3)
+    return sweep(3, seeds, ratio, difference / (within / math.sqrt(3 * seeds)))
 
 
 def unsure(rng: Rng) -> float:
@@ -361,11 +354,12 @@ def promises() -> Iterator[Promise]:
     ):
         yield Promise(f"gate: {name}, 2 × 6", "`ask_gate`", 0.025, 1500, gate(2, 6, loss, counted))
     yield from _of_nights()
-    for command in PURPOSES:
-        name = f"plan for a {command}: shows the difference on three scenes"
-        yield Promise(name, "`Purpose`", 0.8, 500, planned(command, 0.1), True)
-    name = "plan for a sweep: shows the difference, deviations 4 : 1 : 1"
-    yield Promise(name, "`Purpose`", 0.8, 500, planned("sweep", 0.25, 4.0), True)
+    for detail, difference, ratio in (
+        ("the difference on three scenes", 0.1, 1.0),
+        ("the difference, deviations 4 : 1 : 1", 0.25, 4.0),
+    ):
+        name = f"plan for a sweep: shows {detail}"
+        yield Promise(name, "`sweep_designs`", 0.8, 500, planned(difference, ratio), True)
     name = "plan: range of the deviation from a 3 × 3 pilot"
     yield Promise(name, "`deviation_range`", 0.8, 8000, unsure, True)
 

@@ -126,13 +126,8 @@ def set_up_logging(verbose: bool | str | Sequence[str] = False, through_root: bo
     terminal, gsbench does not. ``verbose`` also shows debug lines: gsbench's if it is True, else
     those of the loggers that it names.
     """
-    names = (
-        [verbose]
-        if isinstance(verbose, str)
-        else []
-        if isinstance(verbose, bool)
-        else list(verbose)
-    )
+    given = () if isinstance(verbose, bool) else verbose
+    names = [given] if isinstance(given, str) else list(given)
 
     def shown(record: logging.LogRecord) -> bool:
         named = any(f"{record.name}.".startswith(f"{name}.") for name in names)

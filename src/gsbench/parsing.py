@@ -173,6 +173,11 @@ def read_yaml(path: Path, loader: Any = None) -> Any:
     return value
 
 
+def table_beside(module: str, name: str) -> Any:
+    """The YAML file ``name`` of gsbench itself, beside the file ``module``."""
+    return yaml.load(Path(module).with_name(name).read_text(encoding="utf-8"), Loader=SafeLoader)
+
+
 class SafeLoader(LOADER):
     """A safe loader for which a key that occurs twice in a mapping is an error.
 

@@ -75,7 +75,7 @@ class GsbenchFiles(ConfigSource):
         return "gsbench"
 
     def load_config(self, config_path: str) -> ConfigResult:
-        from gsbench.config.strange_files import check_file
+        from gsbench.config.search_path import check_file
 
         check_file(self.path, config_path)
         return self.files.load_config(config_path)

@@ -10,7 +10,7 @@ from gsbench.analysis.addresses import ArmName, trials_of_arm
 from gsbench.analysis.cells import select_trials, with_variants
 from gsbench.analysis.table_formats import to_markdown
 from gsbench.renders.imported import find_destination
-from gsbench.renders.truth import ReferenceImages
+from gsbench.renders.sources import ReferenceImages
 from gsbench.runs.experiments import Arm
 from gsbench.verbs.results import explain_cell
 from gsbench.view.trials import find_trial

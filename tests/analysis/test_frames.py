@@ -55,7 +55,7 @@ def test_a_least_difference_may_be_a_part_and_directions_of_own_metrics_are_give
 def test_a_missing_seed_costs_its_pair_only():
     lacking = FRAME.drop(FRAME[(FRAME.method == "mine") & (FRAME.seed == 2)].index)
     verdict = gsbench.analysis.judge(lacking, "base", "psnr")["mine"]
-    assert (verdict.pairs.seeds, verdict.wanted) == (2, 8)
+    assert (verdict.pairs.seeds, verdict.question.trials) == (2, 8)
 
 
 @pytest.mark.parametrize(

@@ -70,8 +70,8 @@ def test_curves_that_turn_or_share_little_are_not_comparable(quality, why):
 
 def test_the_interval_is_students_over_pairs_and_needs_two():
     # t of 2 degrees of freedom at 97.5 %: 4.302653
-    assert saving_words(np.log([0.70, 0.75, 0.78])) == "26 % fewer Gaussians (15 to 35 %)"
-    assert saving_words([-0.1, 0.1]) == "0 % more Gaussians (72 % fewer to 256 % more)"
+    assert saving_words(np.log([0.70, 0.75, 0.78])) == "26 % fewer Gaussians (−35 to −15 %)"
+    assert saving_words([-0.1, 0.1]) == "0 % more Gaussians (−72 to +256 %)"
     assert saving_words([0.1]) == "11 % more Gaussians (one pair: no interval)"
 
 
@@ -95,7 +95,7 @@ def write_curves(tmp_path, limits):
 def test_the_report_says_how_many_fewer_gaussians_reach_the_baselines_quality(tmp_path):
     write_curves(tmp_path, [20_000, 40_000, 60_000])
     page = page_of(tmp_path)
-    said = "garden: volumetric has the PSNR (dB) of adc with 25 % fewer Gaussians (25 to 25 %)"
+    said = "garden: volumetric has the PSNR (dB) of adc with 25 % fewer Gaussians (−25 to −25 %)"
     assert page.count(f"{said}; an estimate, not tested.") == 1  # the words of the picture
 
 

@@ -1,7 +1,11 @@
 """Regions of renders: sums by hand, Smyth's prior and Benjamini-Hochberg against scipy, A/A."""
 
+from base64 import b64decode
+from io import BytesIO
+
 import numpy as np
 import pytest
+from PIL import Image
 from scipy import special, stats
 
 from gsbench.analysis.comparison import compare
@@ -19,6 +23,7 @@ from gsbench.analysis.report.where import region_maps
 from gsbench.analysis.results import load_experiment
 from gsbench.claims.archive import unpack_archive
 from gsbench.claims.export import write_archive
+from gsbench.scene.images import read_image
 from tests.helpers import refusal
 from tests.trials import ask_about, write_runs
 
@@ -144,6 +149,11 @@ def test_trainings_of_one_arm_light_a_region_in_at_most_one_report_of_twenty(see
     assert lit / reports <= 0.07  # 5 % and two standard errors of the simulation
 
 
+def shape_of(uri):
+    """Height and width of the picture in a data URI."""
+    return Image.open(BytesIO(b64decode(uri.partition(",")[2]))).size[::-1]
+
+
 def report_of(folder, **plan):
     write_runs(folder, scenes=("garden",), densifiers=("adc", "volumetric"), inits=("sfm",), **plan)
     ask_about(folder)
@@ -186,5 +196,7 @@ def test_an_archive_keeps_the_errors_of_regions_in_place_of_pictures(tmp_path):
         for own in (experiment, unpacked)
     ]
     assert (maps[0]["better"], maps[0]["worse"]) == (maps[1]["better"], maps[1]["worse"])
-    assert maps[0]["truth"]
-    assert not maps[1]["truth"]
+    photograph = read_image(next(experiment.trials[0].path.glob("ground_truth/*.png")))
+    # over the photograph; without one, as many whole regions
+    assert [shape_of(own["lit"]) for own in maps] == [photograph.shape[:2], (4 * 32, 5 * 32)]
+    assert shape_of(maps[0]["noise"]) == photograph.shape[:2]

@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 from plyfile import PlyData
 
-from gsbench.analysis.images import _jpeg_uri, choose_views, read_compared, texture_energy
+from gsbench.analysis.images import choose_views, jpeg_uri, read_compared, texture_energy
 from gsbench.analysis.pairs import Pairs, pair_trials
 from gsbench.analysis.quantities import quantity
 from gsbench.analysis.report.build import _forest, build_report, search_summary, trial_figures
@@ -28,7 +28,6 @@ from gsbench.analysis.report.charts import (
 from gsbench.analysis.report.curves import (
     _logged_histograms,
     _threshold,
-    _volumes_in_training,
     event_table,
     histogram,
     log10_volumes,
@@ -36,7 +35,7 @@ from gsbench.analysis.report.curves import (
 )
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.statistics import Interval
-from gsbench.runs.rows import Histogram
+from gsbench.runs.trial_files import Histogram
 from tests.analysis.helpers import ADC, VOLUMETRIC, loaded, page_of, rows_of, trials_of
 from tests.helpers import refusal, write
 from tests.markup import Page
@@ -232,9 +231,7 @@ def test_volumes_are_those_of_the_ellipsoids(experiment):
     volumes = 4 / 3 * np.pi * scales.prod(axis=0)
     found = log10_volumes(path)
     assert found == pytest.approx(np.log10(volumes), abs=1e-6)
-    record = SimpleNamespace(to_training=SimpleNamespace(scale=10.0))
-    enlarged = _volumes_in_training(SimpleNamespace(path=path.parent, record=record))
-    assert enlarged == pytest.approx(found + 3)
+    assert log10_volumes(path, 10.0) == pytest.approx(found + 3)
     shares = histogram(np.append(found, -np.inf))
     assert sum(share for _, share in shares) == pytest.approx(1)
     assert sum(share for volume, share in shares if volume > 1e-4) == pytest.approx(
@@ -488,7 +485,7 @@ def test_costs_are_listed_under_the_verdict(page):
 
 
 def test_a_wide_picture_is_shown_smaller():
-    uri = _jpeg_uri(np.zeros((10, 2400, 3), dtype=np.uint8))
+    uri = jpeg_uri(np.zeros((10, 2400, 3), dtype=np.uint8))
     with Image.open(io.BytesIO(base64.b64decode(uri.partition(",")[2]))) as shown:
         assert shown.size == (1200, 5)
 

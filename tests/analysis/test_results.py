@@ -7,7 +7,7 @@ import pytest
 
 from gsbench.analysis.results import load_experiment, read_views
 from gsbench.runs.experiments import list_experiments
-from gsbench.runs.rows import read_rows
+from gsbench.runs.trial_files import read_rows
 from tests.analysis.helpers import loaded, trials_of
 from tests.helpers import change_json, refusal, write
 from tests.trials import write_arms, write_runs

@@ -9,12 +9,13 @@ import scipy.stats
 from gsbench.analysis.planning import (
     Components,
     Design,
-    Purpose,
+    designs_like_these,
     estimate_components,
     fewest_seeds,
-    make_plan,
     power_like_these,
     seeds_needed,
+    sweep_designs,
+    sweep_power,
 )
 from gsbench.analysis.statistics import (
     ALPHA,
@@ -212,12 +213,13 @@ def test_power_is_the_share_of_simulated_sweeps_that_see_the_difference(like_ask
         seen = [scipy.stats.binomtest(int(count), design.scenes).pvalue <= 0.05 for count in agree]
     else:
         seen = habits.p_values(values)[1] < 0.05
-    power = power_like_these if like_asked else Purpose().power
+    power = power_like_these if like_asked else sweep_power
     assert power(design, effect, KNOWN) == pytest.approx(np.mean(seen), abs=0.03)
 
 
 def test_planned_designs_for_scenes_like_these_have_the_fewest_seeds_that_suffice():
-    designs = fewest_seeds(lambda one: power_like_these(one, 0.35, KNOWN), range(1, 31))
+    found = fewest_seeds(lambda one: power_like_these(one, 0.35, KNOWN), range(1, 31))
+    designs = sorted(found, key=lambda one: one.scenes)
     for one in designs:
         assert power_like_these(one, 0.35, KNOWN) >= 0.8
         fewer = Design(one.scenes, one.seeds - 1)
@@ -229,14 +231,12 @@ def test_planned_designs_for_scenes_like_these_have_the_fewest_seeds_that_suffic
 def test_seeds_do_not_replace_scenes():
     """If scenes differ by more than the effect, no number of seeds shows scenes like these."""
     scattered = Components(between=5.0, within=0.1, scenes=4, trials=12)
-    found = make_plan(scattered, 0.5, Purpose(), 5)
-    assert found.like_these == ()
-    assert found.these[0] == Design(1, 3)
+    assert designs_like_these(0.5, scattered) == []
+    assert sweep_designs(0.5, scattered)[0] == Design(1, 3)
     assert Design(1, 3).trials == 6  # of two arms
 
 
 def test_a_plan_for_scenes_like_these_needs_two_scenes():
     one_scene = estimate_components([np.array([0.0, 2.0])])
-    assert make_plan(one_scene, 1.0, Purpose(), 5).like_these is None
     with refusal("two"):
         power_like_these(Design(6, 2), 1.0, one_scene)

@@ -90,6 +90,9 @@ def test_at_most_five_notes_stand_below_a_table(make_experiment):
     ]
     few = replace(table, notes=tuple(f"note {k}" for k in range(5)))
     assert to_markdown(few).splitlines()[-1] == "- note 4"
+    # a page folds the others
+    assert "<summary>5 more notes</summary>" in to_html_page(many)
+    assert "more note" not in to_html_page(few)
 
 
 def test_no_mean_is_shown_if_no_scene_has_every_arm(tmp_path):

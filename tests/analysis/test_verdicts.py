@@ -54,7 +54,7 @@ def with_adc(trials, **values):
 def test_pairs_share_scene_and_seed(asked):
     trials, question = asked(effect={"psnr": 0.7}, trial_noise=0.0, residual_noise=0.0)
     found = pair(trials, question)
-    assert found.scenes == ("courtyard", "garden")
+    assert [row.scene for row in found.rows] == ["courtyard", "garden"]
     assert found.differences.shape == (2, 3)
     assert np.allclose(found.differences, 0.7)  # all noise is shared by the arms
 

@@ -12,8 +12,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
 
 from gsbench.app import command, hydra_app, hydra_main, sweep
-from gsbench.app.arm_search import Goal, goal_of
-from gsbench.app.hydra_app import Job, words_without_sweeper
+from gsbench.app.hydra_app import Goal, Job, goal_of, words_without_sweeper
 from gsbench.app.hydra_main import words_for_files, words_for_new_folder
 from gsbench.errors import GsbenchError, InputError
 from gsbench.launch.outcomes import Outcome
@@ -182,10 +181,12 @@ def test_another_sweeper_gets_the_mean_over_the_seeds_towards_its_end(
     tmp_path, monkeypatch, sweeper, sign
 ):
     values = {"name": "x", "eval": {"primary": "lpips_vgg", "extra": {}}}
-    composer = SimpleNamespace(trial=lambda words: SimpleNamespace(values=values))
     config = OmegaConf.create({"hydra": {"sweeper": sweeper | {"params": {"seed": "1,2"}}}})
     asked = SimpleNamespace(
-        words=["densify=m"], other_sweeper="optuna", composer=composer, config=config
+        words=["densify=m"],
+        other_sweeper="optuna",
+        trial=lambda words: SimpleNamespace(values=values),
+        config=config,
     )
     goal = goal_of(asked)
     assert goal == Goal("x-tune", "lpips_vgg", -1, sign, ("seed=1", "seed=2"))
@@ -206,9 +207,7 @@ def test_another_sweeper_gets_the_mean_over_the_seeds_towards_its_end(
 def test_the_best_values_are_said_with_the_command_that_trains_them(sign, direction, best):
     values = {"0.1": 20.0, "0.3": 22.0}
     goal = Goal("x-tune", "m", direction, sign)
-    goal.values = {
-        ("name=x y", f"decay={text}"): value * sign * direction for text, value in values.items()
-    }
+    goal.values = {("name=x y", f"decay={text}"): value for text, value in values.items()}
     assert goal.best_line() == (
         f"best: decay={best}, m {values[best]:.4g} of validation views (1 seed, in x-tune); to "
         f"train it: gsbench 'name=x y' decay={best}"

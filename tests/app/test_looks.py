@@ -1,7 +1,6 @@
 """A sweep in planned looks: which trials each look launches, when it stops, how it continues."""
 
 import logging
-from itertools import chain
 from shlex import split
 
 import numpy as np
@@ -10,15 +9,9 @@ import pytest
 from gsbench import cli
 from gsbench.analysis.results import read_experiment
 from gsbench.analysis.verdicts import judge
-from gsbench.launch.outcomes import Outcome, outcome_of_results
-from gsbench.launch.record import record
-from gsbench.runs.commands import digest_of, read_history
-from gsbench.runs.keys import CODE_OF_STAGE
-from gsbench.runs.layout import RESULTS
-from gsbench.runs.package_code import states_of
-from gsbench.runs.trial_record import record_from
+from gsbench.runs.commands import read_history
+from tests.app.stand_ins import Trainings
 from tests.launch.test_record import TINY
-from tests.trials import write_as
 
 BASE = [
     "-m",
@@ -29,40 +22,13 @@ BASE = [
 SWEEP = [*BASE, "densify=adc,volumetric", "seed=0,1,2,3", "eval.primary=psnr"]
 
 
-class Fake:
-    """Stands in for trainings: gives ``psnr`` of arm and seed.
-
-    Trials with the seed ``fails`` fail; at the seed ``stops_at`` comes a Ctrl-C.
-    """
-
-    def __init__(self, psnr, fails=None, stops_at=None):
-        self.psnr, self.fails, self.stops_at = psnr, fails, stops_at
-        self.batches = []
-
-    def __call__(self, trials, asks=True):
-        record(trials, asks)
-        self.batches.append([])
-        outcomes = []
-        for trial in trials:
-            values = trial.values
-            arm, seed = values["densify"]["name"], values["seed"]
-            self.batches[-1].append((arm, seed))
-            if seed == self.fails:
-                outcomes.append(Outcome(trial.folder, "failed", "made up"))
-                continue
-            if seed == self.stops_at:
-                raise KeyboardInterrupt
-            results = trial.folder / RESULTS
-            if not results.exists():
-                history = read_history(trial.files.home)
-                asked = history.covering(digest_of(values), values["scene"]["name"], seed)
-                values = {"psnr": self.psnr(arm, seed) + np.arange(3.0)}
-                code = {"packages": states_of(chain(*CODE_OF_STAGE.values()))}
-                write_as(trial, _questions=[one.id for one in asked], _code=code, **values)
-            outcomes.append(
-                outcome_of_results(trial.folder, record_from(results.read_bytes(), results))
-            )
-        return outcomes
+def Fake(psnr, fails=None, stops_at=None):  # noqa: N802 - a kind of trainings
+    """Trainings with the ``psnr`` of arm and seed; one seed ``fails``, at another comes a Ctrl-C."""
+    return Trainings(
+        lambda values: psnr(values["densify"]["name"], values["seed"]),
+        lambda number, trial: trial.values["seed"] == stops_at,
+        lambda number, trial: trial.values["seed"] == fails,
+    )
 
 
 @pytest.fixture

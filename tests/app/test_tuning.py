@@ -1,7 +1,6 @@
 """Tuning parity, with trials that take no time: what is declared, searched and chosen for arms."""
 
 import sys
-from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -13,19 +12,12 @@ from gsbench.analysis.fairness import fairness_table
 from gsbench.analysis.report.build import build_report, search_summary
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.tables import build_table
-from gsbench.errors import GsbenchError
-from gsbench.launch.outcomes import outcome_of_error, outcome_of_results
-from gsbench.launch.record import record
 from gsbench.parsing import read_typed
-from gsbench.runs.commands import digest_of, read_history
 from gsbench.runs.experiments import Arm, TuningRecord
-from gsbench.runs.keys import CODE_OF_STAGE
-from gsbench.runs.layout import RESULTS, TUNING
-from gsbench.runs.package_code import states_of
-from gsbench.runs.trial_record import record_from
+from gsbench.runs.layout import TUNING
+from tests.app.stand_ins import Trainings
 from tests.helpers import read_json, write
 from tests.launch.test_record import TINY
-from tests.trials import write_as
 
 optuna = pytest.importorskip("optuna", reason="needs Optuna (extra search)")
 
@@ -54,41 +46,25 @@ KEYS = {"adc": "gradient_threshold", "volumetric": "volume_threshold"}
 BEST = {"adc": 3e-4, "volumetric": 0.01}
 
 
-class Fake:
-    """Stands in for trainings, whose results are best at `BEST`.
+class Fake(Trainings):
+    """Trainings whose results are best at `BEST`.
 
     Ctrl-C comes in the trial with the number ``stops``; those with numbers in ``fails`` fail.
     """
 
-    def __init__(self, stops=None, fails=(), own_metric=False):
-        self.stops, self.fails, self.own_metric = stops, fails, own_metric
-        self.trained = []
-        self.batches = []
+    def __init__(self, stops=None, fails=(), metrics=("psnr",)):
+        stopped = lambda number, trial: number == stops  # noqa: E731
+        super().__init__(self.psnr, stopped, lambda number, trial: number in fails, metrics)
 
-    def __call__(self, trials, asks=True):
-        record(trials, asks)
-        self.batches.append(len(trials))
-        return [self.run(trial) for trial in trials]
+    @staticmethod
+    def psnr(values):
+        arm = values["densify"]["name"]
+        error = abs(np.log(values["densify"][KEYS[arm]] / BEST[arm])) if arm in KEYS else 0.0
+        return 26.0 - error + 0.01 * values["seed"]
 
-    def run(self, trial):
-        results = trial.folder / RESULTS
-        if not results.exists():
-            self.trained.append(trial)
-            if len(self.trained) - 1 == self.stops:
-                raise KeyboardInterrupt
-            if len(self.trained) - 1 in self.fails:
-                return outcome_of_error(trial.folder, GsbenchError("no luck"))
-            arm, values = trial.values["densify"]["name"], trial.values
-            error = abs(np.log(values["densify"][KEYS[arm]] / BEST[arm])) if arm in KEYS else 0.0
-            views = {"psnr": 26.0 - error + 0.01 * values["seed"] + np.arange(3.0)}
-            if self.own_metric:
-                views["mine"] = views["psnr"]
-            history = read_history(trial.files.home)
-            place = values["scene"]["name"], values["seed"]
-            asked = history.covering(digest_of(values), *place)
-            code = {"packages": states_of(chain(*CODE_OF_STAGE.values()))}
-            write_as(trial, _questions=[one.id for one in asked], _code=code, **views)
-        return outcome_of_results(trial.folder, record_from(results.read_bytes(), results))
+    @property
+    def sizes(self):
+        return [len(batch) for batch in self.batches]
 
     def tuning(self, arm):
         return [
@@ -122,7 +98,7 @@ def test_each_arm_gets_the_same_points_on_validation_views_and_the_sweep_gets_th
     fake = Fake()
     assert sweep(fake) == 0
     # a point of both arms at a time, then the sweep as a whole
-    assert fake.batches == [2, 2, 2, 2, 4]
+    assert fake.sizes == [2, 2, 2, 2, 4]
     for arm in ("adc", "volumetric"):
         values = [trial.values for trial in fake.tuning(arm)]
         assert len(values) == 4
@@ -156,7 +132,7 @@ def test_a_killed_tuning_continues_and_chooses_the_same_values(
     assert [tuning(tmp_path / "again", arm) for arm in KEYS] == expected
     again = Fake()
     assert sweep(again) == 0
-    assert again.batches == [4]  # the finished points are not launched again
+    assert again.sizes == [4]  # the finished points are not launched again
 
 
 @pytest.mark.parametrize(
@@ -229,7 +205,7 @@ def test_a_typed_value_replaces_an_interval(sweep, runs):
 def test_zero_points_tune_nothing(sweep, runs):
     fake = Fake()
     assert sweep(fake, f"{TUNE}.points=0") == 0
-    assert fake.batches == [4]
+    assert fake.sizes == [4]
     assert not list(runs.glob("*/tuning.json"))
 
 
@@ -260,7 +236,7 @@ def test_an_interval_searches_one_arm(runs, monkeypatch):
     words = ["-m", *WORDS[:-1], "densify=volumetric", "name=fair", "seed=0,1"]
     searched = [f"densify.volume_threshold={INTERVAL}", f"{TUNE}.points=3", f"{TUNE}.at_once=2"]
     assert cli.run([*words, *searched]) == 0
-    assert fake.batches == [2, 1, 2]
+    assert fake.sizes == [2, 1, 2]
     # Points that run together must know of each other, or the sampler may choose one twice.
     assert sampler_settings == {"seed": 0, "constant_liar": True}
     part = search_summary(runs / "fair-tune-random-volumetric")
@@ -278,7 +254,7 @@ def test_a_users_metric_is_optimised_in_the_direction_of_its_class(sweep, runs, 
     Path("own_measure.py").write_text(text)
     own = ["eval.extra.mine._target_=own_measure.Mine", "allow_targets=[own_measure]"]
     words = [*own, f"{TUNE}.metric=mine", f"{TUNE}.points=2"]
-    assert sweep(Fake(own_metric=True), *words) == 0
+    assert sweep(Fake(metrics=("psnr", "mine")), *words) == 0
     search = tuning(runs, "adc")
     assert search.direction == -1
     assert search.best == min(search.points, key=lambda point: point.value or 0.0)

@@ -8,8 +8,6 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from torch.autograd import DeviceType
-from torch.autograd.profiler_util import FunctionEventAvg
 
 from benchmarks.counters import timed_kernels
 from gsbench.bench import measure
@@ -18,7 +16,6 @@ from gsbench.bench.measure import (
     Stepper,
     device_of,
     peak_memory,
-    per_step,
     run_bench,
 )
 from gsbench.bench.scenes import SCENES, trained_like_gaussians
@@ -55,9 +52,6 @@ class ScriptedStepper:
     def frames_per_second(self):
         return 2000 / self.time
 
-    def profiled_steps(self):
-        return {"kernels_ms": {self.raster: 1.0}}
-
 
 @pytest.fixture
 def reports(monkeypatch):
@@ -85,7 +79,7 @@ def reports(monkeypatch):
 def test_rows_have_the_medians_of_each_setting_and_rasterizer(reports):
     both = ["cpu", "reference"]
     settings = [Setting("trained", 40, 30, 50), Setting("skewed", 33, 17, 1000)]
-    rows = run_bench(both, settings, repeats=3, kernels=True)
+    rows = run_bench(both, settings, repeats=3)
     assert [(row["size"], row["count"], row["raster"]) for row in rows] == [
         (setting.size, setting.count, raster) for setting in settings for raster in both
     ]
@@ -94,7 +88,7 @@ def test_rows_have_the_medians_of_each_setting_and_rasterizer(reports):
     assert one == {
         **{"raster": "cpu", "scene": "skewed", "size": "33x17", "count": 1000},
         **{"step_ms": 3, "step_ratio": 1, "steps_per_second": 333.333, "fps": 666.667},
-        **{"threads": 4, "device": "cpu", "peak_memory_mb": 23, "kernels_ms": {"cpu": 1}},
+        **{"threads": 4, "device": "cpu", "peak_memory_mb": 23},
     }
     # ratios of 6, 1 and 4, turn by turn
     assert (other["step_ms"], other["step_ratio"], other["fps"]) == (6, 4, 333.333)
@@ -112,7 +106,6 @@ def test_a_model_may_be_timed_and_the_memory_left_out(reports):
     )
     assert (row["scene"], row["count"], row["threads"]) == ("my/m.ply", 70, 2)
     assert row["peak_memory_mb"] is None
-    assert "kernels_ms" not in row
     assert reports[0] == ("bench", "40x30, m.ply", 0, 5, "cpu")
 
 
@@ -158,25 +151,6 @@ def test_a_whole_step_and_the_parts_of_one_are_timed_each_by_itself(paced):
     assert stepper.frames_per_second() == 1
 
 
-def test_kernels_are_recorded_on_the_device_and_divided_by_the_steps(paced, monkeypatch):
-    stepper, waits = paced
-    on_gpu = stepper.device.type == "cuda"
-    kind = SimpleNamespace(name=stepper.device.type.upper())
-    times = {"self_cpu_time_total": 7e3, "self_device_time_total": 5e3}
-    event = SimpleNamespace(key="sort", device_type=kind, **times)
-
-    @contextmanager
-    def profile(activities, acc_events):
-        assert [one.name for one in activities] == ["CPU", "CUDA"][: 1 + on_gpu]
-        before = measure.time.perf_counter()
-        yield SimpleNamespace(key_averages=lambda: [event])
-        assert measure.time.perf_counter() - before == (192 if on_gpu else 48)
-
-    monkeypatch.setattr(measure, "profile", profile)
-    assert stepper.profiled_steps()["kernels_ms"] == {"sort": 0.5 if on_gpu else 7, "all others": 0}
-    assert len(waits) == on_gpu
-
-
 @pytest.mark.parametrize("device, resets", [("cpu", 0), ("cuda", 1)])
 def test_peak_memory_is_that_of_three_steps(device, resets, monkeypatch):
     done = []
@@ -202,44 +176,6 @@ def test_a_gpu_is_for_rasterizers_that_need_one_and_for_a_users_own(monkeypatch)
     monkeypatch.setattr(measure, "make_scene", lambda *_: disabled[0] / 0)
     with pytest.raises(ZeroDivisionError):  # not an IndexError: it was called before
         Stepper("triton", Setting("trained", 40, 30, 50))
-
-
-@pytest.mark.slow
-def test_kernels_and_waits_of_a_step_on_a_cpu():
-    """On a CPU the profiler sees torch's operators, here the reference's; nothing waits."""
-    (row,) = run_bench(
-        ["reference"], [Setting("trained", 40, 30, 50)], 1, memory=False, kernels=True
-    )
-    assert row["kernels_ms"]["aten::mul"] > 0
-    assert list(row["kernels_ms"])[-1] == "all others"
-    assert row["waits"] == row["waits_ms"] == {}
-
-
-def test_times_on_a_gpu_are_those_of_kernels_alone():
-    """In the profiler's events, an operator's launch counts neither as a kernel nor as a wait."""
-
-    def event(key, kind, count, cpu, gpu):
-        average = FunctionEventAvg()
-        average.key, average.device_type, average.count = key, kind, count
-        average.self_cpu_time_total, average.self_device_time_total = cpu, gpu
-        return average
-
-    kernels = [
-        event(f"kernel{k}", DeviceType.CUDA, 10, 0.0, 1e3 * (k + 1))
-        for k in range(14)  # twelve get a name
-    ]
-    others = [event("aten::sort", DeviceType.CPU, 10, 7e4, 5e4)]
-    waits = [event("cudaStreamSynchronize", DeviceType.CPU, 15, 2e4, 0.0)]
-    found = per_step([*kernels, *others, *waits], 10, torch.device("cuda"))
-    assert found["kernels_ms"]["kernel13"] == pytest.approx(1.4)
-    assert list(found["kernels_ms"])[:2] == ["kernel13", "kernel12"]
-    assert len(found["kernels_ms"]) == 12 + 1
-    assert found["kernels_ms"]["all others"] == pytest.approx(0.1 + 0.2)
-    assert sum(found["kernels_ms"].values()) == pytest.approx(sum(range(1, 15)) / 10)
-    assert (found["waits"], found["waits_ms"]) == (
-        {"cudaStreamSynchronize": 1.5},
-        {"cudaStreamSynchronize": 2.0},
-    )
 
 
 def test_whole_steps_do_not_change_the_scene(monkeypatch):

@@ -7,19 +7,19 @@ import pytest
 import yaml
 
 from gsbench.app.command import compose_trials
-from gsbench.claims.ablation import (
-    choose_switches,
-    declared_switches,
-    effective_run,
-    off_settings,
-    runs_to_train,
-)
 from gsbench.config.build import build
 from gsbench.config.compose import compose_one
 from gsbench.config.groups import options
 from gsbench.densify.volumetric import Volumetric
 from gsbench.runs.config_hash import config_hash
 from gsbench.settings import Switch
+from gsbench.verbs.ablate import (
+    choose_switches,
+    declared_switches,
+    effective_run,
+    off_settings,
+    runs_to_train,
+)
 from tests.helpers import refusal
 from tests.launch.test_record import TINY
 

@@ -12,7 +12,10 @@ from gsbench.analysis.results import load_experiment
 from gsbench.analysis.statistics import StudentT
 from gsbench.analysis.verdicts import Verdict
 from gsbench.claims.export import write_archive
-from gsbench.claims.gate import (
+from gsbench.cli import run
+from gsbench.errors import InputError
+from gsbench.runs.trial_record import Code
+from gsbench.verbs.gate import (
     NOT_DECIDED,
     PASSED,
     WORSE,
@@ -22,9 +25,6 @@ from gsbench.claims.gate import (
     deviations,
     result_of,
 )
-from gsbench.cli import run
-from gsbench.errors import InputError
-from gsbench.runs.trial_record import Code
 from tests.analysis.helpers import loaded
 from tests.helpers import refusal
 from tests.trials import write_as, write_runs, write_trial
@@ -206,6 +206,27 @@ def test_the_exit_code_of_gate_is_its_result(
     assert words in capsys.readouterr().out
     assert trained == [0, 1]  # the first look decides
     assert len(old) == 4
+
+
+def test_one_training_shows_that_the_sides_cannot_be_compared(runs, tmp_path, monkeypatch, capsys):
+    trained = []
+
+    def train(planned, asks):
+        trained.extend(planned)
+        for trial in planned:
+            write_as(trial, psnr=26, _resolution=[640, 480])
+        return 0
+
+    monkeypatch.setattr("gsbench.verbs.gate.run_trials", train)
+    done = lambda *_: ""  # noqa: E731
+    monkeypatch.setattr("gsbench.runs.trial_folder.TrialFolder.why_not_done", done)
+    trials(tmp_path / "old", 0, 0.01, scenes=("courtyard",))
+    write_archive(load_experiment(tmp_path / "old", "gate"), tmp_path / "exp.zip")
+    assert run(split("gate exp.zip scene=courtyard init=sfm densify=adc")) == 2
+    said = capsys.readouterr().err
+    assert "courtyard: the arms differ in resolution" in said
+    assert "cannot be read" not in said  # of the folder that the gate makes itself
+    assert len(trained) == 1
 
 
 @pytest.mark.parametrize(

@@ -8,10 +8,9 @@ import pytest
 import yaml
 
 from gsbench.analysis.results import load_experiment
-from gsbench.analysis.tables import build_table
 from gsbench.claims.archive import unpack_archive
 from gsbench.claims.export import write_archive
-from gsbench.claims.site import _by_quantity, _unique_key
+from gsbench.claims.site import _unique_key
 from gsbench.cli import run
 from tests.analysis.helpers import loaded, trials_of
 from tests.claims.test_archive import rewrite
@@ -58,16 +57,13 @@ def test_the_first_page_has_arms_scenes_claims_and_working_links(tmp_path):
     assert "https://" not in page
 
 
-def test_a_table_of_many_metrics_is_split_into_one_for_each(tmp_path):
-    write_runs(tmp_path)
-    table = build_table(loaded(tmp_path), columns=("scene",), metrics=("psnr", "ssim", "flip"))
-    parts = list(_by_quantity(table))
-    assert [part.title for part in parts] == [name for name, _ in table.groups]
-    for place, part in enumerate(parts):
-        assert [row.entries for row in part.rows] == [
-            row.entries[2 * place : 2 * place + 2] for row in table.rows
-        ]
-        assert not any(row.rule_above for row in part.rows)
+def test_the_table_of_the_metric_that_was_asked_about_is_open(tmp_path):
+    runs, file = tmp_path / "runs", tmp_path / "exp.zip"
+    write_runs(runs)
+    ask_about(runs, metric="ssim")
+    write_archive(load_experiment(runs, "exp"), file)
+    page = site(tmp_path, file)
+    assert re.findall(r"<details open><summary>([^<]*): arms", page) == ["SSIM ↑"]
 
 
 @pytest.mark.parametrize(

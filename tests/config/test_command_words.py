@@ -102,14 +102,16 @@ def test_brackets_are_counted_while_they_are_open():
 @pytest.mark.parametrize(
     "word, said",
     [
-        ("hydra.searchpath=[file:///a,/b,pkg://gsbench.x,pkg://mine/sub]", None),
+        ("hydra.searchpath=[file:///,/,pkg://gsbench.config,pkg://json/tool]", None),
+        ("hydra.searchpath=[file:///nosuch]", "names /nosuch: no such folder"),
+        ("hydra.searchpath=[pkg://json/nosuch]", r"names json\.nosuch: no such package"),
         ("hydra.searchpath=[pkg://other]", r"imports a package; if you trust it, add "
-            r"allow_targets=\[mine,other\]"),
-        ("hydra.searchpath=[pkg://minefield.a]", r"allow_targets=\[mine,minefield\]"),
+            r"allow_targets=\[json,other\]"),
+        ("hydra.searchpath=[pkg://jsonfield.a]", r"allow_targets=\[json,jsonfield\]"),
         ("hydra.searchpath=[http://a]", "neither a folder .file://…. nor a package"),
         *(
             # Hydra 1.3 knows one of these spellings, 1.4 all
-            (f"{key}={value}", r"allow_targets=\[mine,strange\]|is not a setting")
+            (f"{key}={value}", r"allow_targets=\[json,strange\]|is not a setting")
             for key in ("hydra.searchpath", "hydra[searchpath]")
             for value in ("[pkg://strange]", "extend_list('pkg://strange')")
         ),
@@ -119,7 +121,7 @@ def test_brackets_are_counted_while_they_are_open():
 )  # fmt: skip
 def test_packages_of_settings_need_permission(word, said):
     with refusal(said):
-        check_search_path(["a=1", word], ["mine"])
+        check_search_path(["a=1", word], ["json"])
 
 
 def points(*words):

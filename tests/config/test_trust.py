@@ -375,6 +375,9 @@ def test_an_allowed_search_path_is_read(place):
     write(place / "bombs/scene/own.yaml", "defaults: [courtyard, _self_]\nname: own\n")
     words = ["hydra.searchpath=[pkg://bombs]", "scene=own", "allow_targets=[bombs]"]
     assert compose_trials(words)[0].values["scene"]["name"] == "own"
+    write(place / "bombs/scene/secret.yaml", f"defaults: [courtyard, _self_]\nname: {SECRET}\n")
+    with refusal("reads the variable KEY, which may be secret"):
+        compose_trials([*words, "scene=secret"])
 
 
 # ---- permissions and what they cover

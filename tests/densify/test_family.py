@@ -146,7 +146,7 @@ def test_only_the_option_absolute_gathers_the_absolute_gradient(kind, total):
 def seen_by_one_view():
     """A render in which the last of three Gaussians is not visible."""
     probe = torch.zeros(3, 3, 3, requires_grad=True)
-    probe.grad = torch.zeros(3, 3, 3)
+    probe.grad = torch.ones(3, 3, 3)
     ones = torch.ones(3)
     covered = Footprint(ones.int(), ones, ones, ones)
     more = {"extra": probe, "footprint": lambda values=None: covered}
@@ -161,6 +161,27 @@ def test_variants_of_adc_gather_its_statistics_too(kind):
         densifier.observe(densifier.start + 1, seen_by_one_view())
     sums = {"gradient_sum": [10, 0, 0], "visible_count": [2, 2, 0], "max_radii": [3, 7, 0]}
     assert {name: densifier.statistics[name].tolist() for name in ADC.STATISTICS} == sums
+
+
+@pytest.mark.parametrize(
+    "densifier, quiet, heard",
+    [
+        *((kind(), [15_000], [1, 14_999]) for kind in (ADC, AbsGS, PixelGS, SteepGS)),
+        (EdgeAware(), [500, 15_000], [501, 14_999]),
+        # the pauses of the authors' code: 2,501 to 2,999 and 6,001 to 6,499
+        (ResGS(start=700, stop=12_000), [500, 2501, 2999, 6001], [501, 2500, 3000, 6500]),
+    ],
+)
+def test_statistics_are_gathered_within_the_window_only(densifier, quiet, heard):
+    densifier.begin(random_gaussians(3), DensifyContext(1.0))
+    for step in quiet:
+        densifier.observe(step, seen_by_one_view())
+    assert not any(statistic.any() for statistic in densifier.statistics.values())
+    for count, step in enumerate(heard, start=1):
+        densifier.observe(step, seen_by_one_view())
+        assert densifier.statistics["visible_count"].tolist() == [count, count, 0]
+    gathered = {name for name, statistic in densifier.statistics.items() if statistic.any()}
+    assert gathered == set(densifier.STATISTICS) - {"level"}
 
 
 def test_mrnf_gathers_which_gaussians_were_seen():

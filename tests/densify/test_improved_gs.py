@@ -18,7 +18,7 @@ from tests.densify.helpers import (
     to_rows,
 )
 from tests.densify.restatement import opacity
-from tests.densify.test_rounds import observe, prepared
+from tests.densify.test_rounds import prepared
 from tests.densify.test_scores import COUNT, Room, alphas, find_edges, over_mean, started
 from tests.gaussians.helpers import random_gaussians
 
@@ -182,15 +182,6 @@ def test_edge_aware_prunes_once_early_and_after_two_resets():
         assert_same(trainable, rows)
         assert event is None or (event.balances() and event.after == len(rows) < event.before)
     assert [step for step, event in events.items() if event is None] == [299, 15_300]
-
-
-def test_edge_aware_gathers_gradients_after_iteration_500():
-    densifier = EdgeAware()
-    trainable, _ = prepared(densifier, 0)  # observes iterations 1 to 3
-    observe(densifier, trainable, np.random.default_rng(0), 500)
-    assert not densifier.statistics["visible_count"].any()
-    observe(densifier, trainable, np.random.default_rng(0), 501)
-    assert densifier.statistics["visible_count"].any()
 
 
 def begun(**options):

@@ -7,10 +7,10 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from gsbench.densify import DensifyContext, Volumetric
-from gsbench.densify.budget import admit, allowance
+from gsbench.densify import ADC, DensifyContext, Lineage, Volumetric
+from gsbench.densify.budget import admit
 from gsbench.densify.volumetric import log_condition, log_volume
-from tests.densify.helpers import generator, trained
+from tests.densify.helpers import at, generator, trained
 from tests.gaussians.helpers import random_gaussians
 
 
@@ -140,7 +140,9 @@ def test_admit_chooses_the_best_scores_and_counts_the_refused():
     ],
 )
 def test_each_cap_allows_the_expected_number(count, most, cap, allowed):
-    assert allowance(count, most, cap) == allowed
+    densifier = ADC(cap=cap)
+    densifier.max_gaussians, densifier.lineage = most, Lineage(5)
+    assert densifier.allowance(at(densifier.stop, range(count))) == allowed
 
 
 def test_the_volume_rule_can_have_its_own_window():

@@ -35,11 +35,9 @@ def test_a_setting_is_composed_once_and_checked_twice(tmp_path, monkeypatch):
         monkeypatch.setattr(owner, name, watched)
 
     watch(hydra, "compose")
-    watch(compose, "check_composed")
     watch(compose, "check_permissions")
     watch(settings, "_converted", lambda value, field, cls, key, **named: key == KEY)
     assert run(["-m", *TRIAL, f"runs={tmp_path}"]) == 0
     assert calls["compose"] == 1  # before the sweep: not again when a trial begins
-    # the values of the command, and of the trial; and what these are resolved to
-    assert (calls["check_composed"], calls["check_permissions"]) == (2, 1)
+    assert calls["check_permissions"] == 1
     assert calls["_converted"] == 2  # checked before the sweep, built when the trial begins

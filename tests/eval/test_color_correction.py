@@ -5,8 +5,8 @@ import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
 
-from gsbench.eval.color_correction import color_corrected
 from gsbench.eval.evaluator import Evaluator
+from gsbench.eval.more import color_corrected
 from gsbench.eval.protocol import PAPER, STANDARD
 
 RANDOM = np.random.default_rng(0)

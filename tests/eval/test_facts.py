@@ -1,4 +1,4 @@
-"""The table of metrics, and the attributes that a user's metric may have."""
+"""The table of metrics; attributes and values that a user's metric may have."""
 
 import re
 import subprocess
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsbench.eval.evaluator import MEASURES, Evaluator
+from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.facts import (
     FPS,
     METRICS,
@@ -21,7 +21,7 @@ from gsbench.eval.facts import (
     to_record,
 )
 from gsbench.eval.metric import UnavailableError
-from gsbench.eval.protocol import PAPER, PROTOCOLS
+from gsbench.eval.protocol import PAPER, PROTOCOLS, get_protocol
 from tests.helpers import refusal
 
 IMAGE = np.random.default_rng(0).integers(0, 256, (24, 30, 3), dtype=np.uint8)
@@ -38,7 +38,6 @@ def test_the_evaluator_has_exactly_the_metrics_of_the_table():
     of_images = {facts.key for facts in METRICS}
     assert values.keys() | evaluator.unavailable.keys() == of_images
     assert set(known_keys()) == of_images | {FPS.key}
-    assert set(MEASURES) == of_images
     assert all(f"lpips_{protocol.lpips}" in known_keys() for protocol in PROTOCOLS.values())
     assert set(lpips_variants()) == {"vgg_raw", "vgg", "alex", "squeeze"}
 
@@ -116,3 +115,77 @@ def test_the_page_on_metrics_shows_the_table():
         )
         cells = (f"`{facts.key}`", facts.name, better, low, high, facts.words)
         assert re.sub(r"\|  (?=\|)", "| ", f"| {' | '.join(cells)} |") in page, facts.key
+
+
+class Own:
+    """A metric whose value is that of a function."""
+
+    def __init__(self, of):
+        self.of = of
+
+    def measure(self, image, truth):
+        return self.of()
+
+
+def measured(of):
+    evaluator = Evaluator(get_protocol("paper"), lpips=(), flip=False, extra={"own": Own(of)})
+    return evaluator.evaluate_view(IMAGE, IMAGE)
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        2,
+        2.0,
+        np.float32(2),
+        np.int64(2),
+        np.array(2.0),
+        np.array([2.0]),
+        torch.tensor(2.0),
+        torch.tensor([2]),
+    ],
+)
+def test_a_users_metric_may_return_a_number_of_any_type(value):
+    assert measured(lambda: value)["own"] == 2.0
+
+
+@pytest.mark.parametrize(
+    "value",
+    ["2.0", "good", b"2", True, None, 2j, [2.0], {}, np.zeros(2), torch.zeros(2), np.array("2")],
+)
+def test_a_users_metric_that_returns_no_number_is_refused(value):
+    with refusal(r"eval\.extra\.own must return a number for each view, got "):
+        measured(lambda: value)
+
+
+def endless():
+    return endless()
+
+
+def failing():
+    raise RuntimeError("two\nlines")
+
+
+@pytest.mark.parametrize(
+    "fall, said",
+    [
+        (
+            failing,
+            r"eval\.extra\.own raised RuntimeError two lines \(.*test_facts\.py, line "
+            rf"{failing.__code__.co_firstlineno + 1}\)",
+        ),
+        (lambda: sys.exit(0), r"eval\.extra\.own ended the process \(exit code 0\)"),
+        (endless, r"eval\.extra\.own raised RecursionError .*test_facts\.py"),
+        (
+            lambda: 10**400,
+            r"eval\.extra\.own must return a number for each view, got one that is too large",
+        ),
+        (
+            lambda: 10**5000,
+            r"eval\.extra\.own must return a number for each view, got one that is too large",
+        ),
+    ],
+)
+def test_a_users_metric_that_fails_is_named_in_one_line(fall, said):
+    with refusal(said):
+        measured(fall)

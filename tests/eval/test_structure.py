@@ -11,8 +11,8 @@ from skimage import data
 from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.facts import METRICS, further_keys
 from gsbench.eval.metric import UnavailableError
+from gsbench.eval.more import STRUCTURAL, load_structural
 from gsbench.eval.protocol import PAPER
-from gsbench.eval.structure import STRUCTURAL, load_structural
 
 # The values of an implementation after the authors' papers, without piq, in the order of STRUCTURAL.
 # For MS-SSIM of odd sides piq differs by 0.0041: it pads at the start, the authors at the end.

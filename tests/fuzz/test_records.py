@@ -79,7 +79,6 @@ READS_ITSELF = {
     "runs/keys.py",  # text of this very process
     "system/install.py",  # files that pip wrote about the package
     "claims/archive.py",  # archives, which anybody may have made
-    "claims/old_archive.py",  # archives of the first version, likewise
     "config/schema.py",  # of the package
     "launch/record.py",  # text of this process
     "parsing.py",

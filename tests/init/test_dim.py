@@ -1,6 +1,5 @@
 """Deep image matching with untrained networks, and the behaviour that it needs of libraries."""
 
-import os
 import shutil
 from dataclasses import replace
 from functools import partial
@@ -46,7 +45,8 @@ def superpoint(weights, **options):
 
 
 def matcher_of(weights):
-    return build_matcher(superpoint(None), [weights], CPU)
+    own = superpoint(None)
+    return build_matcher(own.extraction, own.matching, weights, CPU)
 
 
 def features_of(descriptors, keypoints=0.0, size=(9, 9), file_size=None):
@@ -98,7 +98,7 @@ def test_lightglue_matches_enough_points(few, untrained_weights, tmp_path, caplo
 def test_other_settings_or_images_have_other_file_names(courtyard, tmp_path):
     def paths(extraction, matching, images):
         capture = replace(courtyard, images=images)
-        store = FeatureStore(tmp_path / "work", capture, extraction, matching)
+        store = FeatureStore(tmp_path / "work", capture, extraction, matching, None, None, 1)
         return store.features_path("0000.png"), store.matches_path("0000.png", "0001.png")
 
     same, changed = courtyard.images, tmp_path / "changed"
@@ -223,7 +223,7 @@ def test_detection_settings_are_the_extractors_own_unless_given(
     """The defaults are those of deep-image-matching and the authors."""
     own = Dim(extractor=extractor, matcher="mutual_nearest", weights=tmp_path, download=False)
     monkeypatch.setattr(
-        "gsbench.init.networks.options.find_all_weights",
+        "gsbench.init.dim.find_all_weights",
         lambda files, folder, download: [f.names[0] for f in files],
     )
     assert own.find_weights() == [file]
@@ -269,21 +269,17 @@ def test_weights_of_another_network_or_shape_are_refused(untrained_weights, tmp_
             build(file)
 
 
-def test_too_little_gpu_memory_for_matching_is_reported():
+def test_too_little_gpu_memory_is_reported(courtyard):
     features = features_of(np.zeros((1000, 8)))
     with refusal(r"1000 keypoints ran out of memory: lower init.max_image_size"):
         match(no_gpu, features, features)
-
-
-def test_too_little_gpu_memory_for_extraction_is_reported(courtyard):
-    settings = Dim().extraction
     with refusal(r"0000.png: cpu ran out of memory at 320x240 px"):
-        extract_features(courtyard.images / "0000.png", no_gpu, settings, CPU)
+        extract_features(courtyard.images / "0000.png", no_gpu, Dim().extraction, CPU)
 
 
 def test_an_empty_image_has_no_matches():
-    some = features_of(np.eye(3, 8))
-    assert match(mutual_nearest_matcher(0.9, CPU), some, some[:0]).shape == (0, 2)
+    some, none = features_of(np.eye(3, 8)), features_of(np.eye(0, 8))
+    assert match(mutual_nearest_matcher(0.9, CPU), some, none).shape == (0, 2)
 
 
 def test_lightglue_has_no_weights_for_the_small_aliked():
@@ -306,16 +302,6 @@ def test_lightglue_with_real_weights_finds_points_on_the_surfaces(
     init = Dim(extractor=extractor, weights=trained_weights, download=False, **own)
     report = init.run(few, tmp_path)
     assert len(report.settings["weights_sha256"]) == 2
+    assert report.versions["kornia"]
     assert report.num_points > 100
     assert np.median(surface_distance(read_cloud(tmp_path / MODEL_FOLDER).points)) < 0.05  # m
-
-
-@pytest.mark.shared
-@pytest.mark.slow
-def test_aliked_with_real_weights_finds_points_on_the_surfaces(courtyard, shared_weights, tmp_path):
-    init = Dim(extractor="aliked", matcher="mutual_nearest", weights=shared_weights, download=False)
-    report = init.run(courtyard, tmp_path)
-    assert report.num_points > 200
-    assert np.median(surface_distance(read_cloud(tmp_path / MODEL_FOLDER).points)) < 0.05  # m
-    assert report.versions["kornia"]
-    assert os.listdir(tmp_path / MODEL_FOLDER)

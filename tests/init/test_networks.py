@@ -1,16 +1,20 @@
 """Features of all images and matches of all pairs, with stand-ins for the networks."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 from PIL import Image
 
-from gsbench.errors import GsbenchError
 from gsbench.files import file_sha256
-from gsbench.init import Dim
-from gsbench.init.networks import extract_and_match
-from gsbench.init.networks.features import Features
+from gsbench.init import Dim, dim
+from gsbench.init.base import Timer
+from gsbench.init.colmap import database, matches
+from gsbench.init.colmap.database import DatabaseTask
+from gsbench.init.networks import features, models
+from gsbench.init.networks.features import Features, FeatureStore
 from gsbench.init.reconstruction import Job
 from tests.helpers import refusal, write
 
@@ -50,9 +54,9 @@ class Networks:
 @pytest.fixture
 def networks(monkeypatch):
     made = Networks()
-    monkeypatch.setitem(extract_and_match.EXTRACTORS, "superpoint", made.build("extractor"))
-    monkeypatch.setattr(extract_and_match, "build_matcher", made.build("matcher"))
-    monkeypatch.setattr(extract_and_match, "extract_features", made.extract)
+    monkeypatch.setitem(models.EXTRACTORS, "superpoint", made.build("extractor"))
+    monkeypatch.setattr(models, "build_matcher", made.build("matcher"))
+    monkeypatch.setattr(models, "extract_features", made.extract)
     monkeypatch.setattr(Dim, "find_weights", lambda _: made.weights)
     return made
 
@@ -68,43 +72,59 @@ def job(networks, bare_photos, tmp_path):
     return Job(Dim(threads=1), capture, tmp_path, tmp_path / "work", None)
 
 
-def run(job, progress=lambda *at: None):
-    return extract_and_match.extract_and_match(job.options, job, progress)
+def run(job, progress=lambda *at: None, timer=None):
+    """The keypoints and the matches that are written, and the facts, of all pairs."""
+    pairs, written = list(itertools.combinations(NAMES, 2)), []
+    task = DatabaseTask(job.work_dir / "a.db", job.capture.images, list(NAMES), pairs)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(database, "write_features", lambda _, *given: written.extend(given))
+        patch.setattr(matches, "verify_pairs", lambda *_: None)
+        facts = job.options.fill(job, task, progress, timer or Timer())
+    return *written, facts
 
 
-def open_store(job):
-    return extract_and_match.open_store(job.options, job, job.options.find_weights())
+def test_each_image_and_pair_is_computed_once(networks, job, monkeypatch):
+    told, stores, timer = [], [], Timer()
 
+    class Noted(FeatureStore):
+        def __init__(self, *given):
+            super().__init__(*given)
+            stores.append(self)
 
-def test_each_image_and_pair_is_computed_once(networks, job):
-    told = []
-    found = run(job, lambda *at: told.append(at))
+    monkeypatch.setattr(features, "FeatureStore", Noted)
+    keypoints, found, facts = run(job, lambda *at: told.append(at), timer)
     assert networks.made == ["extractor", "matcher"]
     assert networks.extracted == list(NAMES)
     assert networks.matched == [(2, 3), (2, 4), (3, 4)]
     assert told == [(what, done, 3) for what in ("extract", "match") for done in range(4)]
     counted = {"pairs_selected": 3, "pairs_without_matches": 0, "images_without_keypoints": 0}
-    assert found.counts == counted
-    assert set(found.seconds) == {"extract", "match"}
+    assert facts["counts"] == counted
+    assert set(timer.seconds) == {"extract", "match", "verify"}
+    assert {name: len(found) for name, found in keypoints.items()} == networks.keypoints
     again = run(job)
     assert networks.made == ["extractor", "matcher"]  # no network is loaded again
-    assert (again.counts, len(networks.extracted), len(networks.matched)) == (found.counts, 3, 3)
-    store = open_store(job)  # what is gone or damaged is computed again, and nothing else
+    assert (again[2], len(networks.extracted), len(networks.matched)) == (facts, 3, 3)
+    for name in NAMES:
+        assert_array_equal(again[0][name], keypoints[name])
+    assert again[1].keys() == found.keys()
+    store = stores[0]  # what is gone or damaged is computed again, and nothing else
     store.features_path("a.png").unlink()
     store.features_path("b.png").write_bytes(b"half a file")
     store.matches_path("b.png", "c.png").unlink()
+    np.save(store.matches_path("a.png", "b.png"), np.zeros((4, 3)))
     run(job)
     assert networks.extracted[3:] == ["a.png", "b.png"]
-    assert networks.matched[3:] == [(3, 4)]
+    assert networks.matched[3:] == [(2, 3), (3, 4)]
 
 
 def test_images_without_keypoints_and_pairs_without_matches_are_counted(networks, job):
     networks.keypoints["a.png"] = 0
-    found = run(job)
+    _, found, facts = run(job)
     assert networks.matched == [(3, 4)]
-    assert found.counts["images_without_keypoints"] == 1
-    assert found.counts["pairs_without_matches"] == 2
-    assert found.warnings == ("no keypoint in a.png: no point comes from these images",)
+    assert list(found) == [("b.png", "c.png")]
+    assert facts["counts"]["images_without_keypoints"] == 1
+    assert facts["counts"]["pairs_without_matches"] == 2
+    assert facts["warnings"] == ["no keypoint in a.png: no point comes from these images"]
 
 
 def test_nothing_to_match_is_refused(networks, job):
@@ -122,10 +142,9 @@ def test_keypoints_on_ignored_pixels_are_left_out(networks, job):
     Image.fromarray(mask).save(job.work_dir.parent / "mask.png")
     masks = {"c.png": job.work_dir.parent / "mask.png"}
     masked = replace(job, capture=replace(job.capture, masks=masks))
-    run(masked)
-    store = open_store(masked)
-    assert store.features("c.png").keypoints.tolist() == [[0, 0], [2, 2], [3, 3]]
-    assert len(store.features("b.png").keypoints) == 3
+    keypoints, *_ = run(masked)
+    assert_array_equal(keypoints["c.png"], [[0.5, 0.5], [2.5, 2.5], [3.5, 3.5]])
+    assert len(keypoints["b.png"]) == 3
 
 
 def test_pairs_that_the_preview_leaves_out_are_counted(networks, job, monkeypatch):
@@ -135,12 +154,12 @@ def test_pairs_that_the_preview_leaves_out_are_counted(networks, job, monkeypatc
         seen.extend(strongest(name).tolist() for name in names)
         return [("a.png", "c.png")]
 
-    monkeypatch.setattr(extract_and_match, "proposed_pairs", proposed)
-    monkeypatch.setattr(extract_and_match, "STRONGEST", 2)
-    found = run(replace(job, options=Dim(threads=1, pairs="auto")))
+    monkeypatch.setattr(dim, "proposed_pairs", proposed)
+    monkeypatch.setattr(dim, "STRONGEST", 2)
+    *_, facts = run(replace(job, options=Dim(threads=1, pairs="auto")))
     assert seen == [[[2.0]] * 2, [[3.0]] * 2, [[4.0]] * 2]
     assert networks.matched == [(2, 4)]
-    assert (found.counts["pairs_selected"], found.counts["pairs_left_out"]) == (1, 2)
+    assert (facts["counts"]["pairs_selected"], facts["counts"]["pairs_left_out"]) == (1, 2)
 
 
 def test_the_weights_are_named_by_their_digests_and_tell_stored_files_apart(
@@ -150,22 +169,10 @@ def test_the_weights_are_named_by_their_digests_and_tell_stored_files_apart(
     weights = tmp_path / "w.pth"
     weights.write_bytes(b"weights")
     networks.weights[1] = weights
-    assert run(job).settings["weights_sha256"] == {
+    assert run(job)[2]["settings"]["weights_sha256"] == {
         file.name: file_sha256(file) for file in networks.weights
     }
     assert (len(networks.extracted), len(networks.matched)) == (3, 6)
     networks.weights[0] = weights
     run(job)
     assert (len(networks.extracted), len(networks.matched)) == (6, 9)
-
-
-def test_stored_files_that_are_gone_are_named(networks, job):
-    store = open_store(job)
-    for read, names, said in (
-        (store.features, ("a.png",), r"features of a\.png are gone from .*work"),
-        (store.matches, ("a.png", "b.png"), r"matches of a\.png and b\.png are gone"),
-    ):
-        with pytest.raises(GsbenchError, match=f"the stored {said}"):
-            read(*names)
-    np.save(store.matches_path("a.png", "b.png"), np.zeros((4, 3)))
-    assert store.read_matches("a.png", "b.png") is None

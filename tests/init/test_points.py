@@ -103,7 +103,7 @@ def test_tables_of_scanners_and_other_programs_are_read(tmp_path, name, text, co
         ("a.txt", "1,5\t2,5\t3\n", "with decimal points"),
         ("a.xyz", "1 2 3 #ff8000\n4 5 6 #00ff00\n", "save it so, or as PLY"),
         ("a.txt", "#   POINT3D_ID, X, Y, Z, R, G, B\n1 2 3 4 5 6 7 8\n", "init=dataset reads its"),
-        ("a.xyz", "1.0D+00 2.0D+00 3.0D+00\n", "no line is a row of numbers"),
+        ("a.xyz", "1.0D+00 2.0D+00 3.0D+00\n", "save it so, or as PLY with"),
         ("a.las", "LASF", "convert it to PLY, for example with CloudCompare"),
         ("a.splat", "x", "in the format splat: unpack it with npx"),
         ("points3D.bin", "x", "belongs to a COLMAP model: init=dataset"),

@@ -11,15 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from gsbench.init import MODEL_FOLDER
 from gsbench.init.base import OWN_GAUGE_FOLDER, PoseErrors
-from gsbench.init.colmap.alignment import (
-    align,
-    align_poses,
-    compare_poses,
-    measure_gauge,
-    training_extent,
-)
-from gsbench.init.colmap.reconstruct import common_poses, poses_by_name
-from gsbench.init.report import make_report, write_result
+from gsbench.init.colmap.alignment import align, align_poses, common_poses, compare_poses
+from gsbench.init.colmap.models import posed_images, training_extent
+from gsbench.init.report import make_report, measure_gauge, write_result
 from gsbench.scene.types import Capture
 from tests.init.models import add_point, camera_at, model_with
 
@@ -112,16 +106,17 @@ def test_a_similarity_leaves_no_pose_errors_and_a_tilt_does():
     reference, model = model_of(CENTERS), model_of(CENTERS)
     rotation = pycolmap.Rotation3d(turn.as_matrix())
     model.transform(pycolmap.Sim3d(3.0, rotation, np.array([1.0, 2.0, 3.0])))
-    similarity = align_poses(*common_poses(model, reference))
-    errors = compare_poses(model, reference, similarity, 2.0, exact=True)
+    poses = common_poses(model, reference)
+    similarity = align_poses(*poses)
+    errors = compare_poses(poses, similarity, 2.0, exact=True)
     assert similarity.scale == pytest.approx(1 / 3)
     assert errors.num_images == 4
     assert errors.center_max < 1e-9
     assert errors.rotation_max_deg < 1e-5
 
     tilted = model_of(CENTERS, Rotation.from_rotvec([0, np.radians(4.0), 0]))
-    similarity = align_poses(*common_poses(tilted, reference))
-    errors = compare_poses(tilted, reference, similarity, 2.0, exact=False)
+    poses = common_poses(tilted, reference)
+    errors = compare_poses(poses, align_poses(*poses), 2.0, exact=False)
     assert errors.rotation_mean_deg == pytest.approx(4.0)
     assert errors.center_max < 1e-9
 
@@ -157,8 +152,10 @@ def test_an_estimated_model_is_written_in_both_gauges(capture, tmp_path):
     assert own.scene_extent == pytest.approx(3 * report.gauge.scene_extent)
     assert own.threshold_in_reference == pytest.approx(0.03 / 27)
     for gauge, centers in ((MODEL_FOLDER, CENTERS), (OWN_GAUGE_FOLDER, 3 * CENTERS + shift)):
-        found = poses_by_name(pycolmap.Reconstruction(tmp_path / gauge))
-        assert_allclose([found[name][0] for name in NAMES], centers, atol=1e-9)
+        written = pycolmap.Reconstruction(tmp_path / gauge)
+        found = posed_images(written)
+        places = [found[name].projection_center() for name in NAMES]
+        assert_allclose(places, centers, atol=1e-9)
 
 
 def test_centre_errors_are_in_reference_units_and_relative_to_the_extent():
@@ -166,7 +163,7 @@ def test_centre_errors_are_in_reference_units_and_relative_to_the_extent():
     moved[3, 2] += 0.3
     model, reference = model_of(moved), model_of(CENTERS)
     same = align_poses(*common_poses(reference, reference))
-    found = compare_poses(model, reference, same, 2.0, exact=True)
+    found = compare_poses(common_poses(model, reference), same, 2.0, exact=True)
     assert found.center_max == pytest.approx(0.3)
     assert found.center_mean == pytest.approx(0.3 / 4)
     assert found.center_rmse == pytest.approx(0.3 / 2)

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -9,8 +10,10 @@ import pytest
 from numpy.testing import assert_array_equal
 from PIL import Image
 
-from gsbench.init import MODEL_FOLDER, Sfm, SfmDense, read_cloud
-from gsbench.init.base import REPORT_FILE, WORK_FOLDER
+from gsbench.init import MODEL_FOLDER, Sfm, SfmDense, read_cloud, reconstruction
+from gsbench.init.base import REPORT_FILE, WORK_FOLDER, Timer, UnplacedError
+from gsbench.init.reconstruction import Job
+from gsbench.logs import no_progress
 from gsbench.scene.types import Capture
 from tests.helpers import read_json, refusal
 from tests.init.models import camera_at, digest, model_with
@@ -173,3 +176,40 @@ def test_photos_that_cannot_be_matched_are_refused(tmp_path, pixels, said):
 def test_two_photos_are_refused(courtyard, tmp_path):
     with refusal("has 2 images: sfm needs at least 3"):
         Sfm().run(replace(courtyard, image_names=courtyard.image_names[:2]), tmp_path)
+
+
+@pytest.mark.parametrize(
+    "pairs, count, auto, every, poses, kept",
+    [
+        ("auto", 40, 35, 40, "own", "exhaustive"),
+        ("auto", 40, 35, 35, "own", "auto"),
+        ("auto", 40, 35, None, "own", "auto"),
+        ("auto", 40, None, 4, "own", "exhaustive"),
+        ("auto", 40, None, None, "own", None),
+        ("auto", 40, 36, 40, "own", "auto"),  # nine of ten are enough
+        ("auto", 40, 35, 40, "shared", "auto"),  # other pairs place no further cameras
+        ("auto", 30, 10, 30, "own", "auto"),  # these were all pairs
+        ("sequential", 40, 10, 40, "own", "sequential"),
+    ],
+)
+def test_all_pairs_are_matched_if_those_of_auto_place_few_images(
+    monkeypatch, caplog, pairs, count, auto, every, poses, kept
+):
+    def attempt(job, *_):
+        placed = every if job.options.pairs == "exhaustive" else auto
+        if placed is None:
+            raise UnplacedError("no pair")
+        return job.options, SimpleNamespace(num_reg_images=lambda: placed), {"poses": poses}
+
+    monkeypatch.setattr(reconstruction, "_attempt", attempt)
+    names = tuple(map(str, range(count)))
+    capture = Capture("x", Path("x"), names, (), None, False, "0")
+    job = Job(Sfm(pairs=pairs), capture, Path("x"), Path("x"), None)
+    try:
+        options, *_ = reconstruction._best_attempt(job, None, Timer(), no_progress)
+    except UnplacedError:
+        assert kept is None
+    else:
+        assert options.pairs == kept
+    tried_again = pairs == "auto" and count == 40 and poses == "own" and auto != 36
+    assert ("the others are matched" in caplog.text) == tried_again

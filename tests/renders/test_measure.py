@@ -17,7 +17,7 @@ from gsbench.cli import run
 from gsbench.config.compose import compose_one
 from gsbench.renders.imported import Destination, Measured, check_destination, find_destination
 from gsbench.renders.measure import _lines
-from gsbench.renders.truth import ReferenceImages, find_reference_images
+from gsbench.renders.sources import ReferenceImages, find_reference_images
 from gsbench.scene.names import Matching
 from tests.helpers import read_json, refusal, write
 from tests.trials import write_runs

@@ -1,11 +1,13 @@
-"""What enters the key of a step: options, the user's code, and packages of gsbench."""
+"""What enters the key of a step: options, the user's code, and packages; nested values."""
 
+import doctest
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
 
-from gsbench.runs import keys
+from gsbench.runs import keys, nested
 from gsbench.runs.keys import Stage, options_of, rasterizer_inputs, step_of
+from gsbench.runs.nested import flatten, targets_in
 from gsbench.runs.user_code import UserCode
 from tests.helpers import refusal
 
@@ -70,3 +72,18 @@ def test_a_step_has_the_differing_packages_and_checks_for_edits_only_if_it_start
     step_of(*given).check()
     states.pop("init")
     assert step_of(*given).inputs == {"x": 1}
+
+
+def test_the_example_in_the_docstring_holds():
+    assert doctest.testmod(nested).failed == 0
+
+
+def test_empty_mappings_are_kept_only_if_asked():
+    values = {"a": {"b": {"c": 1}, "e": {}}, "f": None}
+    assert flatten(values) == {"a.b.c": 1, "f": None}
+    assert flatten(values, keep_empty=True) == {"a.b.c": 1, "a.e": {}, "f": None}
+
+
+def test_classes_are_found_at_any_depth_with_their_place():
+    values = {"a": {"_target_": "x.Y", "b": [{"_target_": None}, {"c": 1, "_target_": "z.Z"}]}}
+    assert list(targets_in(values)) == [(("a",), "x.Y"), (("a", "b", "1"), "z.Z")]

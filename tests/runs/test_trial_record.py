@@ -6,8 +6,7 @@ from pathlib import Path
 import pytest
 
 from gsbench.parsing import DamagedError, parse_typed
-from gsbench.runs.rows import Histogram, read_rows, whole_lines
-from gsbench.runs.trial_files import Failure
+from gsbench.runs.trial_files import Failure, Histogram, read_rows, whole_lines
 from gsbench.runs.trial_record import MetricRecord, UnfinishedError, record_from, split_text
 from tests.trials import results_of, trial_values
 

@@ -3,6 +3,8 @@
 from pathlib import Path
 
 from gsbench.pipeline.steps.scene import CaptureSource
+from gsbench.runs.store import Store
+from gsbench.scene.load import load_scene
 from gsbench.scene.options import SceneConfig
 from gsbench.scene.pipe import read_capture
 
@@ -26,3 +28,8 @@ def read_with_step(folder, work, reader=None, **settings):
     Path(work).mkdir(exist_ok=True)
     source.step.build(work)
     return source.read(work)
+
+
+def loaded(capture, folder, *args, **options):
+    """The scene of a capture with its own cameras; views are prepared below ``folder``."""
+    return load_scene(capture, capture.model, Store(folder / "cache"), *args, **options)

@@ -9,13 +9,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
 from gsbench.normalization import Normalization
-from gsbench.runs.store import Store
 from gsbench.scene.beside import files_beside, pixels_of_view, read_beside
-from gsbench.scene.load import load_scene
 from gsbench.scene.types import CameraModel, to_pinhole
 from gsbench.scene.undistortion import flat_camera
 from tests.helpers import refusal
-from tests.scene.captures import read_colmap
+from tests.scene.captures import loaded, read_colmap
 
 STEPS = np.arange(12, dtype=np.uint16).reshape(3, 4) * 1000
 
@@ -116,19 +114,21 @@ def test_views_have_depth_in_the_units_of_the_training(make_scene, tmp_path):
         Image.fromarray(np.full((4, 4), value, np.uint16)).save(path)
     capture = replace(
         capture,
-        depths={name: tmp_path / f"{name}.png" for name in (first, second)},
-        more={first: {"normals": capture.images / first}},
+        beside={
+            "depth": {name: tmp_path / f"{name}.png" for name in (first, second)},
+            "normals": {first: capture.images / first},
+        },
         normalization=Normalization(scale=2.0),
     )
     kinds = ["depth", "normals"]
-    scene = load_scene(capture, capture.model, Store(tmp_path / "cache"), max_size=32, beside=kinds)
+    scene = loaded(capture, tmp_path, max_size=32, beside=kinds)
     views = {view.name: view for view in (*scene.train, *scene.test)}
     size = views[first].image.shape[:2]
     assert_allclose(views[first].beside["depth"], np.full(size, 6.0))
     assert_allclose(views[second].beside["depth"], np.full(size, 10.0))
     assert views[first].beside["normals"].shape == (*size, 3)
     assert "normals" not in views[second].beside
-    plain = load_scene(capture, capture.model, Store(tmp_path / "cache"), max_size=32)
+    plain = loaded(capture, tmp_path, max_size=32)
     assert not any(view.beside for view in plain.train)
     assert_array_equal(plain.train[0].image, scene.train[0].image)
 
@@ -137,7 +137,7 @@ def test_depth_that_no_view_knows_is_refused(make_scene, tmp_path, caplog):
     capture = read_colmap("x", make_scene())
     first = capture.image_names[0]
     np.save(tmp_path / "a.npy", np.full((30, 40), -1.0))
-    capture = replace(capture, depths={first: tmp_path / "a.npy"})
+    capture = replace(capture, beside={"depth": {first: tmp_path / "a.npy"}})
     with refusal("scene.beside=depth: no view has a known depth"):
-        load_scene(capture, capture.model, Store(tmp_path / "cache"), beside=["depth"])
+        loaded(capture, tmp_path, beside=["depth"])
     assert "scene.beside=depth: only 1 of 6 photographs have it" in caplog.text

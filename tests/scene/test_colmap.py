@@ -19,6 +19,7 @@ from gsbench.scene.types import Camera
 from tests.helpers import refusal
 from tests.scene.cameras import cameras_of
 from tests.scene.captures import read_colmap, read_photos
+from tests.scene.tables import TABLES
 
 from .conftest import smooth_image
 
@@ -162,36 +163,7 @@ POSED = "1 1 0 0 0 0 0 5 1"
 
 @pytest.mark.parametrize(
     "stem, text, said",
-    [
-        ("cameras", "1 PINHOLE 40 30 50 50 20", "VerifyParams"),
-        ("cameras", "1 OTHER 40 30 50 50 20 15", "model does not exist"),
-        ("cameras", "1 PINHOLE 0 30 50 50 20 15", "camera 1 is damaged"),
-        ("cameras", "1 PINHOLE 40 2000000 50 50 20 15", "camera 1 is damaged"),
-        ("cameras", "1 PINHOLE 40 30 50 0 20 15", "camera 1 is damaged"),
-        ("cameras", "1 PINHOLE 40.0 30 50 50 20 15", "whole px"),
-        ("cameras", "1 PINHOLE 40 30 50,5 50 20 15", "decimal points, not '1 PIN.*50,5"),
-        ("cameras", "1 PINHOLE 40 30 nan 50 20 15", "with decimal points"),
-        ("cameras", "\n".join(2 * [PLAIN["cameras"]]), "Check failed"),
-        ("images", "1 0 0 0 0 0 0 5 1 a.png\n1 2 -1", "frame 1 has no pose that can be used"),
-        ("images", "1 1 0 0 0 0 0 5 2 a.png\n1 2 -1", "does not exist"),
-        ("images", f"{POSED} a.png\n1 2", "each image needs a second line"),
-        ("images", f"{POSED} a.png\n1 nan -1", "each image needs a second line"),
-        ("images", f"{POSED}\n", "id of a camera, name"),
-        ("images", f"{POSED} a.png\n\n2 {POSED[2:]} a.png\n", "no names of their own"),
-        ("images", f"{POSED} a.png\n\n{POSED} b.png\n", "Check failed"),
-        ("images", f"{POSED} a.png\n2 {POSED[2:]} b.png", "each image needs a second line"),
-        ("images", f"{POSED} 1\n2 {POSED[2:]} 22", "each image needs a second line"),
-        ("images", f"4294967297 {POSED[2:]} a.png\n\n", "Check failed"),
-        ("points3D", "1 0 0 nan 0 0 0 0.1", "id, x, y, z"),
-        ("points3D", "1 0 0 5 0 0 0 0.1 1 1", "range"),
-        ("points3D", "1 0 0 5 0 0 0 0.1 9 0", "does not exist"),
-        ("points3D", "1 0 0 5 256 0 0 0.1", "a colour of whole numbers from 0 to 255"),
-        ("points3D", "1 0 0 5 -1 0 0 0.1", "a colour of whole numbers"),
-        ("points3D", "1 0 0 5 128.0 0 0 0.1", "a colour of whole numbers"),
-        ("points3D", "1 0 0 5 0 0 0", "error, pairs of ids"),
-        ("points3D", "1 0 0 5 0 0 0 x", "cannot be read"),
-        ("points3D", "1 0 0 5 0 255 0 0.1 1", "pairs of ids"),
-    ],
+    TABLES["bad lines"],
 )
 def test_a_bad_line_of_a_text_model_is_named(tmp_path, stem, text, said):
     with refusal(rf"{tmp_path}.*{said}"):

@@ -12,6 +12,7 @@ from gsbench.scene.hold_out import hold_out
 from gsbench.scene.options import SceneConfig, SplitRule
 from tests.helpers import refusal
 from tests.scene.captures import read_colmap, read_photos
+from tests.scene.tables import TABLES
 from tests.scene.test_sectors import ring
 
 NAMES = [f"{k:02d}.png" for k in range(24)]
@@ -131,20 +132,7 @@ def test_lists_of_nerfbaselines_are_found_by_their_names(make_scene):
 
 @pytest.mark.parametrize(
     "settings, message",
-    [
-        (
-            {"split": "matched"},
-            r"sweep it, as in -m scene\.split=every_nth,sector scene\.match_views=true",
-        ),
-        ({"split": "sector", "sector": 8}, "the last is 7"),
-        ({"sector": 2}, r"scene.sector=2 is not read with scene.split=every_nth: add scene.split"),
-        ({"split": "list", "sectors": 4}, "scene.sectors=4 is not read with scene.split=list"),
-        ({"split": "sector", "test_list": "a.txt"}, "both say"),
-        ({"split": "list", "match_views": True}, "cannot be matched"),
-        ({"train_list": "a.txt", "match_views": True}, "cannot be matched"),
-        ({"split": "sector", "kind": "photos"}, "needs the cameras"),
-        ({"split": "random"}, "scene.split"),
-    ],
+    TABLES["settings that contradict each other"],
 )
 def test_settings_that_contradict_each_other_are_refused(settings, message):
     with refusal(message):
@@ -158,16 +146,7 @@ def test_too_many_sectors_are_refused():
 
 @pytest.mark.parametrize(
     "kind, changes",
-    [
-        ("transforms", {"sparse": "sparse/0"}),
-        ("photos", {"sparse": "sparse/0"}),
-        ("photos", {"width": 640}),
-        ("colmap", {"views": 12}),
-        ("colmap", {"seed": 1}),
-        ("courtyard", {"images": "images_4"}),
-        ("courtyard", {"sparse": "sparse/1"}),
-        ("courtyard", {"masks": "masks"}),
-    ],
+    TABLES["settings that are not read"],
 )
 def test_a_setting_that_the_kind_of_scene_does_not_read_is_refused(kind, changes):
     path = None if kind == "courtyard" else "/a"

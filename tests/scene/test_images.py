@@ -8,6 +8,7 @@ from PIL import Image
 from gsbench.scene.images import image_size, read_image, resize_image, same_up_to_rounding
 from gsbench.scene.options import downscaled_size
 from tests.helpers import refusal
+from tests.scene.tables import TABLES
 
 from .conftest import smooth_image
 
@@ -59,15 +60,10 @@ def test_damaged_files_are_named(tmp_path, suffix):
 # the sizes of Mip-NeRF 360's own images_4 and images_2
 @pytest.mark.parametrize(
     "native, factor, expected",
-    [
-        ((4946, 3286), 4, (1237, 822)),
-        ((5187, 3361), 4, (1297, 840)),
-        ((3114, 2075), 2, (1557, 1038)),
-        ((3118, 2078), 2, (1559, 1039)),
-    ],
+    TABLES["sizes of Mip-NeRF 360"],
 )
 def test_downscaled_sizes_are_those_of_mipnerf360(native, factor, expected):
-    assert downscaled_size(*native, downscale=factor) == expected
+    assert downscaled_size(*native, downscale=factor) == tuple(expected)
     assert same_up_to_rounding(expected, native)
 
 
@@ -82,7 +78,7 @@ def test_sizes_never_grow_and_the_longest_side_is_exact():
 
 @pytest.mark.parametrize(
     "size, same",
-    [((40, 26), False), ((42, 30), True), ((43, 30), False), ((40, 31), True), ((40, 32), False)],
+    TABLES["rounded sides"],
 )
 def test_sides_may_be_rounded_by_one_pixel(size, same):
     assert same_up_to_rounding(size, (40, 30)) == same

@@ -24,6 +24,7 @@ from gsbench.scene.images import (
 from gsbench.scene.pipe import fingerprint
 from tests.helpers import refusal, write
 from tests.scene.captures import read_photos
+from tests.scene.tables import TABLES
 
 pytestmark = pytest.mark.skipif(
     not hasattr(os, "mkfifo"), reason="pipes and links of a POSIX system"
@@ -118,12 +119,7 @@ def test_images_are_listed_by_real_folders_and_outside_ones_by_their_link(photos
 
 @pytest.mark.parametrize(
     "names, said",
-    [
-        (["d.HEIC"], "1 HEIC file is not read: save as PNG or JPEG"),
-        (["d.DNG", "e.nef", "f.avif"], "2 raw files and 1 AVIF file are not read"),
-        (["d.MOV"], "1 video file is not read"),
-        (["._a.png", "Thumbs.db", "a.txt"], ""),
-    ],
+    TABLES["files that may be photographs"],
 )
 def test_files_that_may_be_photographs_are_counted_in_a_warning(photos, caplog, names, said):
     for name in names:

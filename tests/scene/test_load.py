@@ -17,7 +17,8 @@ from gsbench.scene.rules import inspect
 from gsbench.scene.types import CameraModel
 from gsbench.scene.undistortion import flatten, largest_distortion, lens_findings, undistort
 from tests.helpers import read_json, refusal
-from tests.scene.captures import read_colmap
+from tests.scene.captures import loaded, read_colmap
+from tests.scene.tables import TABLES
 
 WIDTH, HEIGHT = 200, 150
 # Parameters beyond the focal length of 150 px and the centre, where small ones do not fit.
@@ -89,7 +90,7 @@ def test_a_point_is_seen_at_the_pixel_where_pycolmap_undistorts_it(
     """With tiny coefficients, perspective models keep their pixels."""
     camera = {"size": (WIDTH, HEIGHT), "model": name, "params": lens(name, amount).params}
     capture = read_colmap("toy", make_scene(("0.png", "1.png", "2.png"), **camera))
-    scene = load_scene(capture, capture.model, Store(tmp_path / "cache"))
+    scene = loaded(capture, tmp_path)
     model = pycolmap.Reconstruction(capture.model)
     source = model.cameras[1]
     for view in (scene.train[0], scene.test[0]):
@@ -123,16 +124,7 @@ def test_distortion_below_a_twentieth_of_a_pixel_is_ignored_and_above_it_is_not(
 
 @pytest.mark.parametrize(
     "name, params, share",
-    [
-        ("SIMPLE_RADIAL", (90, 80, 60, -0.35), 0.68),
-        ("SIMPLE_RADIAL", (150, 80, 60, -0.1), 0.0),
-        ("SIMPLE_RADIAL", (90, 80, 60, 0.35), 0.0),
-        ("RADIAL", (80, 80, 60, -0.3, 0.03), 0.49),
-        ("OPENCV", (90, 90, 80, 60, -0.35, 0, 0, 0), 0.68),
-        ("OPENCV_FISHEYE", (60, 60, 80, 60, -0.05, -0.1, 0, 0), 0.35),
-        ("OPENCV_FISHEYE", (60, 60, 80, 60, -0.01, 0, 0, 0), 0.0),
-        ("FOV", (90, 90, 80, 60, 0.9), 0.0),
-    ],
+    TABLES["lenses that turn back"],
 )
 def test_lenses_that_turn_back_inside_the_picture_are_refused(
     name, params, share, caplog, in_process
@@ -193,7 +185,7 @@ def test_images_are_prepared_sixteen_at_a_time_in_their_order(tmp_path):
 def test_views_without_changes_are_read_from_the_original_files(make_scene, tmp_path):
     root = make_scene()
     capture = read_colmap("toy", root)
-    scene = load_scene(capture, capture.model, Store(tmp_path / "cache"))
+    scene = loaded(capture, tmp_path)
     assert [view.name for view in scene.test] == ["00.png"]
     assert len(scene.train) == 5
     for view in (*scene.train, *scene.test):
@@ -248,7 +240,7 @@ def test_downscaled_and_distorted_views_come_back_from_the_store(
 
 def test_images_that_were_not_selected_are_not_prepared(make_scene, tmp_path):
     capture = read_colmap("toy", make_scene(), max_images=3)
-    load_scene(capture, capture.model, Store(tmp_path / "cache"), downscale=2)
+    loaded(capture, tmp_path, downscale=2)
     (file,) = (tmp_path / "cache").rglob("cameras.json")
     assert list(read_json(file)["views"]) == ["00.png", "02.png", "04.png"]
     assert sorted(path.name for path in file.parent.glob("*.png")) == [
@@ -260,7 +252,7 @@ def test_a_file_of_another_shape_than_its_camera_is_refused(make_scene, tmp_path
     capture = read_colmap("toy", make_scene())
     Image.new("RGB", (40, 26)).save(capture.images / "01.png")
     with refusal(r"01\.png: the image is 40x26 px but its camera .* 40x30"):
-        load_scene(capture, capture.model, Store(tmp_path / "cache"))
+        loaded(capture, tmp_path)
 
 
 @pytest.mark.parametrize("name", ["cameras.json", "00000.png", "manifest.json"])
@@ -277,8 +269,8 @@ def test_stored_views_that_were_changed_are_prepared_again(name, make_scene, tmp
 
 def test_centred_moves_the_principal_point_only(make_scene, tmp_path):
     capture = read_colmap("toy", make_scene(params=[50, 51, 18, 16]))
-    used = load_scene(capture, capture.model, Store(tmp_path))
-    centred = load_scene(capture, capture.model, Store(tmp_path), principal_point="centred")
+    used = loaded(capture, tmp_path)
+    centred = loaded(capture, tmp_path, principal_point="centred")
     assert (used.train[0].camera.cx, used.train[0].camera.cy) == (18, 16)
     assert (centred.train[0].camera.cx, centred.train[0].camera.cy) == (20, 15)
     assert centred.train[0].camera.fy == 51
@@ -310,5 +302,5 @@ def test_a_truncated_photo_is_named_and_leaves_no_cache(make_scene, tmp_path):
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     capture = read_colmap("toy", root)
     with refusal(r"03\.png: the image is damaged"):
-        load_scene(capture, capture.model, Store(tmp_path / "cache"), downscale=2)
+        loaded(capture, tmp_path, downscale=2)
     assert not list((tmp_path / "cache").glob("views/[!.]*"))

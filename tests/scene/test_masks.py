@@ -8,8 +8,6 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
-from gsbench.runs.store import Store
-from gsbench.scene.load import load_scene
 from gsbench.scene.masks import (
     fill_ignored,
     find_masks,
@@ -20,7 +18,7 @@ from gsbench.scene.masks import (
 )
 from gsbench.scene.types import Capture
 from tests.helpers import refusal
-from tests.scene.captures import read_colmap, read_photos
+from tests.scene.captures import loaded, read_colmap, read_photos
 
 
 def save(path, pixels, **options):
@@ -216,7 +214,7 @@ def test_views_have_their_masks_at_the_final_size(make_scene, tmp_path):
         (2, half(20, 15)),
         (2, half(20, 15)),
     ):  # the second time from the cache
-        scene = load_scene(capture, capture.model, Store(tmp_path / "cache"), downscale)
+        scene = loaded(capture, tmp_path, downscale)
         assert_array_equal(scene.train[0].mask, mask > 0)
         assert scene.train[0].counted == 0.5
 
@@ -229,7 +227,7 @@ def test_a_mask_is_undistorted_with_its_photograph(make_scene, tmp_path):
         save(path, np.repeat(disc[..., None] * np.uint8(255), 3, axis=2))
         save(root / "masks" / f"{path.name}.png", disc * np.uint8(255))
     raw = read_colmap("toy", root, masks="masks")
-    view = load_scene(raw, raw.model, Store(tmp_path / "cache")).train[0]
+    view = loaded(raw, tmp_path).train[0]
     assert view.mask.shape != (90, 120), "undistorting changes the size"
     assert_array_equal(view.mask, view.image[..., 0] == 255)
 
@@ -241,7 +239,7 @@ def test_a_mask_without_counted_pixels_at_the_final_size_is_named(make_scene, tm
     save(root / "masks" / "04.png.png", mask)
     capture = read_colmap("toy", root, masks="masks")
     with refusal(r"04\.png\.png: no pixel is left that counts at 32x24 px"):
-        load_scene(capture, capture.model, Store(tmp_path / "cache"), downscale=10)
+        loaded(capture, tmp_path, downscale=10)
 
 
 def test_masks_change_the_fingerprint_only_if_they_are_used(make_scene):

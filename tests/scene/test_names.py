@@ -9,41 +9,12 @@ from hypothesis import strategies as st
 from gsbench.errors import InputError
 from gsbench.scene.names import match_by_order, match_pictures
 from tests.helpers import refusal
-
-PHOTOGRAPHS = ["DSC08000.JPG", "DSC08008.JPG", "DSC08016.JPG"]
+from tests.scene.tables import TABLES
 
 
 @pytest.mark.parametrize(
     "photographs, pictures, rule",
-    [
-        (PHOTOGRAPHS, ["DSC08000.JPG", "DSC08008.JPG", "DSC08016.JPG"], ""),
-        (PHOTOGRAPHS, ["DSC08000.png", "DSC08008.png", "DSC08016.png"], "apart from the extension"),
-        (["a/1.png", "b/1.png"], ["a__1.png", "b__1.png"], "with folders as part of the name"),
-        (PHOTOGRAPHS, ["dsc08000.PNG", "dsc08008.PNG", "dsc08016.PNG"], "apart from case"),
-        (
-            PHOTOGRAPHS,
-            ["render_DSC08000_rgb.png", "render_DSC08008_rgb.png", "render_DSC08016_rgb.png"],
-            "apart from what all names begin or end with",
-        ),
-        (
-            ["gt_1.png", "gt_2.png"],
-            ["pred_1.png", "pred_2.png"],
-            "apart from what all names begin or end with",
-        ),
-        (["0007.png", "0012.png"], ["7.png", "12.png"], "apart from leading zeros"),
-        (["v0007.png", "v0012.png"], ["r_07.jpg", "r_12.jpg"], "apart from leading zeros"),
-        (
-            ["cam/07.png", "cam/12.png"],
-            ["07.png", "12.png"],
-            "apart from what all names begin or end with",
-        ),
-        (["cam/x/07.png", "cam/y/12.png"], ["07.png", "12.png"], "apart from folders"),
-        (
-            ["cam/x/07.png", "cam/y/12.png"],
-            ["r7.png", "r12.png"],
-            "apart from folders and leading zeros",
-        ),
-    ],
+    TABLES["pictures matched"],
 )
 def test_names_are_matched_by_the_strictest_rule_that_fits(photographs, pictures, rule):
     found = match_pictures(photographs, random.Random(0).sample(pictures, len(pictures)))
@@ -61,27 +32,7 @@ def test_renders_of_training_views_are_left_out():
 
 @pytest.mark.parametrize(
     "photographs, pictures, words",
-    [
-        (
-            ["a.JPG", "b.JPG"],
-            ["a.png", "a.jpg", "b.png"],
-            "a.jpg, a.png all fit the photograph a.JPG",
-        ),
-        (
-            ["1.png", "2.png"],
-            ["01.png", "1.png", "002.png"],
-            "01.png, 1.png all fit the photograph 1.png",
-        ),
-        (
-            ["10.png", "11.png"],
-            ["20.png", "21.png"],
-            "2 of 2 photographs have no picture .*--by-order",
-        ),
-        (["10.png", "11.png"], ["0.png", "1.png"], "--by-order"),
-        (PHOTOGRAPHS, ["DSC08000.png", "DSC08008.png"], r"1 of 3 photographs .*\(DSC08016.JPG\)"),
-        (PHOTOGRAPHS, [], "3 of 3 photographs .*there are none"),
-        (["view7.png"], ["other.png"], "1 of 1 photograph have no picture"),
-    ],
+    TABLES["pictures refused"],
 )
 def test_missing_and_ambiguous_pictures_are_refused(photographs, pictures, words):
     with refusal(words):

@@ -17,6 +17,7 @@ from gsbench.scene.names import match, match_anywhere
 from gsbench.scene.options import SceneConfig
 from tests.helpers import refusal, write
 from tests.scene.captures import read_colmap, read_photos
+from tests.scene.tables import TABLES
 
 
 @pytest.mark.parametrize("text", [False, True])
@@ -60,26 +61,7 @@ def test_files_with_another_extension_are_used_and_missing_ones_left_out(make_sc
 
 @pytest.mark.parametrize(
     "wanted, files, matches",
-    [
-        (["b.JPG"], ["b.png"], {"b.JPG": "b.png"}),
-        (["img_1.jpg"], ["IMG_1.JPG"], {"img_1.jpg": "IMG_1.JPG"}),
-        (["cam/img_1.jpg"], ["Cam/IMG_1.PNG", "IMG_1.PNG"], {"cam/img_1.jpg": "Cam/IMG_1.PNG"}),
-        (
-            ["img.jpg", "IMG.jpg"],
-            ["IMG.jpg", "img.png"],
-            {"IMG.jpg": "IMG.jpg", "img.jpg": "img.png"},
-        ),
-        (["IMG.jpg", "img.jpg"], ["img.png"], {"img.jpg": "img.png"}),
-        (["img.jpg"], ["IMG.JPG", "IMG.png"], {"img.jpg": "IMG.JPG"}),
-        (["ä.jpg"], ["Ä.JPG"], {"ä.jpg": "Ä.JPG"}),
-        (["\u00e9.jpg"], ["e\u0301.jpg"], {"\u00e9.jpg": "e\u0301.jpg"}),  # two ways to write é
-        (["a.png", "a.JPG"], ["a.png"], {"a.png": "a.png"}),
-        (["b.png", "b.png"], ["b.jpg"], {"b.png": "b.jpg"}),
-        (["frame.001"], ["frame.001.png"], {"frame.001": "frame.001.png"}),
-        (["a.JPG"], ["a.png", "a.tif"], "a.JPG may be a.png or a.tif: keep one"),
-        (["A.JPG"], ["a.png", "a.tif"], "A.JPG may be a.png or a.tif: keep one"),
-        (["a.JPG", "a.jpeg"], ["a.png"], "a.png may be a.JPG or a.jpeg: give each"),
-    ],
+    TABLES["names"],
 )
 def test_names_match_their_files_and_ambiguous_ones_are_refused(wanted, files, matches):
     with refusal(None if isinstance(matches, dict) else matches):
@@ -88,15 +70,7 @@ def test_names_match_their_files_and_ambiguous_ones_are_refused(wanted, files, m
 
 @pytest.mark.parametrize(
     "wanted, files, matches",
-    [
-        (["images/a.png"], ["a.png"], {"images/a.png": "a.png"}),
-        (["/home/x/a.png"], ["a.JPG"], {"/home/x/a.png": "a.JPG"}),
-        ([r"C:\data\b\a.png"], ["b/a.png", "c/a.png"], {r"C:\data\b\a.png": "b/a.png"}),
-        (["a.png"], ["cam/a.png"], {"a.png": "cam/a.png"}),
-        (["x/a.png", "b.png"], ["a.png", "b.png"], {"b.png": "b.png"}),  # one name fits as it is
-        (["x/a.png"], ["b/a.png", "c/a.png"], "x/a.png may be b/a.png or c/a.png"),
-        (["x/a.png", "y/a.png"], ["a.png"], "a.png may be x/a.png or y/a.png"),
-    ],
+    TABLES["names in other folders"],
 )
 def test_names_in_other_folders_match_by_the_last_parts_of_their_paths(wanted, files, matches):
     with refusal(None if isinstance(matches, dict) else matches):
@@ -124,15 +98,7 @@ def test_a_model_whose_names_have_another_folder_gives_the_same_capture(make_sce
 @pytest.mark.parametrize("text", [False, True])
 @pytest.mark.parametrize(
     "models, chosen",
-    [
-        ({"sparse/0": 2, "sparse/1": 6}, "sparse/1"),
-        ({"sparse/0": 4, "sparse/1": 4}, "sparse/0"),
-        ({"sparse/0": 4, "sparse": 6}, "sparse"),
-        ({f"sparse/{k}": 3 + (k == 10) for k in range(11)}, "sparse/10"),
-        ({"colmap/sparse/0": 3, "colmap/sparse/2": 5}, "colmap/sparse/2"),
-        ({"sparse/3": 3}, "sparse/3"),
-        ({"sparse/0": 4, "colmap/sparse/0": 6}, "sparse/0"),
-    ],
+    TABLES["models"],
 )
 def test_the_model_with_the_most_images_is_read(make_scene, caplog, models, chosen, text):
     for sparse, count in models.items():
@@ -280,13 +246,7 @@ def test_missing_folders_images_and_models_are_named(make_scene, tmp_path):
 
 @pytest.mark.parametrize(
     "place, given, remedy",
-    [
-        ("dense/0/sparse", ".", "dense/0/sparse is one: set scene.path={}/dense/0"),
-        ("sparse/0", "images", "sparse/0 is one: set scene.path={}"),
-        ("sparse/0", "sparse", "sparse/0 is one: set scene.path={}"),
-        ("model", ".", "model is one: set scene.sparse=model"),
-        (".", ".", "is one: set scene.sparse=."),
-    ],
+    TABLES["places of models"],
 )
 def test_an_error_says_where_a_model_lies(make_scene, place, given, remedy):
     root = make_scene(sparse=place)

@@ -6,6 +6,7 @@ from PIL import Image
 from tests.helpers import refusal, write
 from tests.scene.captures import read_photos
 from tests.scene.conftest import smooth_image
+from tests.scene.tables import TABLES
 
 COUNT = 5
 
@@ -21,31 +22,7 @@ def photographs(folder, pattern="{}.jpg", scale=1, seed=0, change=lambda picture
 
 @pytest.mark.parametrize(
     "pattern, scale, named",
-    [
-        ("masks/{}.jpg.png", 1, "masks/ (5)"),
-        ("Mask/{}.png", 1, "Mask/ (5)"),
-        ("image_masks_v2/{}.png", 1, "image_masks_v2/"),
-        ("maskImages/{}.png", 1, "maskImages/"),
-        ("@eaDir/{}.jpg/SYNOPHOTO_THUMB_M.jpg", 4, "@eaDir/ (5)"),
-        ("#recycle/old/{}.jpg", 1, "#recycle/"),
-        ("__MACOSX/{}.jpg", 1, "__MACOSX/"),
-        ("depth/{}.png", 1, "depth/"),
-        ("depthMaps/cam/{}.png", 1, "depthMaps/"),
-        ("a/thumbs/{}.jpg", 4, "a/thumbs/"),
-        ("runs/store/scene/x/{}.png", 1, "runs/"),
-        ("{}_mask.png", 1, "…mask.png (5)"),
-        ("{}.jpg.mask.png", 1, "…mask.png (5)"),
-        ("{}_mask.jpg.png", 1, "…mask.png (5)"),
-        ("mask{}.png", 1, "…mask.png (5)"),
-        ("{}_mask0.png", 1, "…mask.png (5)"),
-        ("{}(Mask).png", 1, "…mask.png (5)"),
-        ("{}_depth_0001.png", 1, "…depth.png (5)"),
-        ("img_{}_depth.png", 1, "…depth.png (5)"),
-        ("{}.jpg.png", 1, "….*.png (5)"),
-        ("depth_{}.png", 1, "…depth.png"),
-        ("SYNOPHOTO_THUMB_{}.jpg", 4, "SYNO….jpg"),
-        (".thumbnails/{}.jpg", 4, ""),
-    ],
+    TABLES["other files"],
 )
 def test_other_files_beside_photographs_change_no_capture(tmp_path, caplog, pattern, scale, named):
     alone = read_photos("a", photographs(tmp_path / "alone"))
@@ -58,12 +35,7 @@ def test_other_files_beside_photographs_change_no_capture(tmp_path, caplog, patt
 
 @pytest.mark.parametrize(
     "patterns, kept",
-    [
-        ({"images_2/{}.jpg": 2, "images_4/{}.jpg": 4}, "images_2/{}.jpg"),
-        ({"images_8/{}.png": 4, "images_4/{}.jpg": 2}, "images_4/{}.jpg"),
-        ({"rgb/{}.jpg": 1, "rgb_2/{}.jpg": 2, "rgb_4/{}.jpg": 4}, "rgb/{}.jpg"),
-        ({"a/photos/{}.jpg": 1, "a/photos-4/{}.jpg": 4}, "a/photos/{}.jpg"),
-    ],
+    TABLES["folders of several sizes"],
 )
 def test_of_folders_of_several_sizes_the_largest_is_read(tmp_path, caplog, patterns, kept):
     for pattern, scale in patterns.items():
@@ -74,14 +46,7 @@ def test_of_folders_of_several_sizes_the_largest_is_read(tmp_path, caplog, patte
 
 @pytest.mark.parametrize(
     "patterns",
-    [
-        ["cam_2/{}.jpg", "cam_4/{}.jpg"],  # two cameras
-        ["unmasked/{}.jpg"],
-        ["left/{}.jpg", "right/{}.jpg"],
-        ["deep/{}.jpg", "abnormal/{}.jpg"],
-        ["normal/{}.jpg", "wide/{}.jpg"],
-        ["mask_{}.jpg"],  # photographs of a mask: nothing has the rest of the name
-    ],
+    TABLES["folders of photographs"],
 )
 def test_photographs_in_folders_of_other_names_are_all_read(tmp_path, caplog, patterns):
     for number, pattern in enumerate(patterns):
@@ -97,9 +62,9 @@ def test_files_of_the_photographs_names_in_folders_beside_them_are_columns(tmp_p
             write(tmp_path / place / f"{k}.{ending}", b"any")
     capture = read_photos("a", tmp_path)
     names = [f"cam/{k}.jpg" for k in range(3)]
-    assert capture.depths == {name: tmp_path / f"depth/{name[:-3]}npy" for name in names}
-    assert capture.more == {
-        name: {"normals": tmp_path / f"normals/{name[:-3]}png"} for name in names
+    assert capture.beside == {
+        "depth": {name: tmp_path / f"depth/{name[:-3]}npy" for name in names},
+        "normals": {name: tmp_path / f"normals/{name[:-3]}png" for name in names},
     }
     alone = read_photos("a", photographs(tmp_path / "alone", "images/cam/{}.jpg"))
     assert alone.fingerprint == capture.fingerprint

@@ -14,10 +14,11 @@ from gsbench.pipeline.steps.scene import CaptureSource, masked_capture, masking_
 from gsbench.scene import transforms
 from gsbench.scene.colmap import read_model, read_reference
 from gsbench.scene.options import SceneConfig
-from gsbench.scene.transforms import HARMLESS, REFUSED, read_transforms
+from gsbench.scene.transforms import KEYS, read_transforms
 from tests.helpers import change_json, read_json, refusal
 from tests.scene.cameras import cameras_of
 from tests.scene.captures import read_with_step
+from tests.scene.tables import TABLES
 
 SHARED = {"w": 40, "h": 30, "fl_x": 50.0, "fl_y": 51.0, "cx": 19.5, "cy": 15.5}
 
@@ -126,18 +127,7 @@ IDENTITY = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
 
 @pytest.mark.parametrize(
     "change, said",
-    [
-        ({"ply_file_path": "b.ply"}, "names other points than another file"),
-        (
-            {"applied_transform": [[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0]]},
-            "the same points with another",
-        ),
-        (
-            {"applied_transform": [[1, 0, 0, 0], [0, 1, 0, 0.5], [0, 0, 1, 0]]},
-            "the same points with another",
-        ),
-        ({"applied_scale": 2.0}, r"same points with another .* applied_scale"),
-    ],
+    TABLES["files with other points"],
 )
 def test_two_files_must_name_the_same_points_under_one_transform(tmp_path, change, said):
     folder = in_blenders_files(write(tmp_path / "in", ply_file_path="a.ply"))
@@ -151,9 +141,6 @@ def test_two_files_must_name_the_same_points_under_one_transform(tmp_path, chang
     change_json(test, **change)
     with refusal(said):
         read_transforms(folder)
-
-
-DISTORTED = {"k1": 0.1, "k2": -0.02, "p1": 0.001, "p2": 0.002}
 
 
 def in_blenders_files(folder):
@@ -170,16 +157,7 @@ def in_blenders_files(folder):
 
 @pytest.mark.parametrize(
     "said, model, params",
-    [
-        ({}, "PINHOLE", []),
-        (DISTORTED, "OPENCV", list(DISTORTED.values())),
-        (
-            {"camera_model": "OPENCV_FISHEYE", "k1": 0.1, "k2": 0.2, "k3": 0.3, "k4": 0.4},
-            "OPENCV_FISHEYE",
-            [0.1, 0.2, 0.3, 0.4],
-        ),
-        ({"is_fisheye": True}, "OPENCV_FISHEYE", [0] * 4),
-    ],
+    TABLES["intrinsics"],
 )
 def test_intrinsics_are_read_from_the_file_or_from_each_frame(tmp_path, said, model, params):
     def move_to_frames(document):
@@ -249,7 +227,7 @@ def test_masks_and_depth_maps_that_frames_name_are_columns_of_the_record(tmp_pat
         Image.new("L", (40, 30), 255).save(folder / "masks" / "images" / f"{k}.png.png")
     found = capture_of(folder, tmp_path / "a")
     assert found.masks == {"images/1.png": folder / "masks/1.png"}
-    assert found.depths == {"images/1.png": folder / "d/1.npy"}
+    assert found.beside == {"depth": {"images/1.png": folder / "d/1.npy"}}
     found = capture_of(folder, tmp_path / "b", masks="masks")
     assert found.masks["images/2.png"] == folder / "masks/images/2.png.png"
 
@@ -264,49 +242,8 @@ def test_the_file_is_read_once_and_changes_the_fingerprint(tmp_path, monkeypatch
     assert capture_of(folder, tmp_path / "b").fingerprint != capture.fingerprint
 
 
-MIRRORED = [[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 1, 0]]
-NO_FOCAL = "no focal length"
-HIGHER = "must be 0 with OPENCV; .* only OPENCV_FISHEYE has k4, and FULL_OPENCV has k4, k5"
-OUTSIDE, ODD_SIZE = "lies outside the folder", "w and h must be whole numbers"
-LISTED = {"train_filenames": ["images/1.png"]}
-WRONG_KEYS = [
-    ({"applied_transform": MIRRORED}, "applied_transform .*mirrors"),
-    ({"applied_transform": [*IDENTITY, [1, 0, 0, 1]]}, "applied_transform must end"),
-    ({"applied_scale": 0}, "applied_scale must be positive"),
-    ({"camera_model": "EQUIRECTANGULAR"}, "camera_model EQUIRECTANGULAR is not known here"),
-    *(({key: 0.1}, HIGHER) for key in ("k4", "k5", "k6")),
-    ({"is_fisheye": True, "p1": 0.1}, "p1 must be 0 with OPENCV_FISHEYE"),
-    ({"fl_x": None, "fl_y": None}, NO_FOCAL),
-    ({"fl_y": None, "y_fov": 180}, NO_FOCAL),
-    ({"fl_y": 0}, NO_FOCAL),
-    *(({"fl_x": None, "camera_angle_x": angle}, NO_FOCAL) for angle in (4.0, 0)),
-    ({"fl_x": 0}, NO_FOCAL),
-    ({"h": 0}, ODD_SIZE),
-    ({"w": 40.5}, ODD_SIZE),
-    ({"fl_x": "50"}, "fl_x is '50'"),
-    (LISTED | {"test_filenames": ["images/9.png"]}, "held-out filenames"),
-    (LISTED | {"val_filenames": ["images/1.png"]}, "trained and tested on"),
-    ({"ply_file_path": "/etc/passwd"}, OUTSIDE),
-    ({"ply_file_path": "p.ply"}, "names p.ply, which is not there"),
-]
-REFUSED_ROWS = [(key, f"{key}: {reason}") for key, reason in REFUSED.items()]
+REFUSED_ROWS = [(key, f"{key}: {reason}") for key, reason in KEYS["refused"].items()]
 SIZE = {"w": 20, "h": 15}
-MATRIX, ROW = r"frames\.1\.transform_matrix is ", r"frames\.1\.transform_matrix\.0 is "
-WRONG_FRAMES = [
-    ({"transform_matrix": [[1, 0, 0, 0]]}, MATRIX),
-    ({"transform_matrix": [*IDENTITY, [0] * 4, [0] * 4]}, MATRIX),
-    ({"transform_matrix": [[1, 0, 0], *np.eye(4)[1:].tolist()]}, ROW),
-    ({"transform_matrix": [[1, 0, 0, 0, 0], *np.eye(4)[1:].tolist()]}, ROW),
-    ({"transform_matrix": [[2, 0, 0, 0], *np.eye(4)[1:].tolist()]}, "scales, shears or mirrors"),
-    ({"transform_matrix": np.diag([1.0, 1, 0, 1]).tolist()}, "scales, shears or mirrors"),
-    ({"transform_matrix": [*IDENTITY, [0, 0, 3, 1]]}, "./images/1.png must end with the row 0, 0"),
-    ({"rolling_shutter": [0, 0, 0.1, 0]}, r"rolling_shutter \(frame 1\): "),
-    ({"file_path": "../secret.png"}, OUTSIDE),
-    ({"file_path": "/etc/passwd"}, OUTSIDE),
-    ({"file_path": "images/0.png"}, r"images/0\.png is there twice"),
-    (SIZE, "whose fl_x, fl_y, cx, cy are px of the file's size"),
-    (SIZE | {"fl_x": 25, "fl_y": 25}, "whose cx, cy are px"),
-]
 
 
 @pytest.mark.parametrize(
@@ -314,9 +251,9 @@ WRONG_FRAMES = [
     [
         (lambda d: d.pop("frames"), "lacks 'frames'"),
         (lambda d: d["frames"][1].pop("transform_matrix"), "lacks 'frames.1.transform_matrix'"),
-        *((lambda d, keys=keys: d.update(keys), said) for keys, said in WRONG_KEYS),
+        *((lambda d, keys=keys: d.update(keys), said) for keys, said in TABLES["wrong keys"]),
         *((lambda d, key=key: d.update({key: [0.0, 0.5]}), said) for key, said in REFUSED_ROWS),
-        *((in_frame(1, **keys), said) for keys, said in WRONG_FRAMES),
+        *((in_frame(1, **keys), said) for keys, said in TABLES["wrong frames"]),
     ],
 )
 def test_a_file_that_cannot_be_understood_is_named_in_one_line(tmp_path, change, said):
@@ -468,11 +405,11 @@ def test_higher_coefficients_distort_as_in_opencv(tmp_path, said):
         assert_allclose(seen, wanted, atol=1e-9)
 
 
-@pytest.mark.parametrize("key", sorted(HARMLESS | set(REFUSED)))
+@pytest.mark.parametrize("key", sorted([*KEYS["harmless"], *KEYS["refused"]]))
 def test_known_keys_without_effect_are_ignored_without_a_warning(tmp_path, key, caplog):
     wanted = cameras(tmp_path / "in")
     values = (None,) if key.startswith("transform_matrix") else (None, 0, False, [0.0, 0.0])
-    for value in (*values, *([1.5, "text", [1.0]] if key in HARMLESS else [])):
+    for value in (*values, *([1.5, "text", [1.0]] if key in KEYS["harmless"] else [])):
         assert cameras(tmp_path / "in", **{key: value}) == wanted
     assert not caplog.text
 
@@ -493,12 +430,7 @@ def test_unknown_keys_are_named_in_one_line(tmp_path, caplog):
 
 @pytest.mark.parametrize(
     "lists, train, test",
-    [
-        ({"train": [0, 1, 2], "val": [3], "test": [4, 5]}, (0, 1, 2), (4, 5)),
-        ({"train": [0, 1, 2], "val": [3]}, (0, 1, 2), (3,)),
-        ({"train": [0, 1, 2], "val": [3], "test": []}, (0, 1, 2), (3,)),
-        ({"test": [4]}, (0, 1, 2, 3, 5), (4,)),
-    ],
+    TABLES["lists of nerfstudio"],
 )
 def test_nerfstudios_lists_of_filenames_are_the_split(tmp_path, lists, train, test, caplog):
     def names(numbers):

@@ -11,8 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from gsbench.runs.trial_record import TwinViews
 from gsbench.scene.twins import copies_by_name, without_copies
-from gsbench.scene.types import Scene, Twins, View
+from gsbench.scene.types import Scene, View
 from tests.helpers import refusal
 from tests.scene.captures import read_colmap, read_photos
 from tests.scene.conftest import smooth_image
@@ -129,7 +130,7 @@ def test_a_split_whose_training_views_are_all_copies_is_refused():
 def test_flat_pictures_are_twins_only_if_they_are_equal(caplog):
     grey = np.full((128, 160, 3), 100, dtype=np.uint8)
     with caplog.at_level(logging.WARNING):
-        assert without_copies(scene_of(grey, grey + 1)).twins == Twins()
+        assert without_copies(scene_of(grey, grey + 1)).twins == TwinViews()
         assert without_copies(scene_of(grey, grey)).twins.left_out == {"twin.png": "0.png"}
 
 

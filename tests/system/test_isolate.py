@@ -148,7 +148,8 @@ def test_only_the_end_of_a_long_output_is_read(tmp_path, monkeypatch):
     [
         (-9, "crashed (SIGKILL, perhaps out of memory)"),
         (-11, "crashed (SIGSEGV)"),
-        (-99, "crashed (signal 99)"),
+        (139, "crashed (SIGSEGV)"),
+        (255, "ended early (exit code 255)"),
         (0, "ended early (exit code 0)"),
         (7, "ended early (exit code 7)"),
     ],
@@ -164,11 +165,11 @@ def test_progress_and_output_of_a_function_are_forwarded_to_the_end(functions, t
         told.append((*given, *named.values()))
         raise BrokenPipeError  # a closed terminal stops nothing
 
-    assert isolate.run_with_progress(functions.work, 2, report, "work", log) == 3
+    assert isolate.run_isolated(functions.work, 2, what="work", log=log, progress=report) == 3
     assert told == [("a", 2, 5, ""), ("b", 1, None, "note")]
     assert log.read_text() == "printed\n"
     with pytest.raises(ValueError, match="three"):
-        isolate.run_with_progress(functions.work, 3, report, "work")
+        isolate.run_isolated(functions.work, 3, what="work", progress=report)
     assert told[2:] == [("a", 3, 5, "")]
 
 

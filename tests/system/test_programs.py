@@ -18,7 +18,7 @@ SOURCES = {file.relative_to(SRC).as_posix(): file.read_text("utf-8") for file in
 # "own": an empty folder; "neutral": gsbench's; "current": the current folder, since the user's
 # relative paths count from there. A Python starts with -P, and imports nothing from there.
 STARTS = {
-    ("external/program.py", "watch", "subprocess.Popen"): "own",
+    ("external/exchange.py", "watch", "subprocess.Popen"): "own",
     ("launch/slurm.py", "make_executor", "submitit.SlurmExecutor"): "current",
     ("launch/jobs.py", "run_local", "submitit.LocalExecutor"): "current",
     ("pipeline/steps/external.py", "check_version", "subprocess.run"): "own",
@@ -26,7 +26,7 @@ STARTS = {
     ("system/isolate.py", "_run_child", "subprocess.Popen"): "current",
     ("system/isolate.py", "continue_in_child", "os.fork"): "current",
     ("system/programs.py", "answer_of", "subprocess.run"): "neutral",
-    ("tracking/beside.py", "_sync", "subprocess.Popen"): "current",
+    ("tracking/beside.py", "_started", "subprocess.Popen"): "current",
     ("verbs/servers.py", "serve", "subprocess.Popen"): "own",
     ("view/page.py", "write_page", "subprocess.run"): "own",
 }

@@ -1,5 +1,6 @@
-"""`gsbench sync` beside a sweep: what it is asked for, and what a bad tracker costs."""
+"""`gsbench sync` beside a sweep: what it is told, what it sends, and what a bad tracker costs."""
 
+import json
 import logging
 import subprocess
 import sys
@@ -10,7 +11,8 @@ import pytest
 
 from gsbench.system.locks import hold
 from gsbench.tracking import Mirror, beside, connect
-from gsbench.tracking.beside import permissions
+from gsbench.tracking.beside import SOON, permissions, send_beside
+from gsbench.tracking.sync import MirrorError
 from tests.tracking.helpers import (
     STATE,
     begun_trial,
@@ -28,31 +30,42 @@ class Process:
     """Stands in for the process of ``gsbench sync``, which takes some seconds and may fail."""
 
     made: list["Process"]
-    takes, code, said = 0.0, 0, ""
+    takes, code, said = 0.0, 0, b""
 
     def __init__(self, command, **how):
         self.command, self.how, self.killed = command, how, False
+        self.told, self.stdin, self.returncode = [], self, None
         self.made.append(self)
-        self.returncode = None
+        how["stderr"].write(self.said)
 
-    def communicate(self):
-        end = time.monotonic() + self.takes
-        while time.monotonic() < end and not self.killed:
-            time.sleep(0.01)
+    def fileno(self):
+        return sys.stderr.fileno()
+
+    def write(self, line):
+        self.told.append(line.decode())
+        return len(line)
+
+    def poll(self):
+        return self.returncode
+
+    def wait(self, patience=0.0):
+        if self.takes > patience and not self.killed:
+            time.sleep(patience)
+            raise subprocess.TimeoutExpired("sync", patience)
         self.returncode = self.code
-        return "", self.said
+
+    def close(self):
+        self.told.append("")
 
     def kill(self):
         self.killed = True
-
-    def trials(self):
-        return [self.command[k + 1] for k, one in enumerate(self.command) if one == "--trial"]
 
 
 @pytest.fixture
 def processes(monkeypatch):
     monkeypatch.setattr(Process, "made", [], raising=False)
     monkeypatch.setattr(beside.subprocess, "Popen", Process)
+    monkeypatch.setattr(beside.os, "set_blocking", lambda descriptor, blocks: None)
     return Process.made
 
 
@@ -60,37 +73,55 @@ def configured(values, uri=None, patience=30.0, **more):
     return values | {"tracking": options(uri, patience) | more}
 
 
-def test_each_trial_is_sent_until_it_has_ended(processes, tmp_path):
+def followed(mirror, runs, seed=0, **more):
+    """Let the mirror follow a new trial."""
+    folder, values = begun_trial(runs, seed)
+    mirror.follow(folder, configured(values, **more))
+
+
+def seeds_in(lines):
+    """The seeds of the trials that lines name, and the other lines as they are."""
+    return [json.loads(line)["folder"][-1] if len(line) > 1 else line for line in lines]
+
+
+def warnings_in(caplog):
+    return [one.getMessage() for one in caplog.records if one.levelno == logging.WARNING]
+
+
+def test_one_process_is_told_which_trials_begin_and_that_one_ended(processes, tmp_path):
     with Mirror() as mirror:
         for seed in (0, 1):
-            folder, values = begun_trial(tmp_path, seed)
-            mirror.follow(folder, configured(values, flush_seconds=60.0))
-            if seed == 0:
-                write_trial(folder, values)
+            followed(mirror, tmp_path, seed, patience=2.5)
             mirror.trial_ended()
-            while len(processes) <= seed or processes[-1].returncode is None:
-                time.sleep(0.01)
-    sent = [[name[-1] for name in process.trials()] for process in processes]
-    assert sent == [["0"], ["1"], ["1"]]
-    assert processes[0].how["env"]["GSBENCH_RUNS"] == str(tmp_path)
-    assert processes[0].command[1:6] == ["-P", "-m", "gsbench", "sync", "tracked"]
+    (process,) = processes
+    assert seeds_in(process.told) == [SOON, "0", SOON, SOON, "1", SOON, ""][1:]
+    assert process.how["env"]["GSBENCH_RUNS"] == str(tmp_path)
+    assert process.command[1:] == ["-P", "-m", "gsbench", "sync", "--beside=2.5"]
 
 
-def test_a_process_runs_every_while_although_no_trial_ends(processes, tmp_path):
-    folder, values = begun_trial(tmp_path)
+def test_a_process_that_crashed_is_replaced_and_told_all(processes, tmp_path, caplog):
     with Mirror() as mirror:
-        mirror.follow(folder, configured(values, flush_seconds=0.05))
-        while len(processes) < 3:
-            time.sleep(0.01)
+        followed(mirror, tmp_path, 0)
+        processes[0].returncode = -9
+        followed(mirror, tmp_path, 1)
+    assert seeds_in(processes[1].told) == ["0", "1", SOON, ""]
+    assert warnings_in(caplog) == []
+
+
+def test_a_process_that_reads_nothing_holds_up_no_trial(processes, tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(Process, "write", lambda self, line: None)  # the pipe is full
+    with Mirror() as mirror:
+        followed(mirror, tmp_path)
+    assert warnings_in(caplog)[0].startswith("tracking: the tracker is slow")
 
 
 @pytest.mark.parametrize(
     "settings, idle", [({"enabled": False}, False), ({}, True)], ids=["tracking=none", "idle"]
 )
 def test_nothing_is_started_where_nothing_is_to_be_sent(processes, tmp_path, settings, idle):
-    folder, values = begun_trial(tmp_path)
     with Mirror(idle) as mirror:
-        mirror.follow(folder, configured(values, **settings))
+        followed(mirror, tmp_path, **settings)
+        mirror.trial_ended()
     assert processes == []
 
 
@@ -100,11 +131,10 @@ def test_a_slow_tracker_gets_its_patience_and_less_if_the_sweep_is_stopped(
 ):
     monkeypatch.setattr(Process, "takes", 60.0)
     monkeypatch.setattr(beside, "SECONDS_TO_STOP", 0.1)
-    folder, values = begun_trial(tmp_path)
 
     def sweep():
         with Mirror() as mirror:
-            mirror.follow(folder, configured(values, patience=0.3))
+            followed(mirror, tmp_path, patience=0.3)
             if error is not None:
                 raise error
 
@@ -116,24 +146,21 @@ def test_a_slow_tracker_gets_its_patience_and_less_if_the_sweep_is_stopped(
             sweep()
     assert least <= time.monotonic() - started < most
     assert all(process.killed for process in processes)
-    (line,) = [one.getMessage() for one in caplog.records if one.levelno == logging.WARNING]
+    (line,) = warnings_in(caplog)
     assert line.startswith("tracking: the tracker is slow; the files are complete, `gsbench sync`")
 
 
 @pytest.mark.parametrize(
-    "code, said, words", [(1, "more\ngsbench: down\n", "down"), (-9, "", "it crashed (SIGKILL")]
+    "code, said, words", [(1, b"more\ngsbench: down\n", "down"), (-9, b"", "it crashed (SIGKILL")]
 )
 def test_a_failure_is_reported_once_in_one_line(
     processes, tmp_path, monkeypatch, caplog, code, said, words
 ):
     monkeypatch.setattr(Process, "code", code)
     monkeypatch.setattr(Process, "said", said)
-    folder, values = begun_trial(tmp_path)
     with Mirror() as mirror:
-        mirror.follow(folder, configured(values, flush_seconds=0.02))
-        time.sleep(0.2)
-    assert len(processes) > 1
-    (line,) = [one.getMessage() for one in caplog.records if one.levelno == logging.WARNING]
+        followed(mirror, tmp_path)
+    (line,) = warnings_in(caplog)
     assert line.startswith("tracking: ")
     assert words in line
 
@@ -143,9 +170,8 @@ def test_a_process_that_cannot_start_harms_nothing(tmp_path, caplog, monkeypatch
         raise OSError("no more processes")
 
     monkeypatch.setattr(beside.subprocess, "Popen", fail)
-    folder, values = begun_trial(tmp_path)
     with Mirror() as mirror:
-        mirror.follow(folder, configured(values))
+        followed(mirror, tmp_path)
     assert "tracking: no more processes; the files are complete" in caplog.text
 
 
@@ -154,6 +180,92 @@ def test_the_process_gets_what_the_command_was_allowed_and_no_more(tmp_path):
     assert permissions(configured(values)) == []
     given = configured(values, "http://a:1") | {"allow_targets": ["mine", "http://a:1"]}
     assert permissions(given) == ["mine", "http://a:1"]
+
+
+# ---- what the process sends
+
+
+@pytest.fixture
+def sent(monkeypatch):
+    """The seeds of the trials of each send."""
+    found = []
+
+    def send(folders, uri, allowed):
+        found.append([one.path.name[-1] for one in folders])
+        return []
+
+    monkeypatch.setattr(beside, "sync", send)
+    monkeypatch.setattr(beside, "SECONDS_BETWEEN_SENDS", 0.01)
+    return found
+
+
+def told(folder, pause=60.0, since=None):
+    now = time.time() if since is None else since
+    return json.dumps({"folder": str(folder), "since": now, "pause": pause, "allowed": []}) + "\n"
+
+
+FOR_EVER = 1e6
+
+
+def test_each_trial_is_sent_until_it_has_ended(sent, tmp_path):
+    def lines():
+        for seed in (0, 1):
+            folder, values = begun_trial(tmp_path, seed)
+            yield told(folder)
+            if seed == 0:
+                write_trial(folder, values)
+            count = len(sent)
+            yield SOON
+            while len(sent) <= count:
+                time.sleep(0.01)
+
+    send_beside(lines(), FOR_EVER)
+    assert [one for one in sent if one] == [["0"], ["1"], ["1"]]
+
+
+def test_trials_are_sent_every_while_although_none_ends(sent, tmp_path):
+    def lines():
+        yield told(begun_trial(tmp_path)[0], pause=0.02)
+        while sent.count(["0"]) < 3:
+            time.sleep(0.01)
+
+    send_beside(lines(), FOR_EVER)
+
+
+def test_results_of_an_earlier_run_do_not_end_the_sending_of_a_trial(sent, tmp_path):
+    folder, values = begun_trial(tmp_path)
+    write_trial(folder, values)
+
+    def lines():
+        yield told(folder, since=time.time() + 60)
+        yield SOON
+        while not sent:
+            time.sleep(0.01)
+
+    send_beside(lines(), FOR_EVER)
+    assert len(sent) > 1
+    assert sent[-1] == ["0"]
+
+
+def test_the_error_of_the_last_send_is_raised_and_those_before_are_not(monkeypatch, tmp_path):
+    answers = []
+
+    def refuse(*given):
+        answers.append(given)
+        raise MirrorError(f"no {len(answers)}")
+
+    monkeypatch.setattr(beside, "sync", refuse)
+    monkeypatch.setattr(beside, "SECONDS_BETWEEN_SENDS", 0.01)
+    folder, _ = begun_trial(tmp_path)
+
+    def lines():
+        yield told(folder, pause=0.02)
+        while len(answers) < 2:
+            time.sleep(0.01)
+
+    with pytest.raises(MirrorError) as error:
+        send_beside(lines(), FOR_EVER)
+    assert str(error.value) == f"no {len(answers)}"
 
 
 # ---- with MLflow
@@ -183,7 +295,7 @@ def test_a_broken_tracker_harms_no_trial(uri, tmp_path, caplog):
     folder, values = begun_trial(tmp_path, uri=address)
     with following(options(address), folder):
         write_trial(folder, values)
-    (line,) = [one.getMessage() for one in caplog.records if one.levelno == logging.WARNING]
+    (line,) = warnings_in(caplog)
     assert line.startswith("tracking: ")
     assert "gsbench sync" in line
     assert "\n" not in line
@@ -203,17 +315,18 @@ def test_no_process_is_left_by_a_tracker_that_never_answers(tmp_path, caplog):
 
 
 @pytest.mark.slow
-def test_a_process_whose_sweep_was_killed_ends_soon(tmp_path):
-    """Its tracker may hang for ever."""
-    code = "import time; from gsbench.tracking import beside; beside.SECONDS_AFTER_PARENT = 0.5; "
-    code += "beside.end_with(int(__import__('sys').argv[1])); time.sleep(600)"
-    parent = subprocess.Popen(["sleep", "600"])
-    child = subprocess.Popen([sys.executable, "-c", code, str(parent.pid)], env=child_environment())
-    with pytest.raises(subprocess.TimeoutExpired):
-        child.wait(10)
-    parent.kill()
-    parent.wait()
-    assert child.wait(120) == 1
+def test_a_process_whose_sweep_was_killed_ends_soon_though_its_tracker_hangs(tmp_path):
+    folder, _ = begun_trial(tmp_path)
+    code = "import sys, time; from gsbench.tracking import beside; "
+    code += "beside.sync = lambda *given: time.sleep(600); beside.send_beside(sys.stdin, 0.5)"
+    words = [sys.executable, "-c", code]
+    with subprocess.Popen(words, env=child_environment(), stdin=subprocess.PIPE) as child:
+        child.stdin.write(told(folder, pause=0.1).encode())
+        child.stdin.flush()
+        with pytest.raises(subprocess.TimeoutExpired):
+            child.wait(10)
+        child.stdin.close()
+        assert child.wait(120) == 1
 
 
 @pytest.mark.slow

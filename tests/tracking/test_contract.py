@@ -64,6 +64,7 @@ class Shown:
             wandb = ModuleType("wandb")
             wandb.__spec__ = SimpleNamespace()
             wandb.Settings, wandb.Image = dict, lambda pixels: pixels
+            wandb.run = None
             wandb.init = lambda **how: self.fakes.setdefault(how["id"], FakeRun(how["name"]))
             monkeypatch.setitem(sys.modules, "wandb", wandb)
         if kind == "own":

@@ -1,4 +1,4 @@
-"""What users of MLflow expect of a run: its address, user, reason of a failure, and files."""
+"""What users of MLflow expect of a run, also where many processes write to one tracker."""
 
 import getpass
 import shutil
@@ -15,12 +15,16 @@ from tests.tracking.helpers import (
     child_environment,
     ended_trial,
     following,
+    found_runs,
+    history,
+    mirror_command,
     mirror_trial,
     options,
     run_of,
+    trial_runs,
     write_trial,
 )
-from tests.trials import trial_values
+from tests.trials import STEPS, trial_values
 
 pytestmark = pytest.mark.slow
 
@@ -76,3 +80,53 @@ def test_a_moved_runs_folder_is_mirrored_again_from_its_files(runs, tmp_path):
     )
     assert f"mirrored {TrialFolder(folder).label}" in done.stdout.splitlines(), done.stderr
     assert list((moved / "mlartifacts/tracked").rglob("results.json"))
+
+
+JOBS = 8
+
+
+def run_jobs(runs, uri):
+    """Run eight trials at once, each in its own process, all new to the tracker."""
+    commands = [mirror_command(runs, uri, seed) for seed in range(JOBS)]
+    jobs = [
+        subprocess.Popen(
+            command,
+            env=child_environment(),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        for command in commands
+    ]
+    outputs = [job.communicate(timeout=240)[0] for job in jobs]
+    assert [job.returncode for job in jobs] == [0] * JOBS, outputs
+    # A loaded machine may be too slow to send the last values of some; sync sends them.
+    for seed in range(JOBS):
+        values = trial_values(runs, seed)
+        mirror_trial(options(uri), TrialFolder.of(values).path, values)
+
+
+def check_jobs(client):
+    found = trial_runs(client)
+    assert sorted(run.data.tags["seed"] for run in found) == [str(seed) for seed in range(JOBS)]
+    for run in found:
+        seed = int(run.data.tags["seed"])
+        assert run.info.status == "FINISHED"
+        assert history(client, run.info.run_id, "train/loss") == [
+            (i, 1 / i) for i in range(1, STEPS + 1)
+        ]
+        assert {value for _, value in history(client, run.info.run_id, "train/l1")} == {float(seed)}
+        assert run.data.metrics["eval/gaussians"] == 10 + seed
+    # and one parent run of their idea
+    assert len(found_runs(client, "tracked")) == JOBS + 1
+    assert found_runs(client, "Default") == []
+
+
+def test_eight_jobs_at_once_on_a_new_sqlite_database(tmp_path):
+    run_jobs(tmp_path, None)
+    check_jobs(connect(None, tmp_path))
+
+
+def test_eight_jobs_at_once_on_a_new_postgresql_database(tmp_path, postgresql):
+    run_jobs(tmp_path, postgresql)
+    check_jobs(connect(postgresql, tmp_path))

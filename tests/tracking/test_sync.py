@@ -61,8 +61,11 @@ def test_a_tracker_that_fails_frees_the_trial(told, tmp_path, monkeypatch):
             mirror(TrialFolder.of(values), options(), values)
     error = refusal(TrialFolder.of(values), options(), ValueError("x" * 201 + "\nmore"))
     label = TrialFolder.of(values).label
-    assert str(error) == f"{label} could not be sent to MLflow (ValueError: {'x' * 200})"
-    assert str(refusal(TrialFolder.of(values), options(), KeyError())).endswith("(KeyError: )")
+    assert str(error) == f"{label} could not be sent to MLflow (ValueError: {'x' * 201} more)"
+    # what is cut is marked
+    long = refusal(TrialFolder.of(values), options(), ValueError("x" * 400))
+    assert str(long).endswith("x…)")
+    assert str(refusal(TrialFolder.of(values), options(), KeyError())).endswith("(KeyError:)")
 
 
 def test_sync_sends_ended_trials_and_counts_them(told, tmp_path, monkeypatch):

@@ -52,6 +52,11 @@ def case(request):
     return Case(24, 18, 5 if request.param == "few" else 40, sh_degree=0)
 
 
+def z_of(gaussians, camera):
+    axis = gaussians.means.new_tensor(camera.rotation[2])
+    return gaussians.means @ axis + float(camera.translation[2])
+
+
 def test_depth_of_the_cpu_is_that_of_the_reference_in_float64(case):
     exact, _ = render_depth(ReferenceRasterizer(), case.gaussians(), case.camera())
     ours, _ = render_depth(
@@ -69,10 +74,8 @@ def test_depth_is_the_sum_of_weights_times_z_over_alpha():
     gaussians = case.gaussians()
     depth, render = render_depth(ReferenceRasterizer(), gaussians, case.camera())
     camera = case.camera()
-    z = gaussians.means[0] @ gaussians.means.new_tensor(camera.rotation[2])
-    z = z + float(camera.translation[2])
     seen = render.alpha > 0
-    assert torch.allclose(depth[seen], z.expand(int(seen.sum())))
+    assert torch.allclose(depth[seen], z_of(gaussians, camera).expand(int(seen.sum())))
     assert not depth[~seen].any()
 
 
@@ -100,8 +103,7 @@ def test_median_depth_is_that_of_the_gaussian_at_half_transmittance(case):
     """Against blending pixel by pixel, Gaussian by Gaussian."""
     gaussians, camera = case.gaussians(), case.camera()
     rasterizer, black = ReferenceRasterizer(), torch.zeros(3, dtype=torch.float64)
-    z = gaussians.means @ gaussians.means.new_tensor(camera.rotation[2])
-    z = z + float(camera.translation[2])
+    z = z_of(gaussians, camera)
     expected = torch.zeros(18, 24, dtype=torch.float64)
     with torch.no_grad():
         for member in z.argsort(descending=True).tolist():
@@ -132,8 +134,7 @@ def test_only_the_chosen_gaussians_have_a_gradient_of_the_median_depth():
     gaussians.means.requires_grad_(True)
     depth = median_depth(ReferenceRasterizer(), gaussians, camera)
     depth.sum().backward()
-    axis = gaussians.means.new_tensor(camera.rotation[2])
-    z = (gaussians.means @ axis + float(camera.translation[2])).detach()
+    axis, z = gaussians.means.new_tensor(camera.rotation[2]), z_of(gaussians, camera).detach()
     counts = (depth.detach()[..., None] == z).sum((0, 1))  # [N] pixels of each Gaussian
     assert torch.allclose(gaussians.means.grad, counts[:, None] * axis)
     assert 0 < int((counts > 0).sum()) < len(z) + 1

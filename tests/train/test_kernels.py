@@ -2,24 +2,23 @@
 
 import subprocess
 import sys
+from contextlib import suppress
+from threading import Event
+from time import sleep
 from types import SimpleNamespace
 
 import numba
 import pytest
-import torch
 
 from gsbench.densify import NoDensifier
-from gsbench.gaussians.trainable import ParameterState, Update
-from gsbench.raster.cpu import CpuRasterizer, executor
+from gsbench.raster.cpu import executor
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.system.resources import CLOCK, CompileClock
-from gsbench.train import adam_cpu, loss_cpu, trainer
-from gsbench.train.kernels import compiled_beside, kernels_of
-from gsbench.train.loss import PhotometricLoss
-from tests.raster.strategies import Case
+from gsbench.train import adam_cpu, kernels, loss_cpu, trainer
+from gsbench.train.kernels import compiled_beside, tiny_step
 
 
-def test_the_signatures_are_those_of_a_training_step(monkeypatch):
+def test_the_tiny_step_calls_the_kernels_of_a_training_with_the_same_types(lab, monkeypatch):
     called = {}
 
     def noting(name, kernel):
@@ -29,35 +28,35 @@ def test_the_signatures_are_those_of_a_training_step(monkeypatch):
 
         return call
 
-    listed = {}
-    for kernel, signature in kernels_of(CpuRasterizer(1)):
-        name = kernel.py_func.__name__
-        listed[name] = signature
-        for module in (executor, loss_cpu, adam_cpu):
-            if hasattr(module, name):
-                monkeypatch.setattr(module, name, noting(name, kernel))
-    case = Case(33, 17, 30, sh_degree=1)
-    gaussians = case.gaussians().map(lambda tensor: tensor.float().requires_grad_(True))
-    image = CpuRasterizer(1).render(gaussians, case.camera(), 1, torch.zeros(3)).image
-    loss, _, _ = PhotometricLoss(threads=1)(image, torch.zeros(17, 33, 3, dtype=torch.uint8))
-    loss.backward()
-    state = ParameterState(0.1, 1, {key: torch.zeros(30, 3) for key in ("first", "second")})
-    adam_cpu.CpuAdam(1)([Update(gaussians.means, gaussians.means.grad, state)])
-    assert called == listed
+    for module in (executor, loss_cpu, adam_cpu):
+        for name, value in [*vars(module).items()]:
+            if not getattr(value, "targetoptions", {"forceinline": True}).get("forceinline"):
+                monkeypatch.setattr(module, name, noting(name, value))
+    kinds = []
+    for steps in (tiny_step(lab.rasterizer), tiny_step(ReferenceRasterizer())):
+        called.clear()
+        list(steps)
+        kinds.append(dict(called))
+    own, of_reference = kinds
+    assert of_reference == {name: own[name] for name in ("similarity_rows", "gradient_rows")}
+    for by_autograd, fewer in ((False, {"adam_rows"}), (True, set())):
+        training = lab.new(NoDensifier(), by_autograd=by_autograd)
+        called.clear()
+        training.iterate(lab.folder)
+        assert called == {name: kind for name, kind in own.items() if name not in fewer}
 
 
 def test_kernels_are_compiled_beside_other_work_and_waited_for(monkeypatch):
-    compiled = []
+    compiled, begun = [], Event()
 
-    class Kernel:
-        def compile(self, signature):
-            compiled.append(signature)
-            if signature == "bad":
+    def steps(*parts):
+        for part in parts:
+            if part == "bad":
                 raise RuntimeError("no memory")
+            yield compiled.append(part)
 
-    def compiled_with(*signatures, wanted=True):
-        kernels = [(Kernel(), signature) for signature in signatures]
-        monkeypatch.setattr("gsbench.train.kernels.kernels_of", lambda rasterizer: kernels)
+    def compiled_with(*parts, wanted=True):
+        monkeypatch.setattr(kernels, "tiny_step", lambda rasterizer: steps(*parts))
         with compiled_beside(ReferenceRasterizer(), wanted) as wait:
             wait()
         return compiled
@@ -67,10 +66,16 @@ def test_kernels_are_compiled_beside_other_work_and_waited_for(monkeypatch):
     with pytest.raises(RuntimeError, match="no memory"):
         compiled_with("bad")
 
+    def slow(rasterizer):
+        begun.set()
+        sleep(0.5)
+        yield from steps("last", "never")
 
-def test_only_the_own_rasterizer_needs_its_kernels():
-    own = [kernel.py_func.__name__ for kernel, _ in kernels_of(ReferenceRasterizer())]
-    assert own == ["similarity_rows", "gradient_rows"]
+    monkeypatch.setattr(kernels, "tiny_step", slow)
+    with suppress(ZeroDivisionError), compiled_beside(ReferenceRasterizer(), True):
+        begun.wait(10)
+        raise ZeroDivisionError  # the block ends early
+    assert compiled == ["a", "b", "last"]
 
 
 def test_seconds_of_compilation_are_not_of_the_training(lab, monkeypatch):

@@ -1,5 +1,6 @@
 """``gsbench judge``: tables of other trainers' results, questions before and after the training."""
 
+import zipfile
 from shlex import split
 
 import numpy as np
@@ -74,3 +75,27 @@ def test_what_is_no_table_is_refused(tmp_path, refused):
     assert "is no table" in refused("judge", tmp_path / "a.csv", "--baseline", "x")
     assert "no such file" in refused("judge", tmp_path / "b.csv", "--baseline", "x")
     assert run(["judge", str(tmp_path), "--baseline", "x"]) == 2
+
+
+def test_an_archive_is_named_with_what_shows_it(tmp_path, refused):
+    with zipfile.ZipFile(tmp_path / "demo.zip", "w") as archive:
+        for number in range(100):
+            archive.writestr(f"demo/garden/sfm-adc/aaaaaaaa-seed{number}/results.json", "{}")
+    line = refused("judge", tmp_path / "demo.zip", "--baseline", "x")
+    assert "`gsbench site` shows archives" in line
+    assert len(line) < 500
+
+
+def test_a_column_of_counts_decides_and_fewer_is_better(table, said):
+    FRAME.assign(gaussians=1000 - FRAME.psnr).to_csv(table, index=False)
+    out = said("judge", table, "--baseline", "base", "--metric", "gaussians")
+    assert "- BETTER: mine against base: better in Gaussians on these scenes: −" in out
+
+
+def test_notes_name_methods_as_the_table_does(table, said):
+    out = said("judge", table, "--baseline", "base")
+    assert "measured as they are (its conditions are not known): base, mine, other." in out
+    frame = pd.read_csv(table)
+    frame.loc[(frame.method == "mine") & (frame.seed == 2), "psnr"] = np.nan
+    frame.to_csv(table, index=False)
+    assert "r/garden/mine/row-seed2" in said("judge", table, "--baseline", "base")

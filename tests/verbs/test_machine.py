@@ -19,11 +19,11 @@ GB = 10**9
 
 
 def said(findings):
-    return [(finding.verdict, finding.text) for finding in findings]
+    return [(verdict, text) for verdict, _, text in findings]
 
 
 def of_devices(topic):
-    return [finding for finding in machine.check_devices() if finding.topic == topic]
+    return [finding for finding in machine.check_devices() if finding[1] == topic]
 
 
 @pytest.fixture
@@ -102,36 +102,36 @@ def test_doctor_names_the_packages_that_triton_compiles_with(tmp_path, monkeypat
     monkeypatch.setattr(machine, "version_of", lambda package: "3.7.1")
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.delenv("CC", raising=False)
-    (finding,) = machine.check_triton()
-    assert finding.verdict == "note"
-    assert "a C compiler: install the package gcc" in finding.text
+    (finding,) = of_devices("triton")
+    assert finding[0] == "note"
+    assert "a C compiler: install the package gcc" in finding[2]
     (tmp_path / "gcc").write_text("")
     (tmp_path / "gcc").chmod(0o755)
     monkeypatch.setattr("sysconfig.get_paths", lambda scheme: {"include": str(tmp_path)})
-    (finding,) = machine.check_triton()
+    (finding,) = of_devices("triton")
     version = f"{sys.version_info.major}.{sys.version_info.minor}"
-    assert f"Python.h: install the package python{version}-dev" in finding.text
+    assert f"Python.h: install the package python{version}-dev" in finding[2]
     (tmp_path / "Python.h").write_text("")
-    assert not list(machine.check_triton())
+    assert not of_devices("triton")
     monkeypatch.setenv("CC", "nosuchcc -O2")
-    (finding,) = machine.check_triton()
-    assert "CC is nosuchcc -O2, which is not there" in finding.text
+    (finding,) = of_devices("triton")
+    assert "CC is nosuchcc -O2, which is not there" in finding[2]
 
 
 def test_doctor_on_a_runs_folder(runs):
-    assert next(machine.check_runs(runs)).verdict in ("ok", "note")
-    assert next(machine.check_runs(Path("/proc/nowhere"))).verdict == "bad"
+    assert next(machine.check_runs(runs))[0] in ("ok", "note")
+    assert next(machine.check_runs(Path("/proc/nowhere")))[0] == "bad"
 
 
 def test_doctor_says_what_is_missing(monkeypatch):
     monkeypatch.setattr(machine, "version_of", lambda name: "")
-    found = {one.topic: one for one in machine.check_packages()}
+    found = {one[1]: one for one in machine.check_packages()}
     for name in machine.REQUIRED:
-        assert found[name].verdict == "bad"
-        assert found[name].text.startswith("missing: ")
+        assert found[name][0] == "bad"
+        assert found[name][2].startswith("missing: ")
     for name, (purpose, _) in machine.OPTIONAL.items():
-        assert found[name].verdict == "note"
-        assert found[name].text.startswith(f"not installed; needed for {purpose}: ")
+        assert found[name][0] == "note"
+        assert found[name][2].startswith(f"not installed; needed for {purpose}: ")
     monkeypatch.setitem(sys.modules, "torch", None)
     ((verdict, text),) = said(machine.check_devices())
     assert verdict == "bad"
@@ -141,7 +141,7 @@ def test_doctor_says_what_is_missing(monkeypatch):
 def test_a_full_disk_is_noted(tmp_path, monkeypatch):
     for free, verdict in ((machine.LITTLE_SPACE - 1, "note"), (machine.LITTLE_SPACE, "ok")):
         monkeypatch.setattr("shutil.disk_usage", lambda _, free=free: SimpleNamespace(free=free))
-        assert next(machine.check_runs(tmp_path / "a/b")).verdict == verdict
+        assert next(machine.check_runs(tmp_path / "a/b"))[0] == verdict
 
 
 def test_proofs_are_listed_and_rasterizers_of_a_gpu_without_one_noted(gpus, monkeypatch):
@@ -191,7 +191,6 @@ def test_options_of_a_proof_need_prove(tmp_path, words, message):
         ("--count 0", "--count: must be a whole number in "),
         ("--count 5,x", "--count: must be a whole number in "),
         ("--ply nowhere.ply", "nowhere.ply does not exist"),
-        ("--kernels", "has no place in the table: add --json"),
         ("--raster cpu,auto", "name those to time"),
     ],
 )
@@ -213,7 +212,7 @@ def test_bench_times_what_the_words_name(monkeypatch, capsys):
     words = split("--raster cpu,reference --size 16x32,32x16 --count 7,8")
     assert machine.bench([*words, "--no-memory", "--repeats", "3"]) == 0
     rasters, settings, *others = asked
-    assert (rasters, others) == (["cpu", "reference"], [3, False, False])
+    assert (rasters, others) == (["cpu", "reference"], [3, False])
     assert [(one.scene, one.size, one.count, one.ply) for one in settings] == [
         ("trained", size, count, None) for size in ("16x32", "32x16") for count in (7, 8)
     ]

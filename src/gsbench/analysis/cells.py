@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import statistics
 from collections import Counter
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -28,21 +28,11 @@ from gsbench.words import value_words
 if TYPE_CHECKING:
     import pandas as pd
 
-K = TypeVar("K", bound=Hashable)
 C = TypeVar("C", Planned, TrialResult)
 
-TRIAL_FIELDS = (
-    "scene",
-    "init",
-    "densify",
-    "seed",
-    "raster",
-    "protocol",
-    "iterations",
-    "experiment",
-)
 IDENTITY = ("experiment", "scene", "init", "densify", "seed")
 CONDITIONS = ("protocol", "raster", "iterations")
+TRIAL_FIELDS = (*IDENTITY, *CONDITIONS)
 OF_VIEWS = ("protocol", "resolution", "data", "split")  # conditions of the measured views
 MEASUREMENTS = (
     "num_init_points",

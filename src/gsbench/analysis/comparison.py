@@ -19,15 +19,7 @@ from gsbench.analysis.quantities import choose_quantities
 from gsbench.analysis.questions import Asked, choose_pairs
 from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by
 from gsbench.analysis.sentences import asked_words, badge, headline, risk, sentence
-from gsbench.analysis.statistics import REFUTED, SUPPORTED
-from gsbench.analysis.verdicts import (
-    ANSWERED,
-    NOT_ASKED,
-    NOT_TESTED,
-    Verdict,
-    interval_of,
-    judge,
-)
+from gsbench.analysis.verdicts import State, Verdict, interval_of, judge
 from gsbench.runs.commands import Question, code_in, questions_elsewhere
 from gsbench.runs.experiments import DEFAULT_METRIC
 from gsbench.runs.layout import LEDGER, TUNING
@@ -105,7 +97,7 @@ class Comparison:
     def risk(self) -> str:
         """The risk of a page with these answers; "" if it states no verdict."""
         verdicts = itertools.chain(*((one.verdict, *one.others) for one in self.answers))
-        return risk([one for one in verdicts if one.state == ANSWERED])
+        return risk([one for one in verdicts if one.state == "answered"])
 
     @cached_property
     def remarks(self) -> list[Note]:
@@ -118,7 +110,7 @@ class Comparison:
             used = {trial.path for trial in answer.verdict.pairs.trials}
             # the baseline may have more seeds and scenes: they cost nothing
             unused = [one.label for one in by_arm.get(answer.arm, []) if one.path not in used]
-            if unused and answer.verdict.state == ANSWERED:
+            if unused and answer.verdict.state == "answered":
                 notes.append(Note.of("unused", trials=unused, arm=answer.arm))
             notes += [note for note in answer.verdict.notes if note.kind == "valueless"]
         return [*notes, *same_bits_notes(self.trials)]
@@ -178,11 +170,12 @@ def compare(experiment: Experiment, baseline: str | None = None) -> Comparison:
         for pair in choose_pairs(trials, terms)
         if pair[1] not in ideas and pair not in turned and known.issuperset(pair)
     ]
-    state, why = (NOT_TESTED if baseline else NOT_ASKED), ""
-    if (experiment.folder / LEDGER).exists():
-        state, why = NOT_TESTED, OLD_LEDGER
+    state: State = "not tested" if baseline else "not asked beforehand"
+    why = OLD_LEDGER if (experiment.folder / LEDGER).exists() else ""
+    if why:
+        state = "not tested"
     intervals = [interval_of(trials, *pair, DEFAULT_METRIC, state, why) for pair in unasked]
-    if any(verdict.state == NOT_ASKED for verdict in intervals):
+    if any(verdict.state == "not asked beforehand" for verdict in intervals):
         intervals = _with_askers(experiment, intervals)
     answers = [*asked, *(_with_metrics(verdict, trials) for verdict in intervals)]
     return Comparison(experiment, trials, tuple(answers))
@@ -206,7 +199,7 @@ def _asked(experiment: Experiment, trials: Sequence[TrialResult]) -> list[Answer
     for own in group_by(verdicts, "question.baseline", "question.idea", "question.name").values():
         code = _code_of(own[-1].question)
         current = [one for one in own if _code_of(one.question) == code]
-        shown = ([one for one in current if one.state == ANSWERED] or current)[-1]
+        shown = ([one for one in current if one.state == "answered"] or current)[-1]
         others = tuple(one for one in reversed(own) if one is not shown)
         earlier = any(trial.path in folded for trial in shown.pairs.trials)
         answers.append(replace(_with_metrics(shown, trials, others), earlier=earlier))
@@ -307,7 +300,7 @@ def chosen(comparison: Comparison, trials: Sequence[TrialResult], where: str) ->
             answers.append(answer)
         elif {trial.arm for trial in own}.issuperset(pair):
             metric, why = answer.verdict.quantity.key, f"{where} chose its trials"
-            verdict = interval_of(own, *pair, metric, NOT_TESTED, why)
+            verdict = interval_of(own, *pair, metric, "not tested", why)
             answers.append(_with_metrics(verdict, own))
     return replace(comparison, trials=own, answers=tuple(answers))
 
@@ -322,12 +315,12 @@ def winners(comparison: Comparison) -> dict[tuple[str, frozenset[str]], set[Arm]
         verdict, question = answer.verdict, answer.verdict.question
         place = verdict.quantity.key, frozenset(question.seeds)
         better, others = found.setdefault(place, (set(), set()))
-        if verdict.state != ANSWERED or verdict.outcome not in (SUPPORTED, REFUTED):
+        if verdict.state != "answered" or verdict.outcome not in ("supported", "refuted"):
             others.update((answer.baseline, answer.arm))
         elif question.sign == verdict.quantity.direction:
             sides = answer.baseline, answer.arm
-            better.add(sides[verdict.outcome == SUPPORTED])
-            others.add(sides[verdict.outcome == REFUTED])
+            better.add(sides[verdict.outcome == "supported"])
+            others.add(sides[verdict.outcome == "refuted"])
     return {place: better - others for place, (better, others) in found.items()}
 
 

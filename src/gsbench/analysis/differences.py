@@ -7,17 +7,18 @@ ADC. All are read from the trials' recorded configurations and code.
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from operator import attrgetter
+from pathlib import Path
 from typing import Any
+
+import yaml
 
 from gsbench.analysis.notes import Note
 from gsbench.analysis.results import Arm, TrialPair, TrialResult, group_by
 from gsbench.analysis.trial_result import Trained, canonical
 from gsbench.gaussians.paper_values import RATES
-from gsbench.runs.config_hash import (
-    is_ignored,
-    is_ingredient,
-    is_of_scene,
-)
+from gsbench.parsing import LOADER
+from gsbench.runs.config_hash import is_ignored, is_ingredient, is_of_scene
 from gsbench.runs.freshness import Part
 from gsbench.runs.nested import SHOWN
 from gsbench.words import counted, some_of
@@ -31,58 +32,16 @@ ELSEWHERE = "a training elsewhere, which left no record"
 BY_PROGRAM = "everything that the program {} does differently"
 TARGET, INITIAL_CLOUD = "densify._target_", "initial cloud"
 
-# Ingredients that consist of several settings. Every other setting is an ingredient of its own,
-# named by its key without ``densify.``.
-INGREDIENT_NAMES = {
-    "densify.gradient_threshold": "threshold",
-    "densify.threshold_inclusive": "threshold",
-    **{f"densify.{key}": "schedule" for key in ("start", "stop", "interval")},
-    **{
-        f"train.{key}": "schedule"
-        for key in ("densify_start", "densify_stop", "densify_interval", "mcmc_stop")
-    },
-    **{
-        f"densify.{key}": "opacity reset"
-        for key in ("opacity_reset_interval", "opacity_reset_value")
-    },
-    "train.opacity_reset_interval": "opacity reset",
-    "train.resolution_schedule": "resolution schedule",
-    **{f"densify.{key}": "budget" for key in ("max_gaussians", "cap", "governor_dimension")},
-    **{
-        f"densify.{key}": "prunings"
-        for key in ("prune_opacity", "prune_size", "prune_screen_radius")
-    },
-    **{f"init.{key}": "cameras" for key in ("poses", "align")},
-    **{f"train.{key}": "learning rates" for key in RATES},
+TABLES: dict[str, dict[str, list[str]]] = yaml.load(
+    Path(__file__).with_name("ingredients.yaml").read_text("utf-8"), LOADER
+)
+DEPARTURES = TABLES["departures"]  # by the densifier's class
+INGREDIENT_NAMES = {f"train.{key}": "learning rates" for key in RATES} | {
+    key: name for name, keys in TABLES["settings"].items() for key in keys
 }
 # Conditions and settings that each scene may have for itself. The settings of a budget are not
 # among them, so that a note says where it differs. Iterations are a condition already.
 OF_A_SCENE = ("resolution", "data", "budget")
-
-# The ingredients in which each densifier class departs from ADC, beside its settings. They are not
-# attributes of the classes, since importing those loads torch. Another class is one ingredient.
-DEPARTURES: dict[str, tuple[str, ...]] = {
-    "gsbench.densify.AbsGS": ("absolute gradient for splits", "ceiling on opacities"),
-    "gsbench.densify.ADC": (),
-    "gsbench.densify.EdgeAware": ("split", "edge score", "prunings"),
-    "gsbench.densify.FastGS": (
-        "absolute gradient for splits",
-        "ceiling on opacities",
-        "error score",
-        "last prunings",
-    ),
-    "gsbench.densify.GNS": ("split", "edge score", "prunings", "natural selection"),
-    "gsbench.densify.LongAxis": ("split",),
-    "gsbench.densify.MCMC": ("relocation", "growth by a share", "noise", "regularisation"),
-    "gsbench.densify.MRNF": ("edge score", "growth by a share", "noise", "decay"),
-    "gsbench.densify.NoDensifier": ("densification",),
-    "gsbench.densify.PixelGS": ("weights of the gradient",),
-    "gsbench.densify.QuantileADC": ("threshold by a rate", "pruning by a share"),
-    "gsbench.densify.ResGS": ("residual split", "levels", "fading opacity"),
-    "gsbench.densify.SteepGS": ("saddle condition", "split along an eigenvector"),
-    "gsbench.densify.Taming": ("score", "prunings"),
-    "gsbench.densify.Volumetric": ("volume rule",),
-}
 
 
 def differing_conditions(trials: Sequence[TrialResult], code: bool = True) -> dict[str, list[str]]:
@@ -121,41 +80,43 @@ def conditions_between_scenes(trials: Sequence[TrialResult]) -> dict[str, Scenes
 
     A mean over such scenes would be about nothing.
     """
-    by_scene = group_by(trials, "scene")
-    differing = differing_conditions([own[0] for own in by_scene.values()], code=False)
-    keys = [key for key in differing if key not in OF_A_SCENE]
-    return _between_scenes(by_scene, keys, lambda trial, key: trial.conditions.get(key, "none"))
+    found = _between_scenes(trials, attrgetter("conditions"))
+    return {key: scenes for key, scenes in found.items() if key not in OF_A_SCENE}
 
 
 def settings_between_scenes(trials: Sequence[TrialResult]) -> dict[str, ScenesByValue]:
     """The settings in which the scenes of one arm differ, without those of the scene itself."""
-    by_scene = group_by([trial for trial in trials if trial.config], "scene")
-    first, *others = (own[0].config for own in by_scene.values()) if by_scene else ({},)
+    found = _between_scenes([trial for trial in trials if trial.config], attrgetter("config"))
+    return {key: own for key, own in found.items() if is_ingredient(key) and not is_of_scene(key)}
+
+
+def _between_scenes(
+    trials: Sequence[TrialResult], facts_of: Callable[[TrialResult], Mapping[str, Any]]
+) -> dict[str, ScenesByValue]:
+    """For each fact that differs between scenes, the scenes that have a value.
+
+    What differs within a scene is left out: that is no difference between scenes.
+    """
+    by_scene = group_by(trials, "scene")
+    first, *others = (facts_of(own[0]) for own in by_scene.values()) if by_scene else ({},)
     # Compared as they are, not as text: this runs for every pair of arms.
     keys = {
         key for other in others for key in first.keys() | other if first.get(key) != other.get(key)
     }
-    keys = {key for key in keys if is_ingredient(key) and not is_of_scene(key)}
-    return _between_scenes(
-        by_scene, sorted(keys), lambda trial, key: canonical(trial.config.get(key))
-    )
-
-
-def _between_scenes(
-    by_scene: Mapping[str, Sequence[TrialResult]],
-    keys: Iterable[str],
-    value_of: Callable[[TrialResult, str], str],
-) -> dict[str, ScenesByValue]:
-    """For each of ``keys`` that differs between scenes, the scenes that have a value.
-
-    What differs within a scene is left out: that is no difference between scenes.
-    """
-    differing = {}
-    for key in keys:
-        values = {scene: {value_of(trial, key) for trial in by_scene[scene]} for scene in by_scene}
+    differing: dict[str, ScenesByValue] = {}
+    for key in sorted(keys):
+        values = {
+            scene: {as_text(facts_of(trial).get(key)) for trial in own}
+            for scene, own in by_scene.items()
+        }
         if all(len(own) == 1 for own in values.values()):
             differing[key] = group_by(values, lambda scene: min(values[scene]))  # noqa: B023
-    return {key: scenes for key, scenes in differing.items() if len(scenes) > 1}
+    return differing
+
+
+def as_text(value: Any) -> str:
+    """A value as text; text stays as it is."""
+    return value if isinstance(value, str) else canonical(value)
 
 
 def between_scenes_notes(*sides: Sequence[TrialResult]) -> list[Note]:
@@ -252,15 +213,13 @@ def compared_trials(trials: Iterable[TrialResult], first: Arm, second: Arm) -> l
     by_arm = group_by(trials, "arm")
     ones, others = by_arm[first], by_arm[second]
     here, there = (group_by(own, "scene") for own in (ones, others))
-    shared = [_first_pair(own, there[scene]) for scene, own in here.items() if scene in there]
-    return shared or [_first_pair(ones, others)]
-
-
-def _first_pair(ones: Sequence[TrialResult], others: Sequence[TrialResult]) -> TrialPair:
-    """The first trials of one seed, else the first ones."""
-    of_seed = {trial.seed: trial for trial in reversed(others)}
-    pairs = ((one, of_seed[one.seed]) for one in ones if one.seed in of_seed)
-    return next(pairs, (ones[0], others[0]))
+    shared = [(own, there[scene]) for scene, own in here.items() if scene in there]
+    pairs = []
+    for mine, theirs in shared or [(ones, others)]:
+        of_seed = {trial.seed: trial for trial in reversed(theirs)}
+        same = ((one, of_seed[one.seed]) for one in mine if one.seed in of_seed)
+        pairs.append(next(same, (mine[0], theirs[0])))
+    return pairs
 
 
 def ingredients_note(names: Sequence[str], first: Arm, second: Arm) -> Note:
@@ -279,7 +238,7 @@ def is_mixed(names: Sequence[str]) -> bool:
     return len(names) > 1 or any(name.startswith(bundles) for name in names)
 
 
-def _class_ingredients(config: Mapping[str, Any]) -> tuple[str, ...]:
+def _class_ingredients(config: Mapping[str, Any]) -> Sequence[str]:
     """The ingredients in which the configuration's densifier class departs from ADC."""
     target = config.get(TARGET)
     if target is None:

@@ -12,6 +12,7 @@ from operator import attrgetter
 from typing import Any
 
 from gsbench.analysis.differences import (
+    as_text,
     between_scenes_notes,
     compared_trials,
     differing_keys,
@@ -24,7 +25,6 @@ from gsbench.analysis.pairs import pair_trials
 from gsbench.analysis.quantities import COSTS, relative_change
 from gsbench.analysis.results import Arm, TrialResult, group_by, trials_of
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
-from gsbench.analysis.trial_result import canonical
 from gsbench.parsing import read_if_sound
 from gsbench.runs.experiments import SearchPoint, TuningRecord
 from gsbench.runs.layout import EVENTS, TUNING
@@ -126,7 +126,7 @@ def fairness_table(trials: Sequence[TrialResult], first: Arm, second: Arm) -> Ta
 
 
 def _shown(value: Any) -> str:
-    text = value_words(value if isinstance(value, str) else canonical(value))
+    text = value_words(as_text(value))
     return text if len(text) <= LONGEST else f"{text[: LONGEST - 1]}…"
 
 

@@ -6,7 +6,6 @@ Nobody wrote the question down before these results, so its sentence states the 
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -14,25 +13,23 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from gsbench.analysis.comparison import Comparison, compare
-from gsbench.analysis.quantities import asked_quantity
+from gsbench.analysis.quantities import COSTS, asked_quantity
 from gsbench.analysis.questions import read_least
 from gsbench.analysis.results import Experiment, TrialResult, Unfinished, group_by
-from gsbench.analysis.sentences import DECLARED_TABLE, TABLE
 from gsbench.analysis.verdicts import Verdict
 from gsbench.errors import InputError
 from gsbench.eval.facts import find_metric
-from gsbench.files import write_text
-from gsbench.parsing import Count, Record, Text, read_typed
+from gsbench.parsing import Count, Record, Text
 from gsbench.runs.commands import Command, History, Question
 from gsbench.runs.experiments import Arm
-from gsbench.runs.layout import SEED as SEED_MARK
+from gsbench.runs.layout import SEED
 from gsbench.runs.trial_record import MetricRecord, TrialRecord
 from gsbench.words import did_you_mean, listed
 
 if TYPE_CHECKING:
     import pandas as pd
 
-METHOD, SCENE, SEED = COLUMNS = ("method", "scene", "seed")
+COLUMNS = ("method", "scene", "seed")
 DIRECTIONS = {"": 0, "higher": 1, "lower": -1}
 BETTER = {sign: word for word, sign in DIRECTIONS.items()}
 
@@ -51,20 +48,6 @@ class Declared(Record):
     methods: tuple[Text, ...] = ()
     scenes: tuple[Text, ...] = ()
     seeds: tuple[Count, ...] = ()
-
-    def write(self, file: Path) -> None:
-        """Write it; raises InputError if the file is there, since a question is never changed."""
-        if file.exists():
-            raise InputError(f"{file} is there already: a question is not changed")
-        write_text(file, json.dumps(self.to_json(), indent=1) + "\n")
-
-
-def read_declared(file: Path) -> Declared:
-    """The question in a file; raises InputError if it is damaged or missing."""
-    try:
-        return read_typed(file, Declared)
-    except FileNotFoundError:
-        raise InputError(f"{file}: no such file: judge --declare writes it") from None
 
 
 def judge(
@@ -125,7 +108,7 @@ def compare_methods(frame: pd.DataFrame, asked: Declared, name: str = "results")
     least = asked.least or quantity.worthwhile
     size = (None, False) if least is None else read_least(least, "--least")
     questions = [
-        _question(trials, asked, idea, quantity.direction, size).with_id(TABLE) for idea in ideas
+        _question(trials, asked, idea, quantity.direction, size).with_id("table") for idea in ideas
     ]
     folder = Path(name)
     history = History(folder, (Command(words=(), cwd="", time=0.0, questions=tuple(questions)),))
@@ -154,7 +137,7 @@ def _absent(
 
 def _place(folder: Path, scene: str, method: str, seed: int) -> Path:
     """A path of a row, as the folder of a trial is called."""
-    return folder / scene / method.replace("/", "_") / f"row{SEED_MARK}{seed}"
+    return folder / scene / method.replace("/", "_") / f"row{SEED}{seed}"
 
 
 def _question(
@@ -188,7 +171,7 @@ def _question(
         relative=least[1],
         digests={scene: (_digest(baseline), _digest(idea)) for scene in seeds},
         seeds=seeds,
-        rule=DECLARED_TABLE if asked.methods else TABLE,
+        rule="declared table" if asked.methods else "table",
         untested=untested,
     )
 
@@ -218,7 +201,10 @@ def _trials(frame: pd.DataFrame, metric: str, direction: int, name: str) -> list
         raise InputError(f"the column {metric} has a value that is no number")
     sign: Literal[-1, 0, 1] = 1 if direction > 0 else -1 if direction else 0
     facts = {
-        key: MetricRecord(label=key, direction=sign if key == metric else 0)
+        key: MetricRecord(
+            label=COSTS.get(key, (key,))[0],
+            direction=-1 if key in COSTS else sign if key == metric else 0,
+        )
         for key in metrics
         if find_metric(key) is None
     }

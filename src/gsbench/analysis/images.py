@@ -4,8 +4,8 @@ import base64
 import io
 import itertools
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -193,39 +193,29 @@ def compare_view(which: str, pair: TrialPair, view: str) -> ViewComparison:
         pair[0].scene,
         view,
         pair[0].seed,
-        truth=_jpeg_uri(truth),
-        first=_jpeg_uri(first),
-        second=_jpeg_uri(second),
-        difference=_jpeg_uri(colours.round().astype(np.uint8)),
+        truth=jpeg_uri(truth),
+        first=jpeg_uri(first),
+        second=jpeg_uri(second),
+        difference=jpeg_uri(colours.round().astype(np.uint8)),
         first_error=float(errors[0].mean()),
         second_error=float(errors[1].mean()),
     )
 
 
-def _jpeg_uri(image: Pixels) -> str:
+def jpeg_uri(image: NDArray[np.uint8]) -> str:
     """A picture as a JPEG data URI; PNG would make the page ten times as large."""
     picture = Image.fromarray(image)
     picture.thumbnail((WIDEST, WIDEST))
-    return _data_uri(picture, "jpeg", quality=92, subsampling=0)
-
-
-def truth_uri(trial: TrialResult, view: str) -> str:
-    """The photograph of a test view as a JPEG data URI; "" if it is not there."""
-    try:
-        return _jpeg_uri(read_image(trial.path / GROUND_TRUTH / f"{view}.png"))
-    except InputError:
-        return ""
-
-
-def png_uri(image: Pixels) -> str:
-    """A lossless PNG as a data URI."""
-    return _data_uri(Image.fromarray(image), "png", optimize=True)
-
-
-def _data_uri(picture: Image.Image, kind: str, **options: Any) -> str:
     buffer = io.BytesIO()
-    picture.save(buffer, format=kind, **options)
-    return f"data:image/{kind};base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"
+    picture.save(buffer, format="jpeg", quality=92, subsampling=0)
+    return f"data:image/jpeg;base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"
+
+
+def read_truth(trial: TrialResult, view: str) -> Pixels | None:
+    """The photograph of a test view; None if it is not there."""
+    with suppress(InputError):
+        return read_image(trial.path / GROUND_TRUTH / f"{view}.png")
+    return None
 
 
 def read_compared(one: TrialResult, other: TrialResult, view: str) -> list[Pixels]:

@@ -17,9 +17,8 @@ from gsbench.parsing import Amount, Count, Record
 from gsbench.runs.commands import ERROR_RATE, Digest, Question, code_in
 from gsbench.runs.experiments import Arm, unix_time
 from gsbench.runs.layout import DECLARED
-from gsbench.runs.rows import read_rows
+from gsbench.runs.trial_files import read_rows
 
-OLD = "declaration"  # the rule of these questions
 LATE = "it was declared after the first result"
 
 
@@ -74,7 +73,9 @@ def old_questions(experiment: Experiment) -> list[Question]:
         }
         n = max(1, len(versions))
         level = level_of(n, rate=question.level)
-        numbered.append(replace(question, n=n, level=level, rule=OLD).with_id(OLD))
+        numbered.append(
+            replace(question, n=n, level=level, rule="declaration").with_id("declaration")
+        )
     return numbered
 
 

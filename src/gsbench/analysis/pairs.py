@@ -52,10 +52,6 @@ class Pairs:
     relative: bool = False  # compare logarithms
 
     @property
-    def scenes(self) -> tuple[str, ...]:
-        return tuple(row.scene for row in self.rows)
-
-    @property
     def seeds(self) -> int:
         """The number of seeds that all scenes have."""
         return min((len(row.seeds) for row in self.rows), default=0)
@@ -83,14 +79,9 @@ class Pairs:
         return tuple(pair for row in self.rows for pair in row.trials[: self.seeds])
 
     @property
-    def of_baseline(self) -> tuple[TrialResult, ...]:
-        """The baseline's trials that count."""
-        return tuple(baseline for baseline, _ in self.counting)
-
-    @property
-    def of_arm(self) -> tuple[TrialResult, ...]:
-        """The arm's trials that count, each in the place of its partner in `of_baseline`."""
-        return tuple(arm for _, arm in self.counting)
+    def sides(self) -> tuple[list[TrialResult], list[TrialResult]]:
+        """The baseline's trials that count, and their partners of the arm."""
+        return [one for one, _ in self.counting], [other for _, other in self.counting]
 
     @property
     def trials(self) -> tuple[TrialResult, ...]:

@@ -1,32 +1,29 @@
 """Printed numbers of papers, their tables as measured, and the differences."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from importlib.resources import files
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import yaml
 
 from gsbench.analysis.cells import Cell, check_averageable, make_cell
+from gsbench.analysis.comparison import Comparison
 from gsbench.analysis.quantities import choose_quantities, quantity
 from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by
+from gsbench.analysis.statistics import StudentT
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.analysis.tables import build_table
 from gsbench.errors import InputError
 from gsbench.words import did_you_mean, signed
 
-if TYPE_CHECKING:
-    from gsbench.analysis.comparison import Comparison
-
 # suffix of an experiment that repeats a table with each initialiser's own poses and gauge
 OWN = "_own"
 STAND_FOR = {"dim_paper": "dim"}  # our initialiser -> the paper's initialiser that it repeats
 CONFIDENCE = 0.95
+FOLDER = Path(__file__).with_name("published")
 PAPER = "volumetric"  # the paper of the method
 PRINTED_NAMES = {"adc": "3DGS", "volumetric": "Ours", "sfm": "SfM", "dim": "DIM"}
 # marks of measured cells beside printed numbers (`agreement`)
@@ -69,13 +66,14 @@ class Published:
     tables: Mapping[str, PrintedTable]
     contradictions: Sequence[str] = ()
 
+    @property
+    def setup_words(self) -> str:
+        return " ".join(f"The paper on {topic}: it {words}." for topic, words in self.setup.items())
+
 
 def published_names() -> list[str]:
     """The names of the papers whose numbers ship with gsbench."""
-    folder = files("gsbench.analysis").joinpath("published")
-    return sorted(
-        file.name.removesuffix(".yaml") for file in folder.iterdir() if file.name.endswith(".yaml")
-    )
+    return sorted(file.stem for file in FOLDER.glob("*.yaml"))
 
 
 @cache
@@ -87,8 +85,7 @@ def load_published(name: str = PAPER) -> Published:
             f"no published numbers {name!r}{did_you_mean(name, names)} (there are: "
             f"{', '.join(names)})"
         )
-    file = files("gsbench.analysis").joinpath(f"published/{name}.yaml")
-    content = yaml.safe_load(file.read_text(encoding="utf-8"))
+    content = yaml.safe_load((FOLDER / f"{name}.yaml").read_text("utf-8"))
     tables = {
         table: PrintedTable(**printed | {"arms": list(map(tuple, printed["arms"]))})
         for table, printed in content["tables"].items()
@@ -161,12 +158,8 @@ def paper_tables(
         return printed.find(scene, papers_init[arm.init], arm.densify, key)
 
     title = f"{title}, difference from the printed values"
-    below = " ".join(notes), _setup_words(paper)
+    below = " ".join(notes), paper.setup_words
     return [measured, _differences(title, "paper", trials, scenes, compared, find, below)]
-
-
-def _setup_words(paper: Published) -> str:
-    return " ".join(f"The paper on {topic}: it {words}." for topic, words in paper.setup.items())
 
 
 def _run_as(init: str, inits: set[str]) -> str:
@@ -206,7 +199,7 @@ def published_table(trials: Sequence[TrialResult], name: str) -> Table:
         of_paper = printed.arms[0] if len(printed.arms) == 1 else (arm.init, arm.densify)
         return printed.find(scene, *of_paper, key)
 
-    below = " ".join(notes), _setup_words(paper)
+    below = " ".join(notes), paper.setup_words
     return _differences(
         f"Difference from {name}", name, own, scenes, printed.quantities, find, below
     )
@@ -236,7 +229,7 @@ def _differences(
             if printed and cell.mean is not None:
                 mark = agreement(cell, printed)
                 marks[mark] += 1
-                decimals = max(one.decimals, _decimals(printed))
+                decimals = max(one.decimals, len(printed.partition(".")[2]))
                 change = signed(cell.mean - float(printed), f".{decimals}f")
                 entry = TableEntry(f"{change} {mark}", cell=cell)
             entries += [TableEntry(printed or ""), entry]
@@ -256,20 +249,14 @@ def _differences(
     return Table(title, ("scene", "init", "densify"), tuple(columns), tuple(rows), below)
 
 
-def _decimals(printed: str) -> int:
-    return len(printed.partition(".")[2])
-
-
 def agreement(cell: Cell, printed: str) -> str:
     """The mark of a measured cell: ``=``, ``≈`` or ``≠``.
 
     ``=`` if its mean is in the printed number's range, half a unit of its last digit on both sides;
     ``≈`` if its interval overlaps the range, else ``≠``. A single trial has no interval.
     """
-    from gsbench.analysis.statistics import StudentT  # here, since SciPy is slow to import
-
     assert cell.mean is not None
-    value, half = float(printed), 0.5 * 10.0 ** -_decimals(printed)
+    value, half = float(printed), 0.5 * 10.0 ** -len(printed.partition(".")[2])
     low, high = value - half, value + half
     if low <= cell.mean <= high:
         return ROUNDING

@@ -6,31 +6,24 @@ are estimated from pilot trials by the analysis of variance (Searle, Casella and
 *Variance components*, section 3.6). More seeds shrink only the noise; a statement about scenes like
 these needs more scenes.
 
-Commands differ in their error rate and in their looks, so the same trials have other chances.
-Trainings are simulated with the shares of noise that the pilot's scenes have, and decided by the
-thresholds of the judge.
+Plans are for a question whose seeds are judged at once. Trainings are simulated with the shares of
+noise that the pilot's scenes have, and decided by the thresholds of the judge.
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from functools import cache, partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from gsbench.analysis.questions import look_shares, plan_looks
 from gsbench.analysis.statistics import ALPHA, MIN_SCENES, Region, evenness, sign_test_needs
 from gsbench.errors import InputError
 
-COMMANDS = ("sweep", "looks", "gate", "ledger")
 POWER = 0.8  # of planned designs: that of the two-sided tests with the error rate ``ALPHA``
 MAX_SCENES, MAX_SEEDS = 30, 40  # the largest designs that are considered
-ALL_SCENES = range(1, MAX_SCENES + 1)
-# seeds and scenes of designs with looks
-LOOK_SEEDS, LOOK_SCENES = 12, (1, 2, 3, 4, 5, 6, 8, 10, 13)
 DRAWS = 2000  # simulated variances of a design; they give its power to about 0.005
 UNSURE = 0.8  # of pilots have the real deviation within the stated range
 
@@ -157,63 +150,6 @@ def _thresholds(design: Design, level: float, shares: tuple[float, ...]) -> NDAr
     return Region(design.scenes, design.seeds, evenness(variances)).limits(level) * error
 
 
-@dataclass(frozen=True)
-class Purpose:
-    """The purpose of the trials.
-
-    ``rate`` is the error rate of one question. ``looks`` says whether it is judged in looks, and
-    ``give_up`` is the chance at each look that an idea with just the difference is given up. With
-    ``screen``, equally many other trials come before, which must show it at this rate.
-    """
-
-    rate: float = ALPHA
-    looks: bool = False
-    give_up: float = 0.0
-    screen: float = 0.0
-
-    def power(self, design: Design, difference: float, noise: Components) -> float:
-        """The chance that the command shows ``difference`` where pairs differ as in ``noise``."""
-        deviation, shares = noise.within, noise.shares_of(design.scenes)
-        if self.screen:
-            first, then = replace(self, rate=self.screen, screen=0.0), replace(self, screen=0.0)
-            return math.prod(test.power(design, difference, noise) for test in (first, then))
-        if not self.looks or deviation == 0:
-            return power_of_mean(deviation, design, difference, self.rate, shares)
-        shown = np.zeros(DRAWS, dtype=bool)
-        open_ = ~shown
-        size = abs(difference) / deviation
-        for mean, error, region, level in _looks(design, self.rate, shares):
-            reach = region.limits(level) * error
-            better = open_ & (size + mean > reach)
-            shown |= better
-            open_ &= ~better & (size + mean >= -reach)
-            if self.give_up:
-                open_ &= mean + region.limits(2 * self.give_up) * error >= 0
-        return float(shown.mean())
-
-    def designs(self, difference: float, noise: Components) -> list[Design]:
-        """The designs with a power of `POWER`, one per number of scenes, with the fewest seeds."""
-        scenes, most = (LOOK_SCENES, LOOK_SEEDS) if self.looks else (ALL_SCENES, MAX_SEEDS)
-        power = partial(self.power, difference=difference, noise=noise)
-        return fewest_seeds(power, scenes, most)
-
-
-def _looks(
-    design: Design, rate: float, shares: tuple[float, ...]
-) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64], Region, float]]:
-    """Means and standard errors [DRAWS] at each look, thresholds, and the level."""
-    looks = plan_looks(design.seeds)
-    levels = [rate * share for share in look_shares(len(looks))]
-    draws = np.random.default_rng(0).standard_normal((DRAWS, design.scenes, design.seeds))
-    draws *= np.sqrt(shares)[:, None]
-    for seeds, level in zip(looks, levels, strict=True):
-        pairs = draws[:, :, :seeds]
-        variances = pairs.var(axis=2, ddof=1)
-        error = np.sqrt(variances.sum(axis=1) / seeds) / design.scenes
-        region = Region(design.scenes, seeds, evenness(variances))
-        yield pairs.mean(axis=(1, 2)), error, region, level
-
-
 # ---- the designs that suffice
 
 
@@ -221,6 +157,8 @@ def fewest_seeds(
     power: Callable[[Design], float], scenes: Iterable[int], most: int = MAX_SEEDS
 ) -> list[Design]:
     """The designs with a power of `POWER`, one per number of ``scenes``, with the fewest seeds.
+
+    Those with the fewest trials come first.
 
     A number of scenes is left out if it needs more than ``most`` seeds, or no fewer seeds than
     fewer scenes do. The power rises with the number of seeds.
@@ -235,7 +173,26 @@ def fewest_seeds(
             enough = power(Design(count, middle)) >= POWER
             low, high = (low, middle) if enough else (middle + 1, high)
         chosen.append(Design(count, high))
-    return chosen
+    return sorted(chosen, key=lambda design: (design.trials, design.scenes))
+
+
+def sweep_power(
+    design: Design, difference: float, noise: Components, level: float = ALPHA
+) -> float:
+    """The chance that a sweep shows ``difference`` where pairs differ as in ``noise``."""
+    return power_of_mean(noise.within, design, difference, level, noise.shares_of(design.scenes))
+
+
+def sweep_designs(difference: float, noise: Components, level: float = ALPHA) -> list[Design]:
+    """The designs of sweeps with a power of `POWER`, as `fewest_seeds` gives them."""
+    power = partial(sweep_power, difference=difference, noise=noise, level=level)
+    return fewest_seeds(power, range(1, MAX_SCENES + 1))
+
+
+def designs_like_these(difference: float, noise: Components) -> list[Design]:
+    """The same for the statement on scenes like these, from `MIN_SCENES` scenes on."""
+    power = partial(power_like_these, difference=difference, components=noise)
+    return fewest_seeds(power, range(MIN_SCENES, MAX_SCENES + 1))
 
 
 def seeds_needed(deviation: float, scenes: int, difference: float) -> int | None:
@@ -245,56 +202,3 @@ def seeds_needed(deviation: float, scenes: int, difference: float) -> int | None
     """
     power = partial(power_of_mean, deviation, difference=difference)
     return next((one.seeds for one in fewest_seeds(power, [scenes])), None)
-
-
-@dataclass(frozen=True)
-class Plan:
-    """The designs that show a difference between two arms, each list with the fewest trials first.
-
-    ``like_these`` are those for scenes like these, None if the pilot has one scene. The pilot's
-    ``factors`` say between which multiples of its deviation the real one lies (`UNSURE`), and
-    ``powers`` the chances at these that the first design shows the difference; None without one.
-    """
-
-    components: Components
-    these: tuple[Design, ...]
-    like_these: tuple[Design, ...] | None
-    factors: tuple[float, float]
-    powers: tuple[float, float] | None
-
-    def to_json(self) -> dict[str, Any]:
-        def listed(designs: Sequence[Design]) -> list[dict[str, int]]:
-            return [asdict(design) | {"trials": design.trials} for design in designs]
-
-        like_these = None if self.like_these is None else listed(self.like_these)
-        return {
-            "pilot": {"pairs": self.components.trials}
-            | {key: value for key, value in asdict(self.components).items() if key != "trials"},
-            "these_scenes": listed(self.these),
-            "scenes_like_these": like_these,
-            "share_of_pilots": UNSURE,
-            "deviation_factors": self.factors,
-            "power": self.powers,
-        }
-
-
-def make_plan(components: Components, difference: float, purpose: Purpose, most: int) -> Plan:
-    """The plan to show ``difference``, with at most ``most`` designs for each statement.
-
-    Statements about scenes like these start at `MIN_SCENES`.
-    """
-
-    def cheapest(designs: Sequence[Design]) -> tuple[Design, ...]:
-        return tuple(sorted(designs, key=lambda design: (design.trials, design.scenes))[:most])
-
-    these, like_these = cheapest(purpose.designs(difference, components)), None
-    if components.between is not None:
-        power = partial(power_like_these, difference=difference, components=components)
-        like_these = cheapest(fewest_seeds(power, range(MIN_SCENES, MAX_SCENES + 1)))
-    low, high = deviation_range(replace(components, within=1.0))
-    powers = None
-    if these:
-        ends = [replace(components, within=one * components.within) for one in (high, low)]
-        worst, best = (purpose.power(these[0], difference, one) for one in ends)
-        powers = worst, best
-    return Plan(components, these, like_these, (low, high), powers)

@@ -6,7 +6,6 @@ their own unit (`asked_quantity`).
 
 from collections.abc import Callable, Container, Iterable, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from statistics import fmean
 
 from gsbench.analysis.results import TrialResult, group_by
@@ -175,10 +174,12 @@ def asked_quantity(key: str, trials: Iterable[TrialResult] = ()) -> Quantity:
     """
     if key == TEXTURED.key:
         return TEXTURED
-    if key in COSTS:
+    trials = list(trials)
+    # a table of results may have a column of the name
+    if key in COSTS and not any(key in trial.metrics for trial in trials):
         name, read = COSTS[key]
         return Quantity(key, name, -1, 3, lambda trial: read(trial) or None, cost=True)
-    return _metric(key, "", list(trials))
+    return _metric(key, "", trials)
 
 
 def askable_names() -> tuple[str, ...]:
@@ -213,7 +214,12 @@ def _metric(key: str, step: str, trials: Sequence[TrialResult]) -> Quantity:
     records = [trial.record.metric_facts.get(base) for trial in trials if key in trial.metrics]
     facts = find_metric(base) or from_record(base, records[0] if records else None)
     facts = in_region(facts, region)
-    name, read = facts.name, lambda trial: trial.metrics.get(key)
+    name = facts.name
+
+    def read(trial: TrialResult) -> float | None:
+        earlier = trial.record.metrics_at.get(step) if step else trial
+        return None if earlier is None else earlier.metrics.get(key)
+
     if step:
         measured = sorted({int(at) for trial in trials for at in trial.record.metrics_at})
         if step not in map(str, measured):
@@ -221,7 +227,7 @@ def _metric(key: str, step: str, trials: Sequence[TrialResult]) -> Quantity:
             raise InputError(
                 f"no trial was measured at iteration {step!r}; measured were (eval.at) {steps}"
             )
-        name, read = f"{facts.label} at {int(step):,}", partial(_value_at, key, step)
+        name = f"{facts.label} at {int(step):,}"
     return Quantity(
         f"{key}{AT}{step}" if step else key,
         name,
@@ -230,11 +236,6 @@ def _metric(key: str, step: str, trials: Sequence[TrialResult]) -> Quantity:
         read,
         worthwhile=facts.worthwhile,
     )
-
-
-def _value_at(key: str, step: str, trial: TrialResult) -> float | None:
-    earlier = trial.record.metrics_at.get(step)
-    return None if earlier is None else earlier.metrics.get(key)
 
 
 def _protocol_lpips(trial: TrialResult) -> str:

@@ -24,14 +24,13 @@ from typing import Any, Literal
 
 from gsbench.analysis.addresses import ArmName
 from gsbench.analysis.statistics import ALPHA, MIN_SCENES, sign_test_needs
-from gsbench.analysis.trial_result import Trained, canonical
+from gsbench.analysis.trial_result import Trained, canonical, seeds_text
 from gsbench.errors import InputError
 from gsbench.runs.commands import Digest, History, Place, Question, code_in
 from gsbench.runs.config_hash import is_ignored, is_of_scene
 from gsbench.runs.experiments import Arm
 from gsbench.words import counted, some_of
 
-ORDINALS = ("first", "second", "third", "fourth", "fifth")
 LAST_LOOK = 0.6  # of a question's level
 
 
@@ -196,37 +195,27 @@ def ask(
         row for row in planned if not asked.split or row.config.get("scene.split") == asked.split
     ]
     if asked.named:
-        drafts = [
-            _named_draft(number, *one, planned, asked, measured)
-            for number, one in enumerate(asked.named, 1)
-        ]
+        drafts = []
+        for number, (named, sign, (least, relative)) in enumerate(asked.named, 1):
+            ideas, baselines = (named.rows(word, planned) for word in (named.idea, named.baseline))
+            arms = baselines[0].arm, ideas[0].arm
+            question = draft(*arms, [*baselines, *ideas], asked, measured)
+            drafts.append(
+                replace(
+                    question,
+                    metric=named.metric or asked.metric,
+                    sign=sign,  # type: ignore[arg-type]
+                    least=least,
+                    relative=relative,
+                    name=f"{named.idea}-{number}",
+                    says=named.says,
+                    where=named.where,
+                )
+            )
     else:
         pairs = choose_pairs(planned, asked, measured)
         drafts = [draft(*pair, planned, asked, measured) for pair in pairs]
     return _with_levels(drafts, planned, asked, measured, history)
-
-
-def _named_draft(
-    number: int,
-    named: NamedQuestion,
-    sign: int,
-    least: tuple[float | None, bool],
-    planned: Sequence[Trained],
-    asked: Asked,
-    measured: Sequence[Trained],
-) -> Question:
-    ideas, baselines = (named.rows(word, planned) for word in (named.idea, named.baseline))
-    question = draft(baselines[0].arm, ideas[0].arm, [*baselines, *ideas], asked, measured)
-    return replace(
-        question,
-        metric=named.metric or asked.metric,
-        sign=sign,  # type: ignore[arg-type]
-        least=least[0],
-        relative=least[1],
-        name=f"{named.idea}-{number}",
-        says=named.says,
-        where=named.where,
-    )
 
 
 def choose_pairs(
@@ -377,8 +366,7 @@ def places_text(places: Iterable[Place]) -> str:
     """``garden seeds 0, 1; room seed 0``"""
     texts = []
     for scene, own in itertools.groupby(sorted(places), lambda place: place[0]):
-        seeds = [str(seed) for _, seed in own]
-        texts.append(f"{scene} seed{'s' * (len(seeds) > 1)} {', '.join(seeds)}")
+        texts.append(f"{scene} {seeds_text(seed for _, seed in own)}")
     return "; ".join(texts)
 
 
@@ -410,12 +398,17 @@ def announce(question: Question) -> str:
     """The number and the level of a question in words, and what it cannot reach."""
     if question.untested:
         return f"{question.idea}: not tested, since {question.untested}"
-    which = dict(enumerate(ORDINALS, 1)).get(question.n, f"{question.n}th")
-    level = f"{100 * question.level:.2g} %"
+    which, level = ordinal(question.n), f"{100 * question.level:.2g} %"
     text = f"{question.idea} against {question.baseline}: {which} on these seeds: {level}"
     if question.n > 1:
         text += f"; new seeds have {100 * ALPHA:.2g} %"
     return "; ".join([text, *unreachable(question)])
+
+
+def ordinal(number: int) -> str:
+    """``first`` to ``fifth``, then ``6th`` and so on."""
+    words = "first", "second", "third", "fourth", "fifth"
+    return dict(enumerate(words, 1)).get(number, f"{number}th")
 
 
 def unreachable(question: Question) -> list[str]:

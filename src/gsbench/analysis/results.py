@@ -14,7 +14,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any, TypeVar
 
-from gsbench.analysis.trial_result import Configurations, settings_text
+from gsbench.analysis.trial_result import Configurations, read_configuration, settings_text
 from gsbench.analysis.trial_result import TrialResult as TrialResult
 from gsbench.errors import InputError
 from gsbench.files import require_no_links
@@ -123,12 +123,6 @@ def group_by(items: Iterable[T], *by: str | Callable[[T], Any]) -> dict[Any, lis
     return groups
 
 
-def seeds_text(trials: Iterable[TrialResult]) -> str:
-    """``seed 0`` or ``seeds 0, 1``"""
-    seeds = sorted(trial.seed for trial in trials)
-    return f"seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds))}"
-
-
 def load_experiment(runs_dir: Path, name: str) -> Experiment:
     """Read the trials of the experiment ``name`` that count (`newest_code`).
 
@@ -155,7 +149,7 @@ def read_experiment(folder: Path) -> Experiment:
     runs_dir = folder.parent
     trials: list[TrialResult] = []
     faults: dict[Path, str] = {}
-    settings = Configurations()
+    settings: Configurations = {}
     for path in map(Path, trial_folders(folder)):
         try:
             trials.append(read_trial(path, runs_dir, settings))
@@ -223,7 +217,10 @@ def newest_code(experiment: Experiment) -> Experiment:
 
     def fold(made: Sequence[TrialResult], now: TrialResult | None, name: str) -> None:
         older.extend(made)
-        change = _change_of_code(made[0], now) if now else Change("code", name, now="newer")
+        change = Change("code", name, now="newer")
+        if now:  # the first part in which they differ
+            parts = dict.fromkeys([*now.code, *made[0].code], "none")
+            change = next(code_changes(parts | made[0].code, (parts | now.code).get))
         earlier = replaced.setdefault((change.name, change.now), {})
         earlier.setdefault(change.made, []).extend(made)
 
@@ -301,12 +298,6 @@ def _newest_first(groups: Mapping[K, Sequence[TrialResult]]) -> list[K]:
     return sorted(groups, key=lambda key: max(one.finished for one in groups[key]), reverse=True)
 
 
-def _change_of_code(made: TrialResult, newest: TrialResult) -> Change:
-    """The first part of the code in which two trials differ."""
-    parts = dict.fromkeys([*newest.code, *made.code], "none")
-    return next(code_changes(parts | made.code, (parts | newest.code).get))
-
-
 def _versions_line(part: str, now: str, earlier: Mapping[str, Sequence[TrialResult]]) -> str:
     """``sw: 6 trials of sfm-mine made by earlier versions of mine: 3fa9c1d2 (4), …``"""
     trials = [trial for made in earlier.values() for trial in made]
@@ -331,7 +322,8 @@ def _read_settings(trials: Sequence[TrialResult], settings: Configurations) -> d
     for of_arm in group_by(trials, lambda trial: trial.key.rpartition("/")[0]).values():
         paths = group_by([(t.key, t.path) for t in of_arm], lambda pair: pair[0])
         if len(paths) > 1:
-            faults |= {key: settings.read(key, [p for _, p in own]) for key, own in paths.items()}
+            for key, own in paths.items():
+                faults[key] = read_configuration(settings, key, [path for _, path in own])
     return faults
 
 
@@ -367,16 +359,21 @@ class UnusableError(Exception):
 
 def read_trial(path: Path, runs_dir: Path, settings: Configurations) -> TrialResult:
     """Read and check one trial folder; raises `UnusableError`."""
+    folder = TrialFolder(path)
     try:
         require_no_links(runs_dir, path, below=True)
-        folder = TrialFolder(path)
         record = folder.record()
         if change := folder.change():
             raise UnusableError(
                 f"damaged, {change}: `{command('retry', record.experiment)}` repairs it"
             )
     except FileNotFoundError:
-        raise UnusableError(_why_unfinished(path)) from None
+        why = f"unfinished, no {RESULTS} yet"
+        if (path / FAILED).exists():
+            why = f"failed, {folder.failure().reason}"
+        elif not (path / CONFIG).is_file():
+            why = f"{FOREIGN}, not a trial"
+        raise UnusableError(why) from None
     except DamagedError as error:
         state = "unfinished" if isinstance(error, UnfinishedError) else "damaged"
         raise UnusableError(f"{state}, {error.path.name} {error.reason}") from None
@@ -394,11 +391,3 @@ def read_trial(path: Path, runs_dir: Path, settings: Configurations) -> TrialRes
         if value != name:
             raise UnusableError(f"{FOREIGN}, its {RESULTS} is of {key} {value!r}")
     return TrialResult(path, match["hash"], record, settings=settings)
-
-
-def _why_unfinished(path: Path) -> str:
-    if (path / FAILED).exists():
-        return f"failed, {TrialFolder(path).failure().reason}"
-    return (
-        f"unfinished, no {RESULTS} yet" if (path / CONFIG).is_file() else f"{FOREIGN}, not a trial"
-    )

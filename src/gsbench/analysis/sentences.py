@@ -2,30 +2,12 @@
 
 from collections.abc import Sequence
 
-from gsbench.analysis.questions import ORDINALS, places_text
+from gsbench.analysis.questions import ordinal, places_text
 from gsbench.analysis.results import Unfinished
-from gsbench.analysis.statistics import (
-    REFUTED,
-    SUPPORTED,
-    TOO_SMALL,
-    UNDECIDED,
-    Outcome,
-    exact_for,
-)
-from gsbench.analysis.verdicts import (
-    ANSWERED,
-    NOT_ASKED,
-    NOT_TESTED,
-    RUNNING,
-    STOPPED,
-    Verdict,
-    gives_up,
-    passes,
-)
+from gsbench.analysis.statistics import Outcome, exact_for
+from gsbench.analysis.verdicts import Verdict, gives_up, passes
 from gsbench.words import command, counted, least_text, some_of
 
-# rules of questions about a table of results (`gsbench.analysis.frames`)
-TABLE, DECLARED_TABLE = "table", "declared table"
 CONDITION = " It holds if metric, scenes and seeds were chosen before the results were seen."
 WORDS: dict[Outcome, str] = {
     "supported": "better",
@@ -49,8 +31,8 @@ def outcome_words(verdict: Verdict) -> str:
         beyond = f"different by more than {least_words(verdict)}"
         claimed = WORDS | {"supported": WORDS["too small to matter"], "refuted": beyond}
         return claimed[outcome]
-    if outcome in (SUPPORTED, REFUTED) and sign != verdict.quantity.direction:
-        return "higher" if (outcome == SUPPORTED) == (sign > 0) else "lower"
+    if outcome in ("supported", "refuted") and sign != verdict.quantity.direction:
+        return "higher" if (outcome == "supported") == (sign > 0) else "lower"
     return WORDS[outcome]
 
 
@@ -61,18 +43,18 @@ def least_words(verdict: Verdict) -> str:
 
 def badge(verdict: Verdict) -> str:
     """The verdict in one or two words: ``BETTER``, ``TOO SMALL``, ``RUNNING 3/6``."""
-    if verdict.state in (RUNNING, STOPPED) and not verdict.untestable:
-        return f"{verdict.state.upper()} {verdict.done}/{verdict.wanted}"
-    if verdict.state in (NOT_TESTED, NOT_ASKED):
-        return {NOT_TESTED: "NOT TESTED", NOT_ASKED: "NOT ASKED"}[verdict.state]
-    if verdict.outcome == REFUTED and not verdict.question.sign:
+    if verdict.is_open and not verdict.untestable:
+        return f"{verdict.state.upper()} {verdict.done}/{verdict.question.trials}"
+    if not verdict.is_tested:
+        return verdict.state.removesuffix(" beforehand").upper()
+    if verdict.outcome == "refuted" and not verdict.question.sign:
         return "DIFFERENT"
     return outcome_words(verdict).removesuffix(" to matter").upper()
 
 
 def badge_class(verdict: Verdict) -> str:
     """The class of a badge on a page."""
-    return "open" if verdict.state in (RUNNING, STOPPED) else CLASSES.get(badge(verdict), "")
+    return "open" if verdict.is_open else CLASSES.get(badge(verdict), "")
 
 
 def with_notes(words: str, verdict: Verdict) -> str:
@@ -107,17 +89,17 @@ def reason(verdict: Verdict) -> str:
         )
     if verdict.untestable is not None:
         return str(verdict.untestable)
-    if verdict.state == NOT_TESTED:
+    if verdict.state == "not tested":
         why = verdict.question.untested
-        return NOT_TESTED if why in (NOT_TESTED, NOT_ASKED) else f"{NOT_TESTED}, since {why}"
-    if verdict.state == NOT_ASKED:
+        return why if why == verdict.state else f"not tested, since {why}"
+    if verdict.state == "not asked beforehand":
         if not verdict.asker:
-            return NOT_ASKED
+            return "not asked beforehand"
         shown = command("tables", verdict.asker)
-        return f"{NOT_ASKED} here, but in experiment {verdict.asker}: {shown}"
-    if verdict.state in (RUNNING, STOPPED):
+        return f"not asked beforehand here, but in experiment {verdict.asker}: {shown}"
+    if verdict.is_open:
         return _waits(verdict)
-    if verdict.outcome != UNDECIDED:
+    if verdict.outcome != "undecided":
         return f"{outcome_words(verdict)}{_known_sign(verdict)}"
     if verdict.favours_lacking:
         return f"undecided, since {lacking_words(verdict.lacking)}"
@@ -132,10 +114,10 @@ def reason(verdict: Verdict) -> str:
 
 def _waits(verdict: Verdict) -> str:
     """Why a question has no verdict yet, and the command that goes on."""
-    count = f"{verdict.done} of {counted(verdict.wanted, 'trial')}"
-    if verdict.state == RUNNING:
+    count = f"{verdict.done} of {counted(verdict.question.trials, 'trial')}"
+    if verdict.state == "running":
         return f"no verdict before all its trials are done: {count}"
-    if verdict.question.rule in (TABLE, DECLARED_TABLE):
+    if verdict.question.rule in ("table", "declared table"):
         return f"no verdict without all its trials: the table has {count}"
     if verdict.missing:
         again = command("retry", verdict.missing[0].path.parts[-4])
@@ -155,7 +137,7 @@ def in_words(verdict: Verdict) -> str:
         return "; ".join([reason(verdict), *map(str, verdict.pairs.left_out[:1])])
     return (
         f"{reason(verdict)}; {verdict.quantity.name} on {scope(verdict)}: {shown}"
-        if (verdict.state != ANSWERED or verdict.favours_lacking)
+        if (verdict.state != "answered" or verdict.favours_lacking)
         else f"{reason(verdict)} in {verdict.quantity.name} on {scope(verdict)}: {shown}"
     )
 
@@ -163,10 +145,10 @@ def in_words(verdict: Verdict) -> str:
 def _known_sign(verdict: Verdict) -> str:
     """``, though better`` if a difference is too small to matter but its sign is known; else ""."""
     interval, mean, sign = verdict.interval, verdict.mean, verdict.question.sign
-    known = verdict.outcome == TOO_SMALL and interval is not None and interval.excludes_zero()
-    if not known or mean is None or not sign:
+    if verdict.outcome != "too small to matter" or not (sign and interval and mean):
         return ""
-    return f", though {'better' if mean * sign > 0 else 'worse'}"
+    word = f", though {'better' if mean * sign > 0 else 'worse'}"
+    return word if interval.excludes_zero() else ""
 
 
 def scope(verdict: Verdict) -> str:
@@ -191,12 +173,12 @@ def headline(verdict: Verdict) -> str:
 
 def _level_words(verdict: Verdict) -> str:
     question = verdict.question
-    if question.rule == TABLE and verdict.state == ANSWERED:
+    if question.rule == "table" and verdict.state == "answered":
         return CONDITION
-    if verdict.state in (NOT_TESTED, NOT_ASKED) or (question.n == 1 and not question.looks):
+    if not verdict.is_tested or (question.n == 1 and not question.looks):
         return ""
-    which = dict(enumerate(ORDINALS, 1)).get(question.n, f"{question.n}th")
-    text = f" The {which} command about it on these seeds: level {100 * question.level:.2g} %"
+    which, level = ordinal(question.n), f"{100 * question.level:.2g} %"
+    text = f" The {which} command about it on these seeds: level {level}"
     if question.looks:
         text += f", in looks at {', '.join(map(str, question.looks))} seeds"
     return f"{text}."
@@ -205,8 +187,7 @@ def _level_words(verdict: Verdict) -> str:
 def asked_words(verdict: Verdict) -> str:
     """The subject of a question: metric, scenes, seeds and level."""
     question = verdict.question
-    is_tested = verdict.state not in (NOT_TESTED, NOT_ASKED)
-    level = f", level {100 * question.level:.2g} %" if is_tested else ""
+    level = f", level {100 * question.level:.2g} %" if verdict.is_tested else ""
     return f"{verdict.quantity.name} on {places_text(question.places)}{level}"
 
 

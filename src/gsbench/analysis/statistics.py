@@ -39,10 +39,6 @@ ALPHA = ERROR_RATE
 # for a statement about scenes like these: the fewest with which the sign test can reach 5 %
 MIN_SCENES = 6
 Outcome = Literal["supported", "refuted", "too small to matter", "undecided"]
-SUPPORTED: Outcome = "supported"
-REFUTED: Outcome = "refuted"
-TOO_SMALL: Outcome = "too small to matter"
-UNDECIDED: Outcome = "undecided"
 
 Array = NDArray[np.floating]
 
@@ -236,10 +232,10 @@ def favoured(outcome: Outcome, sign: int, direction: int) -> tuple[int, ...]:
     ``sign`` is that of the claim, ``direction`` says whether more is better. If neither side is
     better by the outcome, or if that is not known, both are favoured.
     """
-    if outcome == UNDECIDED:
+    if outcome == "undecided":
         return ()
-    toward = sign * direction * (1 if outcome == SUPPORTED else -1)
-    return (0, 1) if outcome == TOO_SMALL or not toward else (int(toward > 0),)
+    toward = sign * direction * (1 if outcome == "supported" else -1)
+    return (0, 1) if outcome == "too small to matter" or not toward else (int(toward > 0),)
 
 
 @dataclass(frozen=True)
@@ -302,11 +298,10 @@ def median_interval(values: Array, level: float) -> Interval | None:
 def sign_test_needs(scenes: int, level: float) -> int | None:
     """The fewest of ``scenes`` with one sign for which the sign test has p ≤ ``level``, or None."""
     return next(
-        (agree for agree in range(scenes // 2 + 1, scenes + 1) if _sign_p(agree, scenes) <= level),
+        (
+            agree
+            for agree in range(scenes // 2 + 1, scenes + 1)
+            if 2 * float(special.bdtrc(agree - 1, scenes, 0.5)) <= level
+        ),
         None,
     )
-
-
-def _sign_p(agree: int, count: int) -> float:
-    """The two-sided p of the sign test if ``agree`` of ``count`` have the same sign."""
-    return min(1.0, 2 * float(special.bdtrc(agree - 1, count, 0.5))) if agree else 1.0

@@ -1,22 +1,18 @@
 """The notes below a table: who trained, on what, doubts, and how else the compared arms differ."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
+from gsbench.analysis.comparison import Comparison
 from gsbench.analysis.fairness import caveats, counts_notes
 from gsbench.analysis.notes import Note
-from gsbench.analysis.results import TrialResult, group_by, seeds_text
+from gsbench.analysis.results import TrialResult, group_by
+from gsbench.analysis.trial_result import seeds_text
 from gsbench.events import FEWEST_ROUNDS
 from gsbench.runs.layout import EVENTS
 from gsbench.runs.nested import SHOWN
 from gsbench.runs.trial_record import FROM_MODEL, FROM_RENDERS
 from gsbench.words import counted
-
-if TYPE_CHECKING:
-    from gsbench.analysis.comparison import Comparison
 
 LEARNT_NOTHING = "(!)"  # marks means over a trial that is not better than one colour
 # notes on arms that gsbench did not train: whether another program trained them here, and the
@@ -120,7 +116,7 @@ def origin_notes(trials: Sequence[TrialResult]) -> list[Note]:
     by_origin = group_by(not_ours, lambda one: (bool(one.program), one.record.evaluated_from))
     notes = []
     for origin, kind in ORIGINS.items():
-        made = {(f"{t.init}-{t.densify}", t.trainer_version) for t in by_origin.get(origin, [])}
+        made = {(one.arm.name, one.trainer_version) for one in by_origin.get(origin, [])}
         arms = [f"{arm} (version {version})" if origin[0] else arm for arm, version in sorted(made)]
         notes += [Note.of(kind, arms=arms)] if arms else []
     return notes
@@ -146,7 +142,11 @@ def cloud_notes(trials: Sequence[TrialResult]) -> list[Note]:
     for (scene, init, _), group in groups.items():
         clouds = group_by([trial for trial in group if trial.cloud], "cloud")
         if len(clouds) > 1:
-            made = [f"{cloud[:SHOWN]}: {_arms(own)}" for cloud, own in clouds.items()]
+            made = []
+            for cloud, own in clouds.items():
+                arms = group_by(own, "densify").items()
+                texts = (f"{name} {seeds_text(one.seed for one in of)}" for name, of in arms)
+                made.append(f"{cloud[:SHOWN]}: {'; '.join(texts)}")
             notes.append(Note.of("clouds", scene=scene, init=init, clouds=len(clouds), trials=made))
     return notes
 
@@ -171,21 +171,13 @@ def held_out_notes(trials: Sequence[TrialResult]) -> list[Note]:
 
 def points_notes(trials: Sequence[TrialResult]) -> list[Note]:
     """A note for each initialiser on the views that made its points, if photographs did."""
+    found = set()
+    for trial in trials:
+        made_by_views = trial.record.init_report.get("mean_track_length") is not None
+        choice = trial.config.get("init.points_from", "all" if made_by_views else "")
+        found.add((trial.init, str(choice)))
     return [
         Note.of("points of all" if choice == "all" else "points of some", init=init, choice=choice)
-        for init, choice in sorted({(trial.init, _points_from(trial)) for trial in trials})
+        for init, choice in sorted(found)
         if choice
     ]
-
-
-def _points_from(trial: TrialResult) -> str:
-    """The views that made the trial's initial points: all or train; "" if no views did."""
-    if "init.points_from" in trial.config:
-        return str(trial.config["init.points_from"])
-    return "all" if trial.record.init_report.get("mean_track_length") is not None else ""
-
-
-def _arms(trials: Sequence[TrialResult]) -> str:
-    """``adc seeds 0, 1; volumetric seed 0``"""
-    groups = group_by(trials, "densify")
-    return "; ".join(f"{densify} {seeds_text(own)}" for densify, own in groups.items())

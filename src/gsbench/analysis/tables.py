@@ -1,11 +1,8 @@
 """Tables of an experiment: mean and deviation over trials, verdicts, missing values marked."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
-from typing import TYPE_CHECKING
 
 from gsbench.analysis.cells import (
     Cell,
@@ -15,6 +12,7 @@ from gsbench.analysis.cells import (
     make_cell,
     swept_settings,
 )
+from gsbench.analysis.comparison import Comparison, compare, winners
 from gsbench.analysis.differences import (
     between_scenes_notes,
     conditions_between_scenes,
@@ -27,9 +25,6 @@ from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.analysis.table_notes import LEARNT_NOTHING, by_weight, trials_notes
 from gsbench.analysis.trial_result import canonical
 from gsbench.words import counted
-
-if TYPE_CHECKING:
-    from gsbench.analysis.comparison import Comparison
 
 DEFAULT_ROWS = ("scene", "init", "densify")
 SIDE_BY_SIDE = ("scene.split", "scene.sector")
@@ -61,9 +56,6 @@ def build_table(
     table's arms, by default those of the experiment. Bold is the best mean if it was shown to be
     better.
     """
-    # here, since SciPy is slow to import
-    from gsbench.analysis.comparison import compare, winners
-
     trials = list(experiment.trials if trials is None else trials)
     comparison = compare(experiment) if comparison is None else comparison
     folded: dict[str, list[str]] = {}
@@ -100,9 +92,14 @@ def build_table(
     shown_best = winners(comparison)
     bold = _best(cells, quantities, shown_best, varied)
     shown, notes = _rows(cells, bold, quantities), list[Note]()
-    if "scene" in rows and len(scenes) > 1 and _have_unlike_scenes(varied):
+    has_means = "scene" in rows and len(scenes) > 1
+    # scenes of an arm may have different conditions or versions of the code
+    if has_means and any(
+        conditions_between_scenes(of_arm) or differing_code(of_arm)
+        for of_arm in group_by(varied, "arm").values()
+    ):
         notes.append(Note.of("no mean"))
-    elif "scene" in rows and len(scenes) > 1:
+    elif has_means:
         place = list(rows).index("scene")
         means = _means(groups, place, row_labels, column_labels, quantities, scenes, expected)
         best = _best(means, quantities, shown_best, varied)
@@ -254,15 +251,6 @@ def _means(
     return cells if most_scenes else {}
 
 
-def _have_unlike_scenes(trials: Sequence[TrialResult]) -> bool:
-    """Return whether the scenes of an arm have different conditions or versions of the code.
-
-    ``trials`` have their variants.
-    """
-    by_arm = group_by(trials, "arm").values()
-    return any(conditions_between_scenes(of_arm) or differing_code(of_arm) for of_arm in by_arm)
-
-
 def _reading_notes(
     cells: Mapping[Position, Cell],
     quantities: Sequence[Quantity],
@@ -286,7 +274,7 @@ def _reading_notes(
     for one in quantities:
         own = [cell for position, cell in cells.items() if position[2] == one.key]
         reasons = {cell.reason for cell in own if cell.trials and cell.reason}
-        notes += [Note("not available", (("reason", why),), one.name) for why in sorted(reasons)]
+        notes += [Note.of("not available", metric=one.name, reason=why) for why in sorted(reasons)]
     return notes
 
 

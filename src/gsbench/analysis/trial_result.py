@@ -24,37 +24,25 @@ GROUPS = ("scene", "init", "densify")  # groups that every trial's configuration
 ENCODER = json.JSONEncoder(sort_keys=True, separators=(",", ":"))
 
 
-class Configurations:
-    """The settings that determine results, of all trials of an experiment.
+# The settings that determine results, of an experiment's trials by `TrialResult.key`, which the
+# seeds of a trial share: each file is read once for all seeds.
+Configurations = dict[str, Mapping[str, Any]]
 
-    Each file is read once for all seeds. ``trial`` is the key that the seeds of a trial share
-    (`TrialResult.key`).
-    """
 
-    def __init__(self) -> None:
-        self._known: dict[str, Mapping[str, Any]] = {}
-
-    def shared(self, trial: str, folder: Path) -> Mapping[str, Any]:
-        """A trial's settings, read from ``folder`` or from an earlier seed; {} if unreadable."""
-        if trial not in self._known:
-            self.read(trial, [folder])
-        return self._known[trial]
-
-    def read(self, trial: str, folders: Iterable[Path]) -> str:
-        """Read a trial's settings from its first readable folder; return "", or the last fault."""
-        fault = ""
-        for folder in folders:
-            try:
-                config = load_flat_config(folder)
-            except FileNotFoundError:
-                fault = f"{CONFIG} is not there"
-            except DamagedError as error:
-                fault = f"{error.path.name} {error.reason}"
-            else:
-                self._known[trial] = {key: value for key, value in config.items() if is_hashed(key)}
-                return ""
-        self._known.setdefault(trial, {})
-        return fault
+def read_configuration(known: Configurations, trial: str, folders: Iterable[Path]) -> str:
+    """Read a trial's settings from its first readable folder; return "", or the last fault."""
+    fault, known[trial] = "", {}
+    for folder in folders:
+        try:
+            config = load_flat_config(folder)
+        except FileNotFoundError:
+            fault = f"{CONFIG} is not there"
+        except DamagedError as error:
+            fault = f"{error.path.name} {error.reason}"
+        else:
+            known[trial] = {key: value for key, value in config.items() if is_hashed(key)}
+            return ""
+    return fault
 
 
 def load_flat_config(folder: Path) -> dict[str, Any]:
@@ -79,6 +67,12 @@ def config_if_readable(folder: Path) -> Mapping[str, Any]:
         return load_flat_config(folder)
     except (FileNotFoundError, DamagedError):
         return {}
+
+
+def seeds_text(seeds: Iterable[int]) -> str:
+    """``seed 0`` or ``seeds 0, 1``"""
+    shown = [str(seed) for seed in sorted(seeds)]
+    return f"seed{'s' * (len(shown) > 1)} {', '.join(shown)}"
 
 
 def canonical(value: object) -> str:
@@ -109,7 +103,7 @@ class TrialResult:
     record: TrialRecord = field(repr=False)
     # swept settings that distinguish arms of one initialiser and densifier
     variant: tuple[tuple[str, str], ...] = ()
-    settings: Configurations = field(default_factory=Configurations, repr=False, compare=False)
+    settings: Configurations = field(default_factory=dict, repr=False, compare=False)
     alias: Digest = ""  # stands for the digest where a question names its sides otherwise
 
     @property
@@ -150,7 +144,7 @@ class TrialResult:
     @property
     def label(self) -> str:
         """Experiment, scene, arm and folder: enough to find the trial."""
-        return f"{self.experiment}/{self.scene}/{self.init}-{self.densify}/{self.path.name}"
+        return "/".join(self.path.parts[-4:])
 
     @property
     def config(self) -> Mapping[str, Any]:
@@ -159,7 +153,9 @@ class TrialResult:
         They are read once for all trials that share them; `whole_config` is read from the trial's
         own file.
         """
-        return self.settings.shared(self.key, self.path)
+        if self.key not in self.settings:
+            read_configuration(self.settings, self.key, [self.path])
+        return self.settings[self.key]
 
     @cached_property
     def key(self) -> str:

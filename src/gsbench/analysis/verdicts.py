@@ -20,7 +20,6 @@ from gsbench.analysis.questions import look_shares
 from gsbench.analysis.results import TrialResult, Unfinished
 from gsbench.analysis.statistics import (
     ALPHA,
-    UNDECIDED,
     Interval,
     LikeThese,
     Outcome,
@@ -30,7 +29,7 @@ from gsbench.analysis.statistics import (
     outcome_of,
     t_test,
 )
-from gsbench.runs.commands import BY_COMMAND, LOND, SCREENING, Question
+from gsbench.runs.commands import Question
 from gsbench.runs.experiments import Arm
 from gsbench.words import signed
 
@@ -43,14 +42,8 @@ FEW = 1.2
 # The chance, at each look, that an idea of a ledger that is as good as the least difference that
 # matters is given up. It costs power and cannot make a false discovery.
 GIVE_UP = 0.05
-GATE = "gate"  # the rule of a gate's question
 
 State = Literal["answered", "running", "stopped", "not tested", "not asked beforehand"]
-ANSWERED: State = "answered"
-RUNNING: State = "running"
-STOPPED: State = "stopped"
-NOT_TESTED: State = "not tested"
-NOT_ASKED: State = "not asked beforehand"
 
 
 # a scene's mean paired difference, its seeds, and its 95 % interval, which is not tested; without
@@ -87,13 +80,17 @@ class Verdict:
     missing: tuple[Unfinished, ...] = ()  # planned trials that are not there yet
     lacking: tuple[Unfinished, ...] = ()
     favours_lacking: bool = False
-    notes: tuple[Note, ...] = ()
     asker: str = ""
 
     @property
-    def wanted(self) -> int:
-        """The number of the question's trials."""
-        return self.question.trials
+    def is_tested(self) -> bool:
+        """Return whether it is, or will be, more than a mean and an interval."""
+        return self.state not in ("not tested", "not asked beforehand")
+
+    @property
+    def is_open(self) -> bool:
+        """Return whether it waits for trials of its question."""
+        return self.state in ("running", "stopped")
 
     @cached_property
     def scenes(self) -> list[SceneRow]:
@@ -106,6 +103,12 @@ class Verdict:
                 interval = None if test is None else test.interval(ALPHA)
                 found.append((row.scene, float(differences.mean()), len(differences), interval))
         return found
+
+    @cached_property
+    def notes(self) -> list[Note]:
+        """Notes on its trials, beside the reason why it is untestable."""
+        found = [*self.pairs.left_out, *between_scenes_notes(*self.pairs.sides)]
+        return [note for note in found if note != self.untestable]
 
     @property
     def least(self) -> float | None:
@@ -131,8 +134,7 @@ class Verdict:
     @property
     def statements(self) -> int:
         """The number of statements that it makes or will make, each at its level."""
-        tested = self.state not in (NOT_TESTED, NOT_ASKED)
-        return tested * (1 + (self.like_these is not None))
+        return self.is_tested * (1 + (self.like_these is not None))
 
     @property
     def relative(self) -> float:
@@ -184,43 +186,41 @@ def judge(
         _state(question, own, open_),
         question.level,
         done=len(own) + sum(one.failed for one in open_),
-        notes=(*pairs.left_out, *between_scenes_notes(pairs.of_baseline, pairs.of_arm)),
         missing=tuple(one for one in open_ if not one.failed),
     )
     if why := _untestable(verdict):
-        others = tuple(note for note in verdict.notes if note != why)
-        return replace(verdict, untestable=why, notes=others)
-    if question.looks and verdict.state not in (NOT_TESTED, NOT_ASKED):
+        return replace(verdict, untestable=why)
+    if question.looks and verdict.is_tested:
         return _at_looks(verdict)
-    if verdict.state == ANSWERED:
+    if verdict.state == "answered":
         return _without_lacking(_decide(verdict), own, open_)
-    return replace(_measure(verdict), final=verdict.state in (NOT_TESTED, NOT_ASKED))
+    return replace(_measure(verdict), final=not verdict.is_tested)
 
 
 def _state(
     question: Question, own: Sequence[TrialResult], unfinished: Sequence[Unfinished]
 ) -> State:
     if question.untested:
-        return NOT_TESTED
+        return "not tested"
     ideas = {second for _, second in question.digests.values()}
     # gates, ledgers and old declarations know by themselves what was asked before
-    if question.rule == BY_COMMAND and not all(one.asked for one in own if one.digest in ideas):
-        return NOT_ASKED
+    if question.rule == "command" and not all(one.asked for one in own if one.digest in ideas):
+        return "not asked beforehand"
     ended = len(own) + sum(one.failed for one in unfinished)
     if ended >= question.trials:
-        return ANSWERED
-    return RUNNING if any(one.running for one in unfinished) else STOPPED
+        return "answered"
+    return "running" if any(one.running for one in unfinished) else "stopped"
 
 
 def _untestable(verdict: Verdict) -> Note | None:
     """The reason why the question's trials can never answer it."""
     pairs = verdict.pairs
     same = [note for note in pairs.left_out if note.kind in (SAME_CAPTURE, "unlike")]
-    if same or (pairs.left_out and not pairs.rows and verdict.state == ANSWERED):
+    if same or (pairs.left_out and not pairs.rows and verdict.state == "answered"):
         return (*same, *pairs.left_out)[0]
     if (
         pairs.rows
-        and verdict.state == ANSWERED
+        and verdict.state == "answered"
         and all(are_equal(*both) for row in pairs.rows for both in row.trials)
     ):
         return Note.of("equal", pairs=sum(len(row.trials) for row in pairs.rows))
@@ -236,22 +236,22 @@ def _at_looks(asked: Verdict) -> Verdict:
         if not whole or seeds > asked.pairs.seeds:
             break
         at_look = replace(asked, pairs=asked.pairs.first(seeds), level=rate * share)
-        verdict = replace(_decide(at_look), state=ANSWERED)
-        decided = verdict.outcome != UNDECIDED or passes(verdict) or gives_up(verdict)
+        verdict = replace(_decide(at_look), state="answered")
+        decided = verdict.outcome != "undecided" or passes(verdict) or gives_up(verdict)
         verdict = replace(verdict, final=decided or seeds == looks[-1])
         if verdict.final:
             return verdict
-    return replace(verdict, state=RUNNING if asked.state == ANSWERED else asked.state)
+    return replace(verdict, state="running" if asked.state == "answered" else asked.state)
 
 
 def passes(verdict: Verdict) -> bool:
     """Return whether an undecided gate ends: its version is not worse by the least difference."""
-    return verdict.question.rule == GATE and _excludes(verdict, -1, verdict.interval)
+    return verdict.question.rule == "gate" and _excludes(verdict, -1, verdict.interval)
 
 
 def gives_up(verdict: Verdict) -> bool:
     """Return whether an undecided idea of a ledger ends: a gain is unlikely (`GIVE_UP`)."""
-    if verdict.test is None or verdict.question.rule not in (SCREENING, LOND):
+    if verdict.test is None or verdict.question.rule not in ("screening", "lond"):
         return False
     return _excludes(verdict, 1, verdict.test.interval(2 * GIVE_UP))
 
@@ -261,7 +261,7 @@ def _excludes(verdict: Verdict, toward: int, interval: Interval | None) -> bool:
 
     False unless the verdict is undecided.
     """
-    if interval is None or verdict.least is None or verdict.outcome != UNDECIDED:
+    if interval is None or verdict.least is None or verdict.outcome != "undecided":
         return False
     side = verdict.question.sign * toward
     return max(side * interval.low, side * interval.high) < verdict.least
@@ -301,20 +301,19 @@ def _without_lacking(
             missing.append((Unfinished(trial.path, trial.digest, failed=True), side))
         else:
             done[side].add((trial.scene, trial.seed))
-    lacking: tuple[list[Unfinished], list[Unfinished]] = ([], [])
-    for one, side in missing:
-        if (one.scene, one.seed) in done[1 - side] - done[side]:
-            lacking[side].append(one)
+    lacking = [
+        (side, one) for one, side in missing if (one.scene, one.seed) in done[1 - side] - done[side]
+    ]
 
     def favours_lacking(outcome: Outcome) -> bool:
         sides = favoured(outcome, question.sign, verdict.quantity.direction)
-        return any(lacking[side] for side in sides)
+        return any(side in sides for side, _ in lacking)
 
     like, favours = verdict.like_these, favours_lacking(verdict.outcome)
     if like is not None and favours_lacking(like.outcome):
-        like = replace(like, outcome=UNDECIDED)
-    outcome = UNDECIDED if favours else verdict.outcome
-    own = (*lacking[0], *lacking[1])
+        like = replace(like, outcome="undecided")
+    outcome = "undecided" if favours else verdict.outcome
+    own = tuple(one for _, one in sorted(lacking, key=lambda pair: pair[0]))
     return replace(verdict, outcome=outcome, like_these=like, lacking=own, favours_lacking=favours)
 
 
@@ -346,7 +345,7 @@ def interval_of(
     baseline: Arm,
     idea: Arm,
     metric: str,
-    state: State = NOT_TESTED,
+    state: State = "not tested",
     why: str = "",
 ) -> Verdict:
     """Mean and 95 % interval of all trials of two arms in any metric; it is no verdict."""
@@ -369,5 +368,4 @@ def interval_of(
         untested=why or state,
     )
     pairs = pair(own, question, lambda trial: "idea" if trial.arm == idea else "baseline")
-    notes = (*pairs.left_out, *between_scenes_notes(pairs.of_baseline, pairs.of_arm))
-    return _measure(Verdict(question, quantity, pairs, state, ALPHA, done=len(own), notes=notes))
+    return _measure(Verdict(question, quantity, pairs, state, ALPHA, done=len(own)))

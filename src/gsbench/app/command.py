@@ -20,7 +20,7 @@ from gsbench.claims.stopping import log_verdicts
 from gsbench.config.command_words import parse
 from gsbench.config.compose import Trial
 from gsbench.config.explain import explained
-from gsbench.errors import GsbenchError, InputError
+from gsbench.errors import InputError
 from gsbench.eval.options import EvalConfig
 from gsbench.launch.batch import check_parts, missing_folders, need_no_check, run_batch
 from gsbench.launch.dry_run import describe_plan
@@ -37,7 +37,7 @@ def launch(argv: list[str]) -> int:
     Raises InputError for a wrong configuration, and for a single trial's bad input.
     """
     words, multirun, is_dry_run = parse(argv)
-    sweep = Sweep.read(words, multirun)
+    sweep = Sweep(words, multirun)
     # Trials run in this block, so only Hydra's errors are about the words.
     with explained(words, HYDRA_ERRORS):
         if is_dry_run:
@@ -48,7 +48,10 @@ def launch(argv: list[str]) -> int:
             return 0
         if sweep.config.hydra.job.chdir:
             log.info("hydra.job.chdir: paths still start in %s, as the command does", os.getcwd())
-        ended = run_by_hydra(sweep, run_batch) or own_path(sweep)
+        ended = run_by_hydra(sweep, run_batch)
+        if ended is None:
+            own = ended = Ended()
+            run_sweep(sweep, lambda trials: own.add(trials, run_batch(trials)))
     if not ended.trials:  # a sweep whose question is decided needs no trial
         return 0
     if all(outcome.status == "failed" and outcome.bad_input for outcome in ended.outcomes):
@@ -64,7 +67,7 @@ def compose_trials(
 
     Only the words ``typed`` by the user (default: all ``words``) give permissions.
     """
-    sweep = Sweep.read(words, multirun, typed)
+    sweep = Sweep(words, multirun, typed)
     with explained(words, HYDRA_ERRORS):
         return trials_of(sweep)[0]
 
@@ -74,27 +77,11 @@ def trials_of(sweep: Sweep) -> tuple[list[Trial], bool]:
 
     Nothing runs, so no callback is called and Hydra writes nothing.
     """
-    if sweep.other_sweeper:
-        words, is_grid = words_without_sweeper(sweep)
-        trials, are_known = trials_of(Sweep.read(words, is_grid, sweep.composer.typed))
-        return trials, are_known and is_grid
-    if sweep.multirun:
+    if not sweep.other_sweeper:
         return planned_trials(sweep, None)
-    return [sweep.composer.trial(sweep.words)], True
-
-
-def own_path(sweep: Sweep) -> Ended:
-    """Run the trials of a command by gsbench's own sweeper and launcher."""
-    ended = Ended()
-
-    def run(trials: Sequence[Trial]) -> None:
-        ended.add(trials, run_batch(trials))
-
-    if sweep.multirun:
-        run_sweep(sweep, run)
-    else:
-        run(trials_of(sweep)[0])
-    return ended
+    words, is_grid = words_without_sweeper(sweep)
+    trials, are_known = trials_of(Sweep(words, is_grid, sweep.typed))
+    return trials, are_known and is_grid
 
 
 def one_trial_per_scene(verb: str, settings: Sequence[str], metric: str) -> dict[str, Trial]:
@@ -149,7 +136,7 @@ def summarize(outcomes: Sequence[Outcome], trials: Sequence[Trial]) -> int:
     """
     failed = [outcome for outcome in outcomes if outcome.status == "failed"]
     if failed and len(outcomes) == 1:
-        raise (InputError if failed[0].bad_input else GsbenchError)(failed[0].message)
+        raise failed[0].error
     for outcome in failed:
         if not outcome.change:
             print(f"gsbench: failed: {outcome.label}: {outcome.message}", file=sys.stderr)

@@ -20,7 +20,7 @@ from gsbench.app.tuning import tuned_jobs
 from gsbench.claims.stopping import Needed, SequentialTest, log_verdicts
 from gsbench.config.command_words import grid_points, is_interval
 from gsbench.config.compose import Trial
-from gsbench.config.overrides import bare_key, is_sweep, key_of, value_text
+from gsbench.config.overrides import bare_key, is_sweep, key_of, task_words, value_text
 from gsbench.errors import InputError
 from gsbench.files import checked_runs_folder, make_runs_folder
 from gsbench.launch.record import check_looks, planned_rows, record
@@ -37,7 +37,7 @@ GRIDS_ADVICE = (
 
 
 def run_sweep(sweep: Sweep, run: Run) -> None:
-    """Run all points that the words of ``sweep`` and its files span, perhaps in looks."""
+    """Run the trials of a command by gsbench's own sweeper, perhaps in looks."""
     trials, _ = planned_trials(sweep, run)
     if any(trial.values["launch"]["stop_when_decided"] for trial in trials):
         _run_until_decided(trials, run)
@@ -46,12 +46,14 @@ def run_sweep(sweep: Sweep, run: Run) -> None:
 
 
 def planned_trials(sweep: Sweep, run: Run | None) -> tuple[list[Trial], bool]:
-    """The trials of all points, and whether these are known, or depend on a search to come.
+    """The trials of a command, and whether these are known, or depend on a search to come.
 
     ``hydra.sweeper.tune`` says how intervals are searched first, by trials that ``run`` runs; with
     None, in a dry run, only their plan is printed.
     """
-    node = sweep.config.hydra.sweeper
+    if not sweep.multirun:
+        return [sweep.trial(sweep.words)], True
+    node, given = sweep.config.hydra.sweeper, task_words(sweep.words)
     tune: Any = OmegaConf.to_container(node.tune, resolve=True)
     params: Any = OmegaConf.to_container(node.params, resolve=True) if node.params else {}
     # not resolved: their ${…} are for each trial's values
@@ -60,7 +62,7 @@ def planned_trials(sweep: Sweep, run: Run | None) -> tuple[list[Trial], bool]:
     jobs: list[list[str]] = []
     # for each job, the settings that are searched for its arm
     intervals: list[dict[str, Override]] = []
-    for grid_words in words_of_grids(params, grids, sweep.task_words):
+    for grid_words in words_of_grids(params, grids, given):
         own = {bare_key(word.get_key_element()): word for word in sweep.parse(grid_words)}.values()
         points = grid_points([word for word in own if not is_interval(word)])
         jobs += points
@@ -68,10 +70,10 @@ def planned_trials(sweep: Sweep, run: Run | None) -> tuple[list[Trial], bool]:
         intervals += [searched] * len(points)
     try:
         jobs, are_known = tuned_jobs(sweep, tune or {}, jobs, intervals, run)
-        trials = sweep.composer.trials(jobs)
+        trials = sweep.trials(jobs)
     except InputError as error:
-        keys = [key_of(word) for word in sweep.task_words]
-        groups = {key_of(word) for word in sweep.task_words if is_sweep(word)}
+        keys = [key_of(word) for word in given]
+        groups = {key_of(word) for word in given if is_sweep(word)}
         if grids or not any("." in key and key.partition(".")[0] in groups for key in keys):
             raise
         raise InputError(f"{error}; {GRIDS_ADVICE}") from error
@@ -147,7 +149,13 @@ def checked_grids(grids: Any) -> list[dict[str, str]]:
         raise InputError(
             f"{GRIDS} must be a list, each a mapping of settings to values, got {grids!r}"
         )
-    return [{str(key): _text(key, value) for key, value in grid.items()} for grid in grids]
+    for key, value in itertools.chain(*(grid.items() for grid in grids)):
+        if value is None or isinstance(value, list | dict):
+            raise InputError(
+                f"{GRIDS}: {key} must list values as on the command line, such as 1,2,3, got "
+                f"{value!r}"
+            )
+    return [{str(key): value_text(value) for key, value in grid.items()} for grid in grids]
 
 
 def words_of_grids(
@@ -163,21 +171,13 @@ def words_of_grids(
     for grid in grids or [{}]:
         of_grid = set(map(bare_key, grid))
         shared = {key: value for key, value in params.items() if bare_key(key) not in of_grid}
-        words = [f"{key}={value}" for key, value in (*grid.items(), *shared.items())]
-        signs = {bare_key(key): key[: len(key) - len(bare_key(key))] for key in (*grid, *shared)}
-        own = (word for word in given if key_of(word) not in listed - of_grid)
-        jobs.append([*words, *(_signed(word, signs.get(key_of(word), "")) for word in own)])
+        settings = {**grid, **shared}
+        words = [f"{key}={value}" for key, value in settings.items()]
+        signed = {bare_key(key): key for key in settings}
+        for word in given:
+            key = key_of(word)
+            if key not in listed - of_grid:
+                sign = "" if word[0] in "+~" else signed.get(key, key).removesuffix(key)
+                words.append(sign + word)
+        jobs.append(words)
     return jobs
-
-
-def _signed(word: str, sign: str) -> str:
-    """A word that sets a value, with the ``sign`` (``+``) if it has none."""
-    return word if word.startswith(("+", "~")) else f"{sign}{word}"
-
-
-def _text(key: object, value: object) -> str:
-    if value is None or isinstance(value, list | dict):
-        raise InputError(
-            f"{GRIDS}: {key} must list values as on the command line, such as 1,2,3, got {value!r}"
-        )
-    return value_text(value)

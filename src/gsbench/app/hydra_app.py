@@ -6,6 +6,7 @@ the jobs that the sweeper proposes, and runs them itself or by the chosen launch
 
 import logging
 import os
+import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,29 +16,122 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.plugins import Plugins
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.types import HydraContext
-from omegaconf import DictConfig, OmegaConf, read_write
+from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
-from gsbench.app.arm_search import Goal, goal_of
 from gsbench.app.grids import GRIDS, run_sweep
 from gsbench.app.hydra_main import FOLDER, run_main, words_for_files, words_for_new_folder
-from gsbench.app.sweep import BASIC, HYDRA_ERRORS, OWN, Ended, Sweep
-from gsbench.config.compose import Trial, check_permitted, trial_of_job
+from gsbench.app.sweep import BASIC, HYDRA_ERRORS, OWN, Ended, Sweep, better_direction
+from gsbench.app.tuning import mean_of, words_of_point
+from gsbench.config.command_words import grid_points
+from gsbench.config.compose import Trial, check_permitted
+from gsbench.config.explain import explained
 from gsbench.config.hydra_setup import installed_nodes
-from gsbench.config.overrides import is_sweep, key_of, task_words
+from gsbench.config.overrides import bare_key, is_sweep, key_of, parse_word, task_words
+from gsbench.config.schema import check, plain
 from gsbench.errors import GsbenchError, InputError
 from gsbench.files import checked_runs_folder, storage_errors
 from gsbench.launch.batch import begin
 from gsbench.launch.jobs import check_job_links
 from gsbench.launch.outcomes import Outcome, outcome_of_error
 from gsbench.logs import set_up_logging
+from gsbench.runs.experiments import DEFAULT_METRIC, metric_and_question
 from gsbench.system.programs import allow_modules
-from gsbench.words import command
+from gsbench.words import command, counted
 
 MODE = "hydra.mode"
 LAUNCHER = ("hydra/launcher", "hydra.launcher.")
 RunBatch = Callable[..., list[Outcome]]  # `gsbench.launch.batch.run_batch`
 
 log = logging.getLogger(__name__)
+
+
+# ---- what another sweeper gets: values of validation views, over several seeds
+
+
+@dataclass
+class Goal:
+    """The space that another sweeper searches, and the trials of its points, which lie in ``home``.
+
+    A point's value is the mean of a metric over the ``seeds`` (words; none: the job's own seed) on
+    validation views. ``sign`` says what the sweeper looks for: the largest value (1) or the least
+    (-1). A metric whose better ``direction`` is the other one is negated.
+    """
+
+    home: str
+    metric: str
+    direction: int
+    sign: int
+    seeds: tuple[str, ...] = ()
+    # the means of the metric, by the words of the jobs
+    values: dict[tuple[str, ...], float] = field(default_factory=dict)
+
+    def jobs_of(self, job: Sequence[str]) -> list[list[str]]:
+        """The words of a point's trials."""
+        words = [*job, *words_of_point(self.home)]
+        return [[*words, seed] for seed in self.seeds] or [words]
+
+    def value(self, job: Sequence[str], trials: Sequence[Trial]) -> float:
+        """The value of a job with its ``trials``, which are done.
+
+        Raises GsbenchError if one lacks the metric.
+        """
+        mean = mean_of(trials, self.metric)
+        if mean is None:
+            raise GsbenchError(
+                f"{trials[0].files.label} has no {self.metric}, which the sweeper needs"
+            )
+        self.values[tuple(job)] = mean
+        return mean * self.direction * self.sign
+
+    def best_line(self) -> str:
+        """The best values, with the command that trains them; "" if no point has a value."""
+        if not self.values:
+            return ""
+        best = max(self.values, key=lambda job: self.values[job] * self.direction)
+        swept = [word for word in best if not all(word in job for job in self.values)]
+        seeds = ",".join(word.partition("=")[2] for word in self.seeds)
+        words = [*best, *[f"seed={seeds}"] * bool(seeds)]
+        words = ["-m", *words] if len(self.seeds) > 1 else words
+        what, seeds = " ".join(swept) or "the only point", counted(max(1, len(self.seeds)), "seed")
+        return (
+            f"best: {what}, {self.metric} {self.values[best]:.4g} of validation views ({seeds}, in "
+            f"{self.home}); to train it: gsbench {shlex.join(words)}"
+        )
+
+
+def goal_of(sweep: Sweep) -> Goal | None:
+    """The space that the chosen sweeper searches; None for Hydra's grid."""
+    if sweep.other_sweeper == BASIC:
+        return None
+    node = sweep.config.hydra.sweeper
+    lists = {
+        bare_key(str(key)): f"{key}={value}" for key, value in (node.get("params") or {}).items()
+    }
+    lists |= {key_of(word): word for word in sweep.words if is_sweep(word)}
+    seeds = grid_points([parse_word(lists["seed"])]) if "seed" in lists else []
+    values = sweep.trial([word for word in sweep.words if not is_sweep(word)]).values
+    metric = metric_and_question(str(values["eval"].get("primary") or ""))[0] or DEFAULT_METRIC
+    direction, sign = better_direction(metric, values, "eval.primary"), _sign(node)
+    log.info(
+        "hydra/sweeper=%s gets %s%s of validation views, %s",
+        sweep.other_sweeper,
+        "-" if sign != direction else "",
+        metric,
+        "maximized" if sign > 0 else "minimized",
+    )
+    words = tuple(word for (word,) in seeds)
+    return Goal(f"{values['name']}-tune", metric, direction, sign, words)
+
+
+def _sign(sweeper: DictConfig) -> int:
+    """1 for a sweeper (Optuna, Nevergrad, Ax) that looks for the largest value, else -1."""
+    direction = sweeper.get("direction")
+    name = str(getattr(direction, "name", direction)).lower()
+    nevergrad, ax = (
+        OmegaConf.select(sweeper, key)
+        for key in ("optim.maximize", "ax_config.experiment.minimize")
+    )
+    return 1 if name == "maximize" or nevergrad is True or ax is False else -1
 
 
 # ---- what Hydra calls
@@ -60,7 +154,7 @@ class Job:
         # its command has written the questions down
         (outcome,) = self.run([self.trial(config)], asks=False)
         if outcome.status == "failed":  # the launcher passes on what is raised
-            raise _error(outcome)
+            raise outcome.error
 
     def trial(self, config: DictConfig) -> Trial:
         """The trial, with the process as its command's: its folder, its modules, its log."""
@@ -75,7 +169,10 @@ class Job:
         set_up_logging(hydras.hydra.verbose, has_log)
         typed: Any = OmegaConf.to_container(hydras.hydra.overrides, resolve=False)
         of_hydra = [word for word in typed["hydra"] if key_of(word) not in (MODE, GRIDS)]
-        trial = trial_of_job(config, self.allowed, [*of_hydra, *typed["task"]])
+        overrides = (*of_hydra, *typed["task"])
+        with open_dict(config), explained(overrides):
+            config.allow_targets = list(self.allowed)
+            trial = Trial(check(plain(config)), overrides)
         if has_log:  # Hydra's log lies elsewhere
             log.info("the trial's folder is %s", trial.folder)
         return trial
@@ -93,7 +190,7 @@ class HydraApp:
 
     @property
     def job(self) -> Job:
-        return Job(self.run, self.sweep.composer.allowed)
+        return Job(self.run, self.sweep.allowed)
 
     def __call__(self, config: DictConfig) -> None:
         """Run the single trial of a command without ``-m``."""
@@ -110,7 +207,7 @@ class HydraApp:
     ) -> list[JobReturn]:
         """Run the jobs of another sweeper, for gsbench's launcher; returns their values."""
         of_jobs = [self.goal.jobs_of(job) if self.goal else [list(job)] for job in jobs]
-        trials = self.sweep.composer.trials([words for of_job in of_jobs for words in of_job])
+        trials = self.sweep.trials([words for of_job in of_jobs for words in of_job])
         # a search writes no question
         outcomes = self._launch(trials, context, config, asks=self.goal is None)
         by_folder = {outcome.folder: outcome for outcome in outcomes}
@@ -121,9 +218,9 @@ class HydraApp:
             own = [next(rest) for _ in of_job]
             ended = JobReturn(overrides=job, status=JobStatus.COMPLETED)
             try:
-                for trial in own:
-                    if (outcome := by_folder[trial.folder]).status == "failed":
-                        raise _error(outcome)
+                for outcome in (by_folder[trial.folder] for trial in own):
+                    if outcome.status == "failed":
+                        raise outcome.error
                 ended.return_value = self.goal.value(job, own) if self.goal else None
             except GsbenchError as error:
                 ended.return_value, ended.status = error, JobStatus.FAILED
@@ -158,8 +255,8 @@ class HydraApp:
             config.hydra.launcher = files["launcher"]
             config.hydra.runtime.choices["hydra/launcher"] = name
             config.hydra.overrides.hydra = [*words, *(typed or [f"hydra/launcher={name}"])]
-        config.allow_targets = list(self.sweep.composer.allowed)
-        self.sweep.composer.keep_times(config)  # the launcher composes its jobs from it
+        config.allow_targets = list(self.sweep.allowed)
+        self.sweep.keep_times(config)  # the launcher composes its jobs from it
         launcher = Plugins.instance().instantiate_launcher(
             hydra_context=context, task_function=self.job, config=config
         )
@@ -183,17 +280,13 @@ class HydraApp:
         ]
 
 
-def _error(outcome: Outcome) -> GsbenchError:
-    return (InputError if outcome.bad_input else GsbenchError)(outcome.message)
-
-
 # ---- a command
 
 
 def run_by_hydra(sweep: Sweep, run: RunBatch) -> Ended | None:
     """Run a command by `hydra.main`; None if nothing in it needs Hydra's path."""
     config = sweep.config
-    if not (sweep.composer.hydra_words or sweep.other_sweeper):
+    if not (sweep.hydra_words or sweep.other_sweeper):
         return None
     files = words_for_files(config, sweep.words, sweep.multirun)
     has_plugins = config.hydra.callbacks or config.hydra.hydra_logging.get("root")

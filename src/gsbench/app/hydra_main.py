@@ -8,18 +8,23 @@ import logging
 import os
 import secrets
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext, redirect_stderr
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext, redirect_stderr
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import hydra
 import hydra.utils
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from gsbench.app.sweep import BASIC, OWN, Sweep
-from gsbench.config.hydra_setup import CONFIG_NAME, VERSION_BASE, installed_nodes
+from gsbench.config.hydra_setup import (
+    CONFIG_NAME,
+    VERSION_BASE,
+    hydra_config,
+    installed_nodes,
+)
 from gsbench.config.overrides import key_of
 from gsbench.config.schema import register_schemas
 from gsbench.config.trust import HYDRAS_CALLBACKS, load_callbacks
@@ -113,27 +118,14 @@ def run_main(
         names = [*own, *config.allow_targets, *(target for _, target in targets_in(nodes))]
     names = [name for name in names if all(part.isidentifier() for part in name.split("."))]
     register_schemas()
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # else Hydra prints errors and ends the process
     with (
         WHITELIST([*HYDRAS_CALLBACKS, *names, *(f"{name}.*" for name in names)]),
         redirect_stderr(_WithoutHydrasLine(sys.stderr)),
-        _as_program(["gsbench", *argv]),
+        hydra_config(None),
+        patch.object(sys, "argv", ["gsbench", *argv]),
     ):
         hydra.main(**VERSION_BASE, config_path=str(conf_dir()), config_name=CONFIG_NAME)(task)()
-
-
-@contextmanager
-def _as_program(argv: list[str]) -> Iterator[None]:
-    """Let Hydra read ``argv``, and raise errors instead of printing them and ending the process."""
-    saved = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
-    sys.argv, os.environ["HYDRA_FULL_ERROR"] = argv, "1"
-    try:
-        yield
-    finally:
-        sys.argv = saved[0]
-        os.environ.pop("HYDRA_FULL_ERROR")
-        if saved[1] is not None:
-            os.environ["HYDRA_FULL_ERROR"] = saved[1]
-        HydraConfig.instance().cfg = None
 
 
 class _WithoutHydrasLine:

@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
@@ -16,7 +16,7 @@ from gsbench.config.command_words import check_removal, check_words
 from gsbench.config.compose import Composer, Trial
 from gsbench.config.explain import explained
 from gsbench.config.hydra_setup import config_loader, hydra_config, hydra_ready
-from gsbench.config.overrides import is_sweep, parse_word, task_words
+from gsbench.config.overrides import is_sweep, parse_word
 from gsbench.errors import InputError
 from gsbench.launch.outcomes import Outcome
 from gsbench.logs import set_up_logging
@@ -42,24 +42,18 @@ class Ended:
         self.outcomes += outcomes
 
 
-@dataclass(frozen=True)
-class Sweep:
-    """The words of a command for a single trial or, with ``multirun``, for many."""
+class Sweep(Composer):
+    """A command for a single trial or, with ``multirun``, for many: it composes their trials.
 
-    words: tuple[str, ...]
-    multirun: bool
-    composer: Composer
+    Logging is set up as the ``words`` say. Raises InputError with one line for wrong ones.
+    """
 
-    @classmethod
-    def read(cls, words: Sequence[str], multirun: bool, typed: Sequence[str] | None = None) -> Self:
-        """Check and compose ``words``; only those ``typed`` (default: all) give permissions.
-
-        Logging is set up as they say.
-        Raises InputError with one line for wrong ones.
-        """
+    def __init__(
+        self, words: Sequence[str], multirun: bool, typed: Sequence[str] | None = None
+    ) -> None:
         check_words(words)
-        composer = Composer(words, typed)
-        config = composer.config
+        super().__init__(words, typed)
+        config = self.config
         # without -m, a file may say that it is a sweep
         multirun = multirun or config.hydra.mode == RunMode.MULTIRUN
         swept = [word for word in words if is_sweep(word)]
@@ -72,17 +66,7 @@ class Sweep:
                 with hydra_config(config):
                     os.path.abspath(config.hydra.run.dir)
         set_up_logging(config.hydra.verbose)
-        return cls(tuple(words), multirun, composer)
-
-    @property
-    def config(self) -> DictConfig:
-        """The whole configuration of the words that list no values, with Hydra's node."""
-        return self.composer.config
-
-    @property
-    def task_words(self) -> list[str]:
-        """The words without those for Hydra."""
-        return task_words(self.words)
+        self.words, self.multirun = tuple(words), multirun
 
     @property
     def other_sweeper(self) -> str:

@@ -12,25 +12,20 @@ their folders.
 
 from __future__ import annotations
 
-import itertools
 import logging
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+import math
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import chain, islice, product
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hydra.core.override_parser.types import Override
 
 from gsbench.analysis.results import group_by
-from gsbench.app.arm_search import (
-    RETUNED,
-    SEED,
-    ArmSearch,
-    distribution,
-    own_values,
-    words_of_values,
-)
 from gsbench.app.sweep import Run, Sweep, better_direction
-from gsbench.config.command_words import grid_points
+from gsbench.config.command_words import check_makes_trials, grid_points
 from gsbench.config.compose import Composer, Trial
 from gsbench.config.overrides import bare_key, key_of, parse_word
 from gsbench.config.schema import TUNE, TuneSettings
@@ -39,25 +34,84 @@ from gsbench.eval.facts import known_keys
 from gsbench.files import checked_runs_folder, make_runs_folder, write_json
 from gsbench.runs.experiments import (
     DEFAULT_METRIC,
+    SearchPoint,
     TuningRecord,
     make_home,
     metric_and_question,
 )
 from gsbench.runs.layout import TUNING
+from gsbench.runs.nested import flatten
 from gsbench.settings import check_values
 from gsbench.system.install import require_package
 from gsbench.words import command, counted, did_you_mean, listed
 
 if TYPE_CHECKING:
+    from optuna import Study
+    from optuna.distributions import BaseDistribution
     from optuna.trial import Trial as Proposal
 
 log = logging.getLogger(__name__)
+
+# groups that say how all arms are run and judged
+NOT_TUNED = ("scene", "eval", "launch", "tracking", "hydra")
+# settings that have their own values in the trials of a point
+RETUNED = ("seed", "name", "scene.validation", "eval.primary")
+DIGITS = 4  # significant digits of a value, so that people can type it
+
+
+def words_of_point(experiment: str) -> list[str]:
+    """The words of a search's trials in their own ``experiment``, on validation views."""
+    return [f"name={experiment}", "scene.validation=true", "eval.primary=null"]
+
+
+def mean_of(trials: Sequence[Trial], metric: str) -> float | None:
+    """The mean of a metric over ``trials``, from their files; None if one of them lacks it."""
+    records = [trial.files.sound_record() for trial in trials]
+    values = [record.metrics.get(metric) for record in records if record is not None]
+    found = [value for value in values if value is not None]
+    return statistics.fmean(found) if len(found) == len(trials) else None
+
+
+@dataclass(frozen=True)
+class ArmSearch:
+    """The search for the values of an arm, in the experiment whose folder is ``home``.
+
+    ``record`` says what is searched and by which metric, and gets the judged points. ``jobs`` are
+    the arm's jobs in the sweep without the settings `RETUNED`. Optuna's ``study`` proposes points
+    in the ``ranges`` and gets their results.
+    """
+
+    record: TuningRecord
+    home: Path
+    ranges: Mapping[str, BaseDistribution]
+    jobs: Sequence[Sequence[str]]
+    study: Study
+
+    def jobs_of(self, values: Mapping[str, Any]) -> list[list[str]]:
+        """The words of a point's trials."""
+        of_point = [*words_of_point(self.home.name), *words_of_values(values)]
+        seeds = self.record.seeds
+        return [[*job, *of_point, f"seed={seed}"] for job, seed in product(self.jobs, seeds)]
+
+    def judge(self, proposal: Proposal, trials: Sequence[Trial]) -> SearchPoint:
+        """Judge a point by the mean of its trials; it failed if one of them lacks the metric."""
+        from optuna.trial import TrialState
+
+        mean = mean_of(trials, self.record.metric)
+        state = TrialState.FAIL if mean is None else TrialState.COMPLETE
+        self.study.tell(proposal, mean, state=state)
+        settings = {
+            key: float(_text(value)) if isinstance(value, float) else value
+            for key, value in proposal.params.items()
+        }
+        self.record.points.append(point := SearchPoint(settings=settings, value=mean))
+        return point
 
 
 def tuned_jobs(
     sweep: Sweep,
     settings: Mapping[str, Any],
-    jobs: Sequence[Sequence[str]],
+    jobs: list[list[str]],
     intervals: Sequence[Mapping[str, Override]],
     run: Run | None,
 ) -> tuple[list[list[str]], bool]:
@@ -68,60 +122,62 @@ def tuned_jobs(
     if no point of an arm could be judged.
     """
     tune = TuneSettings(**check_values(TuneSettings, settings, TUNE))
-    untuned = [list(job) for job in jobs]
     if not tune.points or not any(intervals):
-        return untuned, True
+        return jobs, True
     if not sweep.config.launch.wait:
         raise InputError(f"{TUNE} learns from results, so launch.wait must be true")
-    trials = sweep.composer.trials(jobs)
-    searches = _plan(tune, jobs, intervals, trials)
-    tuned = {search.record.arm: search for search in searches if search.ranges}
+    trials = sweep.trials(jobs)
+    arms = [trial.folder.parent.name for trial in trials]
+    searches = _plan(tune, trials, arms, jobs, intervals)
     if run is None:
-        print(_describe(searches))
-    if not _search(sweep.composer, list(tuned.values()), run):
+        print(_describe(searches, arms))
+    if not _search(sweep, searches, tune.at_once, run):
         print(
             f"then the trials of the sweep ({len(jobs)}) with the values found, which are not "
             "known yet"
         )
-        return untuned, False
-    best_words = {arm: _best_words(search) for arm, search in tuned.items()}
-    arms = (trial.folder.parent.name for trial in trials)
-    tuned_words = (best_words.get(arm, ()) for arm in arms)
-    return [[*job, *best] for job, best in zip(jobs, tuned_words, strict=True)], True
+        return jobs, False
+    best = {search.record.arm: _best_words(search) for search in searches}
+    return [[*job, *best.get(arm, ())] for job, arm in zip(jobs, arms, strict=True)], True
 
 
-def _search(composer: Composer, searches: Sequence[ArmSearch], run: Run | None) -> bool:
+def _search(
+    composer: Composer, searches: Sequence[ArmSearch], at_once: int, run: Run | None
+) -> bool:
     """Propose, train and judge the points of all arms side by side.
 
     A dry run judges only points whose trials are done already, and returns False at the first other
     point.
     """
-    while True:
-        points: list[tuple[ArmSearch, Proposal, list[list[str]]]] = []
-        for search in searches:
-            points += [
-                (search, proposal, search.jobs_of(proposal.params)) for proposal in search.propose()
-            ]
-        if not points:
-            break
+    wanted, metric = searches[0].record.wanted, searches[0].record.metric
+    for number in range(0, wanted, at_once):
+        points = [
+            (search, search.study.ask(dict(search.ranges)))
+            for search in searches
+            for _ in range(min(at_once, wanted - number))
+        ]
+        jobs = [search.jobs_of(proposal.params) for search, proposal in points]
         # Composed together, because the trials of a point share all but the seed.
-        composed = iter(composer.trials(list(itertools.chain(*(jobs for _, _, jobs in points)))))
-        trials = [list(itertools.islice(composed, len(jobs))) for _, _, jobs in points]
-        missing: list[Trial] = []
-        for (search, _, _), of_point in zip(points, trials, strict=True):
-            missing += [trial for trial in of_point if search.value_of(trial) is None]
+        composed = iter(composer.trials(list(chain(*jobs))))
+        trials = [list(islice(composed, len(of_point))) for of_point in jobs]
+        missing = [trial for trial in chain(*trials) if mean_of([trial], metric) is None]
         if missing:
             if run is None:
                 return False
             _write(searches)  # before training, so that the ranges were on record before any result
             run(missing)
-        for (search, proposal, _), of_point in zip(points, trials, strict=True):
-            point, record = search.judge(proposal, of_point), search.record
+        for (search, proposal), of_point in zip(points, trials, strict=True):
+            point = search.judge(proposal, of_point)
             if missing:
-                value = "failed" if point.value is None else f"{point.value:.5g}"
-                title = f"{search.home.name}: point {len(record.points)} of {record.wanted}"
-                settings = ", ".join(words_of_values(point.settings))
-                log.info("%s: %s: %s %s", title, settings, record.metric, value)
+                log.info(
+                    "%s: point %d of %d: %s: %s %s",
+                    search.home.name,
+                    len(search.record.points),
+                    wanted,
+                    ", ".join(words_of_values(point.settings)),
+                    metric,
+                    "failed" if point.value is None else f"{point.value:.5g}",
+                )
     if run is not None:
         _write(searches)
     return True
@@ -137,40 +193,36 @@ def _write(searches: Sequence[ArmSearch]) -> None:
 
 def _best_words(search: ArmSearch) -> list[str]:
     """The words of the best point of an arm. Raises GsbenchError if no point has the metric."""
-    record, best, name = search.record, search.record.best, search.home.name
-    if best is None:
+    record, name = search.record, search.home.name
+    if (best := record.best) is None:
         raise GsbenchError(
             f"{TUNE}: no point of {record.arm} has a {record.metric} "
             f"({command('status', name)} says why)"
         )
     words = words_of_values(best.settings)
     failed = sum(point.value is None for point in record.points)
-    count = counted(len(record.points), "point") + (f", {failed} failed" if failed else "")
-    where = " ".join(words)
     log.info(
-        "search: best %s %.5g at %s (%s); gsbench report %s",
+        "search: best %s %.5g at %s (%s%s); gsbench report %s",
         record.metric,
         best.value,
-        where,
-        count,
+        " ".join(words),
+        counted(len(record.points), "point"),
+        f", {failed} failed" if failed else "",
         name,
     )
     return words
 
 
-def _describe(searches: Sequence[ArmSearch]) -> str:
-    """The line in which a dry run describes the searches."""
+def _describe(searches: Sequence[ArmSearch], arms: Sequence[str]) -> str:
+    """The line in which a dry run describes the searches; other ``arms`` are not tuned."""
     first = searches[0].record
-    trials = {
-        search.record.arm: len(search.jobs) * len(first.seeds)
-        for search in searches
-        if search.ranges
-    }
-    untuned = [search.record.arm for search in searches if not search.ranges]
+    tuned = [search.record.arm for search in searches]
+    untuned = [arm for arm in dict.fromkeys(arms) if arm not in tuned]
+    trainings = sum(len(search.jobs) for search in searches) * len(first.seeds) * first.wanted
     return (
-        f"a search tunes first: {counted(first.wanted, 'point')} each for {listed(list(trials))}, "
+        f"a search tunes first: {counted(first.wanted, 'point')} each for {listed(tuned)}, "
         f"by {first.metric} of validation views on {listed(first.scenes)} with "
-        f"{counted(len(first.seeds), 'seed')}, {sum(trials.values()) * first.wanted} trainings"
+        f"{counted(len(first.seeds), 'seed')}, {trainings} trainings"
         + (f"; not tuned: {listed(untuned)}" if untuned else "")
     )
 
@@ -180,11 +232,12 @@ def _describe(searches: Sequence[ArmSearch]) -> str:
 
 def _plan(
     tune: TuneSettings,
+    trials: Sequence[Trial],
+    arms: Sequence[str],
     jobs: Sequence[Sequence[str]],
     intervals: Sequence[Mapping[str, Override]],
-    trials: Sequence[Trial],
 ) -> list[ArmSearch]:
-    """The search of each arm of a sweep; for an arm that is not tuned it has no ranges.
+    """The search of each arm of a sweep that has intervals.
 
     Raises InputError for what cannot be searched.
     """
@@ -200,48 +253,51 @@ def _plan(
             f"{TUNE} searches on validation views by itself: leave scene.validation out"
         )
     asked = _asked(tune, trials)
-    by_arm = group_by(
-        zip(trials, jobs, intervals, strict=True), lambda job: job[0].folder.parent.name
-    )
-    return [_arm_search(asked, tune.at_once, of_arm) for of_arm in by_arm.values()]
-
-
-def _arm_search(
-    record: Callable[..., TuningRecord],
-    at_once: int,
-    jobs: Sequence[tuple[Trial, Sequence[str], Mapping[str, Override]]],
-) -> ArmSearch:
-    """The search of an arm with these ``jobs``: each a trial, its words, and its intervals.
-
-    ``record`` makes its record from what is its own.
-    """
-    first = jobs[0][0]
-    home, arm = first.files.home, first.folder.parent.name
-    found: dict[str, Override] = {}
-    for _, _, of_job in jobs:
-        found |= of_job
-    intervals = {key: found[key] for key in sorted(found)}
-    kept = [tuple(word for word in words if key_of(word) not in RETUNED) for _, words, _ in jobs]
-    fixed = set(map(key_of, itertools.chain(*kept)))
-    if both := next((key for key in intervals if bare_key(key) in fixed), None):
-        raise InputError(
-            f"{both} of {arm} is searched in one grid and given in another: leave one of them out"
+    rows = zip(arms, trials, jobs, intervals, strict=True)
+    searches = []
+    for arm, own in group_by(rows, lambda row: row[0]).items():
+        found = {key: interval for *_, of_job in own for key, interval in of_job.items()}
+        kept = [tuple(word for word in job if key_of(word) not in RETUNED) for _, _, job, _ in own]
+        fixed = set(map(key_of, chain(*kept)))
+        if both := next((key for key in sorted(found) if bare_key(key) in fixed), None):
+            raise InputError(
+                f"{both} of {arm} is searched in one grid and given in another: leave one of them "
+                "out"
+            )
+        if not found:
+            continue
+        ranges = {key: distribution(found[key]) for key in sorted(found)}
+        record = TuningRecord(
+            **asked,
+            arm=arm,
+            ranges={key: str(found[key].input_line).partition("=")[2] for key in ranges},
+            log=[key for key, searched in ranges.items() if getattr(searched, "log", False)],
+            points=[],
         )
-    ranges = {key: distribution(interval) for key, interval in intervals.items()}
-    texts = {key: str(one.input_line).partition("=")[2] for key, one in intervals.items()}
-    log_scaled = [key for key, values in ranges.items() if getattr(values, "log", False)]
-    return ArmSearch(
-        record(arm=arm, ranges=texts, log=log_scaled, points=[]),
-        home.with_name(f"{home.name}-tune-{arm}"),
-        at_once,
-        ranges,
-        list(dict.fromkeys(kept)),
-        own_values(first.values, ranges),
+        home = trials[0].files.home
+        study = _study(record, tune.at_once)
+        settings = flatten(own[0][1].values)
+        first = {key: settings.get(bare_key(key)) for key in ranges}
+        if all(_is_in(first[key], searched) for key, searched in ranges.items()):
+            study.enqueue_trial(first)
+        place = home.with_name(f"{home.name}-tune-{arm}")
+        searches.append(ArmSearch(record, place, ranges, list(dict.fromkeys(kept)), study))
+    return searches
+
+
+def _study(record: TuningRecord, at_once: int) -> Study:
+    import optuna
+
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    return optuna.create_study(
+        direction="maximize" if record.direction > 0 else "minimize",
+        # Points that run together must know of each other, or one could be proposed twice.
+        sampler=optuna.samplers.TPESampler(seed=0, constant_liar=at_once > 1),
     )
 
 
-def _asked(tune: TuneSettings, trials: Sequence[Trial]) -> Callable[..., TuningRecord]:
-    """The record of the searches, without arms and their ranges.
+def _asked(tune: TuneSettings, trials: Sequence[Trial]) -> dict[str, Any]:
+    """What the records of all searches have in common.
 
     Raises InputError for an unknown metric, and for one without a better direction.
     """
@@ -256,10 +312,8 @@ def _asked(tune: TuneSettings, trials: Sequence[Trial]) -> Callable[..., TuningR
         )
     direction = better_direction(metric, values, f"{TUNE}.metric")
     try:
-        seeds = [
-            int(word.partition("=")[2])
-            for (word,) in grid_points([parse_word(f"{SEED}={tune.seed}")])
-        ]
+        points = grid_points([parse_word(f"seed={tune.seed}")])
+        seeds = [int(word.partition("=")[2]) for (word,) in points]
     except ValueError:
         raise InputError(
             f"{TUNE}.seed must list whole numbers, as 100,101, got {tune.seed!r}"
@@ -269,12 +323,60 @@ def _asked(tune: TuneSettings, trials: Sequence[Trial]) -> Callable[..., TuningR
             f"{TUNE}.seed: {listed(list(map(str, both)))} is a seed of the sweep, too: tune with "
             "others"
         )
-    return partial(
-        TuningRecord,
-        sweep=trials[0].files.home.name,
-        metric=metric,
-        direction=direction,
-        wanted=tune.points,
-        seeds=seeds,
-        scenes=list(dict.fromkeys(trial.values["scene"]["name"] for trial in trials)),
+    return {
+        "sweep": trials[0].files.home.name,
+        "metric": metric,
+        "direction": direction,
+        "wanted": tune.points,
+        "seeds": seeds,
+        "scenes": list(dict.fromkeys(trial.values["scene"]["name"] for trial in trials)),
+    }
+
+
+# ---- values
+
+
+def distribution(override: Override) -> BaseDistribution:
+    """The range of an interval, for Optuna.
+
+    Raises InputError for a wrong interval or a setting that arms share.
+    """
+    from optuna.distributions import FloatDistribution, IntDistribution
+
+    check_makes_trials(override)
+    key = override.get_key_element()
+    if bare_key(key).partition(".")[0] in (*NOT_TUNED, *RETUNED):
+        raise InputError(f"{key} belongs to what all arms share, not to one arm: give it a value")
+    sweep: Any = override.value()
+    low, high, log_scale = sweep.start, sweep.end, "log" in sweep.tags
+    try:
+        if not -math.inf < low < high < math.inf:
+            raise ValueError("an interval goes from a number to a larger one")
+        if log_scale and low <= 0:
+            raise ValueError("on a logarithmic scale an interval begins above 0")
+        if "int" in sweep.tags:
+            if not float(low).is_integer() or not float(high).is_integer():
+                raise ValueError("whole numbers lie between whole numbers")
+            return IntDistribution(int(low), int(high), log=log_scale)
+        return FloatDistribution(float(low), float(high), log=log_scale)
+    except ValueError as error:
+        raise InputError(f"{override.input_line}: {error}") from error
+
+
+def _is_in(value: Any, searched: Any) -> bool:
+    """Return whether ``value`` lies in ``searched`` and rounding to `DIGITS` does not change it."""
+    is_whole = isinstance(searched.low, int)
+    if isinstance(value, bool) or not isinstance(value, int if is_whole else int | float):
+        return False
+    return searched.low <= value <= searched.high and (
+        is_whole or float(_text(float(value))) == value
     )
+
+
+def words_of_values(values: Mapping[str, Any]) -> list[str]:
+    """The words of a command line that set ``values``, rounded to `DIGITS`."""
+    return [f"{key}={_text(value)}" for key, value in values.items()]
+
+
+def _text(value: Any) -> str:
+    return f"{value:.{DIGITS}g}" if isinstance(value, float) else str(value)

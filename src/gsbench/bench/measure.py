@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch.profiler import ProfilerActivity, profile
 
 from gsbench.bench.scenes import SEED, make_scene
 from gsbench.densify import ADC
@@ -35,16 +34,6 @@ NEVER = 10**9  # iterations
 ZERO_RATE = 1e-20
 # whole steps between two readings of the clock and of the losses
 STEPS_AT_ONCE = {"cpu": 1, "cuda": 10}
-LONGEST_KERNELS = 12  # that get a name of their own
-# Calls of CUDA's runtime in which the host waits for the GPU. A copy waits only if it goes to
-# pageable memory.
-WAITING_CALLS = (
-    "cudaStreamSynchronize",
-    "cudaDeviceSynchronize",
-    "cudaEventSynchronize",
-    "cudaMemcpyAsync",
-    "cudaMemcpy",
-)
 UNUSED_FOLDER = Path("/nonexistent")  # for snapshots, which are off
 
 
@@ -126,8 +115,11 @@ class Stepper:
 
         A step has view, render, loss, backward pass, statistics and Adam. Losses are read at times.
         """
+        steps = STEPS_AT_ONCE[self.device.type]
         begin = self._now()
-        steps = self._iterate()
+        for _ in range(steps):
+            self.trainer.iterate(UNUSED_FOLDER)
+        self.trainer.losses.wait()
         return steps / (self._now() - begin)
 
     def frames_per_second(self) -> float:
@@ -139,53 +131,10 @@ class Stepper:
                 self.trainer.render(0)
         return frames / (self._now() - begin)
 
-    def profiled_steps(self) -> dict[str, dict[str, float]]:
-        """The kernels of whole training steps and the host's waits, as `per_step` has them."""
-        gpu = [ProfilerActivity.CUDA] if self.device.type == "cuda" else []
-        self._now()
-        with profile(activities=[ProfilerActivity.CPU, *gpu], acc_events=True) as profiler:
-            steps = self._iterate()
-        return per_step(profiler.key_averages(), steps, self.device)
-
-    def _iterate(self) -> int:
-        """Make whole training steps, and return how many."""
-        steps = STEPS_AT_ONCE[self.device.type]
-        for _ in range(steps):
-            self.trainer.iterate(UNUSED_FOLDER)
-        self.trainer.losses.wait()
-        return steps
-
     def _now(self) -> float:
         if self.device.type == "cuda":
             torch.cuda.synchronize()
         return time.perf_counter()
-
-
-def per_step(
-    events: Iterable[Any], steps: int, device: torch.device
-) -> dict[str, dict[str, float]]:
-    """Times of one step, from what torch's profiler recorded on ``device`` in ``steps`` steps.
-
-    ``kernels_ms``: the time of each kernel, the longest first; on a CPU, the own time of each of
-    torch's operators. ``waits_ms``: the host's time in each of `WAITING_CALLS`. ``waits``: how
-    often it makes that call.
-    """
-    on_gpu = device.type == "cuda"
-    kind = "CUDA" if on_gpu else "CPU"
-    times: dict[str, float] = {}
-    waits: dict[str, float] = {}
-    waits_ms: dict[str, float] = {}
-    for event in events:
-        own_ms = event.self_cpu_time_total / 1e3 / steps
-        if event.key in WAITING_CALLS:
-            waits[event.key] = event.count / steps
-            waits_ms[event.key] = round(own_ms, 4)
-        elif event.device_type.name == kind:
-            times[event.key] = event.self_device_time_total / 1e3 / steps if on_gpu else own_ms
-    ordered = sorted(times, key=times.__getitem__, reverse=True)
-    kernels = {name: round(times.pop(name), 4) for name in ordered[:LONGEST_KERNELS]}
-    kernels["all others"] = round(sum(times.values()), 4)
-    return {"kernels_ms": kernels, "waits": waits, "waits_ms": waits_ms}
 
 
 def device_of(raster: str) -> torch.device:
@@ -223,7 +172,6 @@ def run_bench(
     settings: Iterable[Setting],
     repeats: int = 5,
     memory: bool = True,
-    kernels: bool = False,
 ) -> list[dict[str, Any]]:
     """Time the training step with each of ``rasters`` in each of ``settings``.
 
@@ -239,15 +187,14 @@ def run_bench(
     - ``steps_per_second``: whole training steps, without waits in between;
     - ``fps``: frames per second of rendering alone;
     - ``peak_memory_mb``: of a fresh process that makes the same steps (on a GPU: torch's
-      allocations there); None if ``memory`` is False;
-    - with ``kernels``, also the columns of `per_step`, of steps that are not timed otherwise.
+      allocations there); None if ``memory`` is False.
     """
     rows = []
     with progress("bench") as report:
         for setting in settings:
             model = f"{setting.count:,} Gaussians" if setting.ply is None else setting.ply.name
             say = partial(report, f"{setting.size}, {model}")
-            own = _compare(rasters, setting, repeats, kernels, say)
+            own = _compare(rasters, setting, repeats, say)
             if memory:
                 for row in own:
                     say(len(own), len(own), f"memory of {row['raster']}")
@@ -263,7 +210,6 @@ def _compare(
     rasters: Sequence[str],
     setting: Setting,
     repeats: int,
-    kernels: bool,
     say: Callable[[int, int, str], None],
 ) -> list[dict[str, Any]]:
     """The rows of one setting, without the memory."""
@@ -288,5 +234,5 @@ def _compare(
         }
         row |= {key: round(statistics.median(s[key] for s in counted), 3) for key in counted[0]}
         row |= {"threads": stepper.threads, "device": stepper.device.type, "peak_memory_mb": None}
-        rows.append(row | (stepper.profiled_steps() if kernels else {}))
+        rows.append(row)
     return rows

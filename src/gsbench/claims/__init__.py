@@ -1,1 +1,1 @@
-"""Claims and their verdicts: declared questions, seeds until they are decided, pooled results."""
+"""Looks at trials while they run, ledgers of ideas, archives, and sites of them."""

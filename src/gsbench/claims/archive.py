@@ -7,10 +7,11 @@ experiment's commands or ledger, records of searches, and pictures if they were 
 without a usable result has its configuration alone: no verdict favours an arm that lacks results.
 
 Archives may come from strangers, so sizes, names, checksums and contents are checked. Those of the
-first version have other files (`gsbench.claims.old_archive`).
+first version have other files (`as_files`).
 """
 
 import hashlib
+import io
 import json
 import os
 import zipfile
@@ -20,8 +21,9 @@ from lzma import LZMAError
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from gsbench.analysis.results import Experiment, newest_code, read_experiment, read_views
-from gsbench.claims.old_archive import as_files
 from gsbench.errors import InputError
 from gsbench.parsing import read_typed
 from gsbench.runs.experiments import TuningRecord
@@ -198,3 +200,35 @@ def _member(archive: zipfile.ZipFile, name: str) -> bytes:
         )
     with archive.open(info) as stream:
         return stream.read(MAX_BYTES)
+
+
+def as_files(name: str, contents: Mapping[str, bytes]) -> dict[str, bytes]:
+    """The files of the experiment ``name`` by their places in a runs folder.
+
+    ``contents`` are those of an archive of the first version: JSON lines of all trials.
+    """
+    import pandas as pd  # here, since it is slow to import
+
+    def lines(member: str) -> list[dict[str, Any]]:
+        return [json.loads(line) for line in contents.get(member, b"").decode().splitlines()]
+
+    texts: dict[str, str] = {}
+    for member, file, part in (
+        ("results.jsonl", RESULTS, "results"),
+        ("from_pixels.jsonl", FROM_PIXELS, "measures"),
+    ):
+        for line in lines(member):
+            texts[f"{line['folder']}/{file}"] = json.dumps(line[part])
+    for line in lines("configurations.jsonl"):
+        for folder, seed in line["trials"]:
+            values = line["configuration"] | {"seed": seed}
+            texts[f"{folder}/{CONFIG}"] = yaml.safe_dump(values)
+    for line in lines("unfinished.jsonl"):
+        texts[f"{line['folder']}/{CONFIG}"] = yaml.safe_dump(line["configuration"])
+        texts[f"{line['folder']}/{FAILED}"] = "{}"
+    frame = pd.read_csv(io.BytesIO(contents[PER_VIEW]), dtype=str, keep_default_na=False)
+    for folder, own in frame.groupby("trial", sort=False):
+        views = own.drop(columns="trial").to_csv(index=False, lineterminator="\n")
+        texts[f"{folder}/{PER_VIEW}"] = views
+    files = {f"{name}/{place}": text.encode() for place, text in texts.items()}
+    return files | {f"{name}/{own}": contents[own] for own in (DECLARED, LEDGER) if own in contents}

@@ -25,7 +25,6 @@ from gsbench.analysis.images import PixelMeasures, region_record, textured_error
 from gsbench.analysis.old_declarations import all_questions
 from gsbench.analysis.quantities import TEXTURED
 from gsbench.analysis.results import Experiment, TrialResult, group_by, newest_code, read_views
-from gsbench.analysis.verdicts import RUNNING, STOPPED
 from gsbench.claims.archive import (
     FORMAT,
     MANIFEST,
@@ -73,7 +72,11 @@ def write_archive(
     """
     left_out = list(experiment.warnings)
     unfinished = {one.path for one in experiment.unfinished if one.path.is_dir()}
-    files, kept = _of_experiment(experiment.folder), list[TrialResult]()
+    files, kept, home = dict[str, bytes](), list[TrialResult](), experiment.folder
+    if (home / COMMANDS).is_file():
+        files[f"{home.name}/{COMMANDS}"] = _shared_commands(home)
+    if (home / DECLARED).is_file():
+        files[f"{home.name}/{DECLARED}"] = read_bytes(home / DECLARED)
     for trial in (*experiment.trials, *experiment.older):
         try:
             files |= _of_trial(trial, pictures)
@@ -90,17 +93,12 @@ def write_archive(
             with suppress(InputError):  # a trial whose pictures cannot be read
                 measures = PixelMeasures(error_textured=textured_error(trial)).to_json()
                 files[f"{_folder(trial.path)}/{FROM_PIXELS}"] = _page(measures)
-    files |= _searches(experiment.folder, kept)
+    files |= _searches(home, kept)
     check_size(sum(map(len, files.values())))
     _write_zip(out, experiment.name, dict(sorted(files.items())))
-    return left_out, _open(experiment)
-
-
-def _open(experiment: Experiment) -> str:
     answers = compare(newest_code(experiment)).answers
-    states = [verdict.state for one in answers for verdict in (one.verdict, *one.others)]
-    still_open = sum(state in (RUNNING, STOPPED) for state in states)
-    return f"open: {still_open} of {len(states)}" if still_open else ""
+    is_open = [verdict.is_open for one in answers for verdict in (one.verdict, *one.others)]
+    return left_out, f"open: {sum(is_open)} of {len(is_open)}" if any(is_open) else ""
 
 
 def _write_zip(out: Path, name: str, files: Mapping[str, bytes]) -> None:
@@ -140,16 +138,6 @@ def _of_unfinished(path: Path) -> dict[str, bytes]:
     if TrialFolder(path).state() in ("failed", "damaged"):
         reason = without_folders(TrialFolder(path).failure().reason)
         files[f"{folder}/{FAILED}"] = _page({"status": "failed", "message": reason})
-    return files
-
-
-def _of_experiment(home: Path) -> dict[str, bytes]:
-    """The experiment's own records."""
-    files = {}
-    if (home / COMMANDS).is_file():
-        files[f"{home.name}/{COMMANDS}"] = _shared_commands(home)
-    if (home / DECLARED).is_file():
-        files[f"{home.name}/{DECLARED}"] = read_bytes(home / DECLARED)
     return files
 
 

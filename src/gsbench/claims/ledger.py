@@ -20,37 +20,23 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Literal
 
-from gsbench.analysis.quantities import COSTS, relative_change
 from gsbench.analysis.questions import plan_looks
 from gsbench.analysis.results import Arm, Experiment, read_experiment
 from gsbench.analysis.sentences import numbers, reason, with_notes
-from gsbench.analysis.statistics import REFUTED, SUPPORTED, TOO_SMALL
 from gsbench.analysis.verdicts import Verdict, gives_up, judge
 from gsbench.errors import InputError
-from gsbench.runs.commands import (
-    BASELINE,
-    CONFIRMATION,
-    LOND,
-    SCREENING,
-    Idea,
-    Ledger,
-    Question,
-    read_history,
-)
+from gsbench.runs.commands import BASELINE, Idea, Ledger, Question, Rule, read_history
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.words import counted, least_text, listed
 
-IDEAS, RATE = 40, 0.1  # the defaults of a ledger
-# The chance that an idea without an effect passes on to its test, over all looks. Half of it or
-# twice as much finds about as many good ideas (findings/simulations.md).
+# The chance that an idea without an effect passes on to its test, over all looks, by one side of
+# its interval. Half or twice as much finds about as many good ideas (findings/simulations.md).
 SCREEN = 0.1
 SEEDS_FROM, SEEDS = 100_000, 900_000  # of tests
-KEPT, DROPPED, UNDECIDED, FAILED = "kept", "dropped", "undecided", "failed"
-BEGUN = "begun"
-CHOOSES = "it only chooses what is tested on new seeds"
-LOOKS_WORSE = "looks worse"  # on the seeds of all ideas, which is no verdict
-MEND = "bring back the file as gsbench wrote it, or begin another ledger"
+# of an idea; it has none ("begun") before it is decided
+Result = Literal["kept", "dropped", "undecided", "failed", "begun"]
 
 
 @dataclass(frozen=True)
@@ -68,14 +54,14 @@ class Book:
     @cached_property
     def questions(self) -> dict[str, Question]:
         """The question of each idea in their order: its test, else its screening as a test."""
-        rules = (SCREENING, LOND)  # a test comes after its screening
+        rules = ("screening", "lond")  # a test comes after its screening
         asked = (one for one in self.experiment.history.questions if one.rule in rules)
         return {one.name: replace(one, untested="") for one in asked}
 
     @property
     def tests(self) -> dict[str, Question]:
         """The tests on seeds that no idea had seen."""
-        return {name: one for name, one in self.questions.items() if one.rule == LOND}
+        return {name: one for name, one in self.questions.items() if one.rule == "lond"}
 
     @cached_property
     def verdicts(self) -> dict[str, Verdict]:
@@ -84,7 +70,7 @@ class Book:
         return {name: judge(trials, one, unfinished) for name, one in self.questions.items()}
 
     def ask(
-        self, idea: Idea, baseline: Idea, rule: str, seeds: tuple[int, ...], level: float
+        self, idea: Idea, baseline: Idea, rule: Rule, seeds: tuple[int, ...], level: float
     ) -> Question:
         """The question of an idea by one of the ledger's rules."""
         opened, scenes = self.opened, baseline.digests
@@ -97,95 +83,80 @@ class Book:
             idea=Arm("", idea.name),
             digests={scene: (old, idea.digests[scene]) for scene, old in scenes.items()},
             seeds=dict.fromkeys(scenes, seeds),
-            looks=() if rule == CONFIRMATION else plan_looks(len(seeds)),
+            looks=() if rule == "confirmation" else plan_looks(len(seeds)),
             rule=rule,
             level=level,
-            untested=CHOOSES if rule == SCREENING else "",
+            untested="it only chooses what is tested on new seeds" if rule == "screening" else "",
             versions=True,
             name=idea.name,
         )
 
-    def screening(self, idea: Idea) -> Question:
-        """The comparison on the seeds of all ideas.
-
-        An idea passes by one side of the interval, so the interval has twice the rate.
-        """
-        baseline, seeds = self.ideas[idea.against], self.opened.seeds
-        return self.ask(idea, baseline, SCREENING, seeds, 2 * SCREEN)
-
-    def test(self, name: str) -> Question:
-        """The test of an idea that looks better, in as many looks on new seeds.
+    def next_test(self, name: str) -> Question | None:
+        """The test of an idea that looks better and has none, in as many looks on new seeds.
 
         These are in a row that begins where the hash of all lines before says, so another ledger on
         the same captures has other seeds.
         """
+        verdict = self.verdicts[name]
+        if name in self.tests or not verdict.final or result_of(verdict) != "kept":
+            return None
         history, count = self.experiment.history, len(self.opened.seeds)
         seen = {seed for one in history.questions for _, seed in one.places}
         first = SEEDS_FROM + int(history.head, 16) % SEEDS
         while not seen.isdisjoint(range(first, first + count)):
             first += count
-        rate, number = self.opened.rate, len(self.tests) + 1
-        level = level_of_test(rate, self.opened.ideas, number, len(self.kept))
+        number, ideas = len(self.tests) + 1, range(1, self.opened.ideas + 1)
+        # The weights 1 / number give the first tests more than equal ones would: few ideas of the
+        # planned ones pass on to a test, and each kept one raises the levels after it.
+        level = self.opened.rate * (len(self.kept) + 1) / number / sum(1 / one for one in ideas)
         seeds = dict.fromkeys(self.questions[name].seeds, tuple(range(first, first + count)))
-        level = min(1.0, 2 * level)
-        return replace(self.questions[name], rule=LOND, seeds=seeds, level=level)
-
-    def is_measured(self, idea: str) -> bool:
-        """Return whether a trial of the idea gave a result."""
-        known = {digest for digest, _ in self.experiment.history.results}
-        known |= {one.digest for one in self.experiment.trials}
-        return not known.isdisjoint(self.ideas[idea].digests.values())
+        test = replace(self.questions[name], rule="lond", seeds=seeds, level=min(1.0, 2 * level))
+        return test.with_id(history.head)
 
     def failure(self, idea: str) -> str:
         """The reason why an idea has no result, since its trials failed; "" otherwise."""
-        digests = self.ideas[idea].digests
-        for one in self.experiment.unfinished:
-            if one.failed and digests.get(one.scene) == one.digest and not self.is_measured(idea):
+        own = self.ideas[idea].digests
+        experiment = self.experiment
+        measured = {digest for digest, _ in experiment.history.results}
+        measured |= {one.digest for one in experiment.trials}
+        for one in experiment.unfinished:
+            is_own = one.failed and own.get(one.scene) == one.digest
+            if is_own and measured.isdisjoint(own.values()):
                 return TrialFolder(one.path).failure().reason
         return ""
 
-    def result(self, idea: str) -> str:
+    def result(self, idea: str) -> Result:
         if self.failure(idea):
-            return FAILED
+            return "failed"
         verdict = self.verdicts[idea]
         found = result_of(verdict)
-        ended = verdict.final and (found != KEPT or idea in self.tests)
-        return found if ended else BEGUN
-
-    def is_decided(self, idea: str) -> bool:
-        """Return whether the idea has a result; it has none if its trials failed."""
-        return self.result(idea) not in (FAILED, BEGUN)
+        return found if verdict.final and (found != "kept" or idea in self.tests) else "begun"
 
     def why(self, idea: str) -> str:
         """The reason of a result."""
         if failure := self.failure(idea):
             return failure
         verdict = self.verdicts[idea]
-        looks_worse = idea not in self.tests and verdict.outcome == REFUTED
-        return with_notes(LOOKS_WORSE if looks_worse else reason(verdict), verdict)
+        # on the seeds of all ideas that is no verdict
+        looks_worse = idea not in self.tests and verdict.outcome == "refuted"
+        return with_notes("looks worse" if looks_worse else reason(verdict), verdict)
 
     def line(self, idea: str) -> str:
         """``larger_splits against baseline: kept: better; psnr +0.5 (…); 3 new seeds, level …``"""
-        verdict, test, facts = self.verdicts[idea], self.tests.get(idea), [self.why(idea)]
-        if not facts[0].startswith(result := self.result(idea)):  # such as undecided
-            facts[0] = f"{result}: {facts[0]}"
+        verdict, test = self.verdicts[idea], self.tests.get(idea)
+        text, result, seeds = self.why(idea), self.result(idea), verdict.pairs.seeds
+        if not text.startswith(result):  # such as undecided
+            text = f"{result}: {text}"
         if shown := numbers(verdict):
-            where = f"{counted(verdict.pairs.seeds, 'seed')} of all ideas"
+            where = f"{counted(seeds, 'seed')} of all ideas"
             if test:
-                new = counted(verdict.pairs.seeds, "new seed")
-                where = f"{new}, level {50 * test.level:.2g} %"
-            facts += [f"{self.opened.metric} {shown}", where]
-        return f"{idea} against {self.ideas[idea].against}: {'; '.join(facts)}"
-
-    def ratio(self, idea: str) -> float | None:
-        """The Gaussians of an idea over those of what it is compared with."""
-        pairs = self.verdicts[idea].pairs
-        change = relative_change(pairs.of_baseline, pairs.of_arm, COSTS["gaussians"][1])
-        return None if change is None else 1 + change.of_totals
+                where = f"{counted(seeds, 'new seed')}, level {50 * test.level:.2g} %"
+            text += f"; {self.opened.metric} {shown}; {where}"
+        return f"{idea} against {self.ideas[idea].against}: {text}"
 
     @property
     def kept(self) -> list[str]:
-        return [idea for idea in self.tests if self.result(idea) == KEPT]
+        return [idea for idea in self.tests if self.result(idea) == "kept"]
 
     @property
     def tried(self) -> int:
@@ -196,23 +167,23 @@ class Book:
         """Raise InputError if a scene of ``asked`` was used before, by name or photographs."""
         earlier = set(self.ideas[BASELINE].digests)
         for one in self.experiment.history.questions:
-            if one.rule == CONFIRMATION and not any(map(one.covers, asked)):
+            if one.rule == "confirmation" and not any(map(one.covers, asked)):
                 earlier |= one.digests.keys()
         data = {one.scene: one.record.hashes.get("data") for one in self.experiment.trials}
-        seen = {data[scene] for scene in earlier & data.keys()}
-        used = {one for one in asked[0].digests if one in earlier or data.get(one, "") in seen}
-        if used:
+        seen = {data.get(scene) for scene in earlier}
+        if used := sorted(
+            one for one in asked[0].digests if one in earlier or data.get(one, one) in seen
+        ):
             raise InputError(
-                f"{listed(sorted(used))} was seen by the ideas, or by an earlier confirmation: "
+                f"{listed(used)} was seen by the ideas, or by an earlier confirmation: "
                 "confirm on other captures"
             )
 
     def describe(self) -> list[str]:
         """Two lines: what decides, and how many of the planned ideas were tried and kept."""
         opened = self.opened
-        better = "more" if opened.sign > 0 else "less"
         return [
-            f"{opened.metric} decides: {better} is better, and "
+            f"{opened.metric} decides: {'more' if opened.sign > 0 else 'less'} is better, and "
             f"{least_text(opened.least, opened.relative)} is the least that matters. At most "
             f"{100 * opened.rate:g} % of the kept ideas are expected to be no better.",
             f"{self.tried} of {opened.ideas} planned ideas were tried, and {len(self.kept)} kept, "
@@ -233,7 +204,9 @@ def read_ledger(home: Path) -> Book:
             f"{home.name} has no ledger: gsbench ledger new {home.name} --metric … begins one"
         )
     if history.faults:
-        raise InputError(f"{history.faults[0]}: {MEND}")
+        raise InputError(
+            f"{history.faults[0]}: bring back the file as gsbench wrote it, or begin another ledger"
+        )
     experiment = read_experiment(home)
     unknown = {(one.scene, one.digest) for one in experiment.trials}
     for one in history.questions:
@@ -247,18 +220,9 @@ def read_ledger(home: Path) -> Book:
     return Book(experiment, history.ledger)
 
 
-def level_of_test(rate: float, ideas: int, number: int, kept: int) -> float:
-    """The level of the test ``number`` (from 1) after ``kept`` ideas were kept.
-
-    The weights ``1 / number`` give the first tests more than equal weights would: few ideas of the
-    planned ones pass on to a test, and each kept one raises the levels after it.
-    """
-    return rate * (kept + 1) / number / sum(1 / test for test in range(1, ideas + 1))
-
-
-def result_of(verdict: Verdict) -> str:
-    """``kept``, ``dropped`` or ``undecided``; an undecided idea may change with more seeds."""
-    if verdict.outcome == SUPPORTED:
-        return KEPT
-    dropped = verdict.equal or verdict.outcome in (REFUTED, TOO_SMALL) or gives_up(verdict)
-    return DROPPED if dropped else UNDECIDED
+def result_of(verdict: Verdict) -> Result:
+    """The result by a verdict; an undecided idea may change with more seeds."""
+    if verdict.outcome == "supported":
+        return "kept"
+    is_open = verdict.outcome == "undecided" and not (verdict.equal or gives_up(verdict))
+    return "undecided" if is_open else "dropped"

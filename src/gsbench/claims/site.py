@@ -5,7 +5,7 @@ files.
 """
 
 import re
-from collections.abc import Callable, Container, Iterator, Sequence
+from collections.abc import Callable, Container, Sequence
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
@@ -13,6 +13,7 @@ from typing import Any
 
 from gsbench.analysis.cells import swept_settings
 from gsbench.analysis.comparison import compare
+from gsbench.analysis.quantities import choose_quantities
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import Experiment, TrialResult
 from gsbench.analysis.table_formats import Table, fill
@@ -67,14 +68,24 @@ def _section(experiment: Experiment, key: str) -> dict[str, Any]:
 
     It has a line on each idea, and a table of arms × scenes for each quantity.
     """
-    trials, notes = experiment.trials, list[str]()
+    trials, notes, comparison = experiment.trials, list[str](), compare(experiment)
     tables: list[Table] = []
     try:
         rows = ("init", "densify", *swept_settings(trials))
-        tables = list(_by_quantity(build_table(experiment, rows=rows, columns=("scene",))))
+        # the metrics that were asked about come first
+        asked = {answer.verdict.quantity.key for answer in comparison.answers}
+        for one in sorted(choose_quantities(trials), key=lambda one: one.key not in asked):
+            table = build_table(
+                experiment,
+                rows=rows,
+                columns=("scene",),
+                metrics=[one.key],
+                title=one.heading,
+                comparison=comparison,
+            )
+            tables.append(replace(table, notes=()))
     except InputError as error:
         notes.append(f"No table: {error}")
-    comparison = compare(experiment)
     facts = {"trials": str(len(trials))}
     for name, read in FACTS.items():
         facts[name] = ", ".join(map(str, sorted(set(map(read, trials)))))
@@ -86,19 +97,6 @@ def _section(experiment: Experiment, key: str) -> dict[str, Any]:
         "tables": tables,
         "notes": [*notes, *comparison.remarks, *experiment.warnings],
     }
-
-
-def _by_quantity(table: Table) -> Iterator[Table]:
-    """Split a table into one table of arms × scenes per quantity."""
-    start = 0
-    for name, count in table.groups:
-        group = slice(start, start + count)
-        start += count
-        columns = tuple(replace(column, group="") for column in table.columns[group])
-        rows = tuple(
-            replace(row, entries=row.entries[group], rule_above=False) for row in table.rows
-        )
-        yield replace(table, title=name, columns=columns, rows=rows, notes=())
 
 
 def _unique_key(name: str, taken: Container[str]) -> str:

@@ -1,21 +1,54 @@
 """Adding seeds in planned looks until every question is decided: sweeps, gates, ledgers."""
 
 import logging
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from gsbench.analysis.comparison import compare
 from gsbench.analysis.fairness import counts_notes
 from gsbench.analysis.notes import texts
+from gsbench.analysis.quantities import COSTS, NO_DIRECTION
+from gsbench.analysis.questions import read_least
 from gsbench.analysis.results import TrialResult, newest_code, read_experiment
 from gsbench.analysis.verdicts import Verdict, judge
 from gsbench.config.compose import Trial
+from gsbench.errors import InputError
+from gsbench.eval.facts import known_keys
+from gsbench.pipeline.metric_facts import facts_for
 from gsbench.runs.commands import Digest, Question
-from gsbench.words import counted
+from gsbench.words import counted, did_you_mean
 
 log = logging.getLogger(__name__)
 
 Needed = tuple[str, Digest, int]  # scene, digest and seed of a trial
+
+
+def asked_difference(metric: str, least: str | None, values: Mapping[str, Any]) -> dict[str, Any]:
+    """The terms of a question about ``metric``: ``metric``, ``sign``, ``least``, ``relative``.
+
+    ``least`` is text such as ``0.1`` or ``10%``; None takes the metric's usual least difference.
+    ``values`` is a trial's configuration, which may define the user's own metrics. Raises
+    InputError, one line, for a metric that cannot be judged.
+    """
+    users_metrics = values["eval"].get("extra") or {}
+    metrics = (*known_keys(), *COSTS, *users_metrics)
+    if metric not in metrics:
+        raise InputError(
+            f"--metric {metric}: there is no such metric{did_you_mean(metric, metrics)}"
+        )
+    sign, usual = -1, None  # less is better of counts and times
+    if metric not in COSTS:
+        facts = facts_for(metric, values)
+        sign, usual = facts.direction, facts.worthwhile
+    if not sign:
+        raise InputError(f"--metric {metric}: {NO_DIRECTION}")
+    if least is None and usual is None:
+        raise InputError(
+            f"{metric} has no usual least difference that matters: give --least, such as 0.1 or 10%"
+        )
+    size = read_least(str(usual) if least is None else least, "--least", metric in COSTS)
+    return {"metric": metric, "sign": sign, "least": size[0], "relative": size[1]}
 
 
 def trials_of_look(questions: Sequence[Question], seeds: int) -> list[Needed]:

@@ -177,17 +177,6 @@ def check_single(words: Sequence[str], advice: str) -> None:
         raise InputError(f"{swept[0]} lists several values: {advice}")
 
 
-def check_sweep(override: Override) -> None:
-    """Raise InputError for an interval, and for a list whose values would give equal trials."""
-    if not override.is_discrete_sweep():
-        key = bare_key(override.get_key_element())
-        raise InputError(
-            f"{override.input_line}: a sweep is a list of values, such as {key}=1,2,3; "
-            "intervals are for gsbench's own sweeper, which searches in them (docs/search.md)"
-        )
-    check_makes_trials(override)
-
-
 def grid_points(overrides: Sequence[Override]) -> list[list[str]]:
     """The words of every point of the grid that ``overrides`` span.
 
@@ -196,22 +185,26 @@ def grid_points(overrides: Sequence[Override]) -> list[list[str]]:
     """
     choices: dict[str, list[str]] = {}
     for override in overrides:
-        key = override.get_key_element()
-        if override.is_sweep_override():
-            check_sweep(override)
-            try:
-                values = islice(override.sweep_string_iterator(), MAX_POINTS + 1)
-                choices[key] = [f"{key}={value}" for value in values]
-            except ValueError as error:  # such as a range with a step of 0
-                raise InputError(f"{override.input_line}: {error}") from error
-            if not choices[key]:
-                raise InputError(f"{override.input_line} lists no value")
-            if len(choices[key]) > MAX_POINTS:
-                raise InputError(f"{override.input_line} lists more than {MAX_POINTS:,} values")
-        else:
-            choices[key] = [
-                key if override.is_delete() else f"{key}={override.get_value_element_as_str()}"
-            ]
+        key, word = override.get_key_element(), override.input_line
+        if not override.is_sweep_override():
+            value = override.get_value_element_as_str()
+            choices[key] = [key if override.is_delete() else f"{key}={value}"]
+            continue
+        if is_interval(override):
+            raise InputError(
+                f"{word}: a sweep is a list of values, such as {bare_key(key)}=1,2,3; intervals "
+                "are for gsbench's own sweeper, which searches in them (docs/search.md)"
+            )
+        check_makes_trials(override)
+        try:
+            values = islice(override.sweep_string_iterator(), MAX_POINTS + 1)
+            choices[key] = [f"{key}={value}" for value in values]
+        except ValueError as error:  # such as a range with a step of 0
+            raise InputError(f"{word}: {error}") from error
+        if not choices[key]:
+            raise InputError(f"{word} lists no value")
+        if len(choices[key]) > MAX_POINTS:
+            raise InputError(f"{word} lists more than {MAX_POINTS:,} values")
     return [list(point) for point in product(*choices.values())]
 
 

@@ -4,12 +4,12 @@ Words go one way: Hydra composes once for each choice of groups, the values of s
 set in a copy, and the resolved copy is checked: a trial.
 """
 
-import os
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +31,12 @@ from gsbench.config.hydra_setup import (
 from gsbench.config.overrides import bare_key, is_sweep, key_of, parse_word, task_words
 from gsbench.config.permissions import check_texts
 from gsbench.config.schema import ROOT_SETTINGS, Config, check, plain
-from gsbench.config.search_path import check_search_path, read_by_gsbench, searched_folders
-from gsbench.config.strange_files import check_choice, check_places, permitted_to_files
+from gsbench.config.search_path import (
+    check_choice,
+    check_search_path,
+    permitted_to_files,
+    read_by_gsbench,
+)
 from gsbench.config.trust import MADE_NODES, check_composed, check_permissions
 from gsbench.errors import InputError
 from gsbench.runs.trial_folder import TrialFolder
@@ -96,14 +100,12 @@ class Composer:
         # are checked first.
         self.typed = words if typed is None else typed
         self.allowed = typed_permissions(self.typed) + typed_readings(self.typed)
-        packages = check_search_path(words, self.allowed)
-        allow_modules(self.allowed, os.getcwd() if modules is None else modules)
-        check_places(searched_folders(words), packages)
+        allow_modules(self.allowed, modules)
+        check_search_path(words, self.allowed)
         single = [word for word in words if not is_sweep(word)]
         own = task_words(single)
         self.hydra_words = tuple(word for word in single if word not in own)
-        self._check_texts(single)  # before any of them is resolved
-        self._check_words(self.hydra_words)
+        self._check_words(single)  # before any of them is resolved
         self._chosen: dict[tuple[str, ...], DictConfig] = {}
         self._times: dict[str, Any] = {}  # what ${now:…} stands for, the same in all trials
         # The settings of a group whose choices are listed, here or in a file, are checked with each
@@ -122,17 +124,14 @@ class Composer:
             self.config.hydra = self._choose(values).hydra
 
     def settings(self, words: Sequence[str]) -> DictConfig:
-        """The configuration of ``words`` without Hydra's node; what it may run is checked."""
+        """The configuration of ``words`` without Hydra's node; trials check what it may run."""
         self._check_words(words)
         chosen = self._choose(words)
         config = OmegaConf.masked_copy(chosen, [str(key) for key in chosen if key != "hydra"])
         OmegaConf.set_struct(config, True)
-        values = [word for word in words if _is_value(word)]
         with explained(words):
-            for word in values:
+            for word in filter(_is_value, words):
                 set_value(config, parse_word(word))
-        if values:
-            check_composed(config, self.allowed, {})
         config[PERMISSIONS] = list(self.allowed)  # any in a file counts nothing
         return config
 
@@ -163,9 +162,7 @@ class Composer:
 
     def trial(self, overrides: Sequence[str]) -> Trial:
         """The single trial of the command's words, which are its ``overrides``."""
-        words = task_words(overrides)
-        trial = self._trial(words, words) or self._trial_of_hydra(words)
-        return replace(trial, overrides=tuple(overrides))
+        return replace(self.trials([task_words(overrides)])[0], overrides=tuple(overrides))
 
     def keep_times(self, config: DictConfig) -> None:
         """Let ``${now:…}`` in ``config`` stand for what it stands for in the trials."""
@@ -187,15 +184,14 @@ class Composer:
             return self._checked(config, None, words, {} if seed is None else {"seed": seed})
         return None
 
-    def _trial_of_hydra(self, words: Sequence[str], number: int | None = None) -> Trial:
+    def _trial_of_hydra(self, words: Sequence[str], number: int) -> Trial:
         """The trial of ``words`` as Hydra composes its job, with its number and its node."""
         with hydra_ready(), explained(words):
             config = self._composed(words)
             with open_dict(config):
                 config[PERMISSIONS] = list(self.allowed)
                 config.hydra.mode = self.config.hydra.mode
-                if number is not None:
-                    config.hydra.job.num, config.hydra.job.id = number, f"job_id_for_{number}"
+                config.hydra.job.num, config.hydra.job.id = number, f"job_id_for_{number}"
             return self._checked(config, config, words, {})
 
     def _checked(
@@ -248,16 +244,12 @@ class Composer:
 
     def _check_words(self, words: Sequence[str]) -> None:
         """Refuse words that would resolve what is not allowed, or leave the folder of a group."""
-        self._check_texts(words)
         for word in words:
+            override = parse_word(word)
+            value: Any = override.value()
+            check_texts({override.key_or_group: value}, self.allowed)
             if not _is_value(word):
-                check_choice(word, str(parse_word(word).value()))
-
-    def _check_texts(self, words: Sequence[str]) -> None:
-        for word in words:
-            if "${" in word:
-                override = parse_word(word)
-                check_texts({override.key_or_group: override.value()}, self.allowed)
+                check_choice(word, str(value))
 
 
 def _by_autograd(train: Mapping[str, Any]) -> bool:
@@ -268,10 +260,10 @@ def _by_autograd(train: Mapping[str, Any]) -> bool:
 def _swept_groups(sweeper: DictConfig) -> set[str]:
     """The groups of which a sweep in a file lists choices or settings."""
     raw: Any = OmegaConf.to_container(sweeper, resolve=False)
-    params, grids = raw.get("params"), raw.get("grids")
-    nodes = [params, *(grids if isinstance(grids, list) else [])]
-    keys = [str(key) for node in nodes if isinstance(node, dict) for key in node]
-    return {bare_key(key).partition(".")[0] for key in keys}
+    grids = raw.get("grids")
+    nodes = [raw.get("params"), *(grids if isinstance(grids, list) else ())]
+    keys = chain(*(node for node in nodes if isinstance(node, dict)))
+    return {bare_key(str(key)).partition(".")[0] for key in keys}
 
 
 def _is_value(word: str) -> bool:
@@ -289,10 +281,11 @@ def _choices(words: Sequence[str]) -> dict[str, str]:
 def _without_seed(words: Sequence[str]) -> tuple[tuple[str, ...], int | None]:
     """The words without the seed, and the seed; all words and None unless it is a plain number."""
     seeds = [word for word in words if key_of(word) == "seed"]
-    seed: Any = parse_word(seeds[-1]).value() if len(seeds) == 1 else None
-    if not isinstance(seed, int) or not seeds[0].startswith("seed="):
-        return tuple(words), None
-    return tuple(word for word in words if word != seeds[0]), seed
+    if len(seeds) == 1 and seeds[0].startswith("seed="):
+        seed: Any = parse_word(seeds[0]).value()
+        if isinstance(seed, int):
+            return tuple(word for word in words if word != seeds[0]), seed
+    return tuple(words), None
 
 
 def set_value(config: DictConfig, override: Override) -> None:
@@ -340,15 +333,6 @@ def typed_address(typed: Sequence[str]) -> tuple[str, ...]:
     with hydra_ready(), explained(words):
         config = hydra.compose(CONFIG_NAME, read_by_gsbench(words))
         return (str(config.tracking.uri),) if config.tracking.get("uri") else ()
-
-
-def trial_of_job(config: DictConfig, allowed: Sequence[str], overrides: Sequence[str]) -> Trial:
-    """The trial of a configuration that Hydra composed for a job, without Hydra's node."""
-    check_composed(config, allowed, {})
-    with open_dict(config):
-        config[PERMISSIONS] = list(allowed)
-    with explained(overrides):
-        return Trial(check(plain(config)), tuple(overrides))
 
 
 def with_seed(trial: Trial, seed: int) -> Trial:

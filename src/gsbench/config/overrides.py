@@ -2,7 +2,7 @@
 
 import re
 import shlex
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import cache
 from itertools import accumulate
 
@@ -48,6 +48,19 @@ def parse_word(word: str) -> Override:
 def key_of(word: str) -> str:
     """The setting that a word sets, adds or removes."""
     return bare_key(parse_word(word).get_key_element())
+
+
+def changed_words(words: Sequence[str], changes: Sequence[str]) -> list[str]:
+    """The words with ``changes``: each replaces the word of its key, and ``~KEY`` removes that.
+
+    Another launcher or tracker takes no settings that were meant for the one before.
+    """
+    others = {key_of(word) for word in changes if word not in words} & {"launch", "tracking"}
+    own = {key_of(word): word for word in words if key_of(word).partition(".")[0] not in others}
+    for word in changes:
+        if own.pop(key_of(word), None) is None or not word.startswith("~"):
+            own[key_of(word)] = word
+    return list(own.values())
 
 
 def bare_key(key: str) -> str:

@@ -115,10 +115,10 @@ def _import_advice(error: BaseException) -> str:
 
 
 def packages_allowed_at(place: Sequence[str]) -> tuple[str, ...]:
-    """The packages of gsbench whose classes a setting at ``place`` may name without permission."""
+    """gsbench's packages and classes that a setting at ``place`` may name without permission."""
     if len(place) == 1 and place[0] in COMPONENTS:
         own = f"{PACKAGE}.{place[0]}"
-        return (own, f"{PACKAGE}.external") if place[0] == "densify" else (own,)
+        return (own, *EXTERNAL) if place[0] == "densify" else (own,)
     if len(place) == 3 and tuple(place[:2]) == ("eval", "extra"):
         return (f"{PACKAGE}.eval",)
     return ()
@@ -242,9 +242,6 @@ def check_launch(launch: Mapping[str, Any], allowed: Sequence[str]) -> None:
 # oc.decode, oc.dict) could create a `_target_` after the check; resolvers of plug-ins could do
 # anything.
 RESOLVERS = ("hydra", "now", "oc.env", "oc.select", "python_version")
-# Hydra 1.4's own values, whose resolvers join the words of a job. With arguments they would call
-# other resolvers.
-HYDRAS_VALUES = ("${hydra_override_dirname:}", "${hydra_deprecated_override_dirname:}")
 
 
 def check_texts(values: Any, allowed: Sequence[str], file: str = "") -> None:
@@ -254,14 +251,9 @@ def check_texts(values: Any, allowed: Sequence[str], file: str = "") -> None:
     """
     for place, key, value in entries_of(values):
         where = f"{file}: " * bool(file) + ".".join((*place, key))
-        check_text(where, key, value, allowed)
-
-
-def check_text(where: str, key: str, value: Any, allowed: Sequence[str]) -> None:
-    """Refuse a ``${…}`` in a key or in its value that may not be resolved."""
-    for text in (key, value):
-        if isinstance(text, str) and "${" in text and text not in HYDRAS_VALUES:
-            _check_interpolation(where, key, text, allowed)
+        for text in (key, value):
+            if isinstance(text, str) and "${" in text:
+                _check_interpolation(where, key, text, allowed)
 
 
 def _check_interpolation(where: str, key: str, value: str, allowed: Sequence[str]) -> None:

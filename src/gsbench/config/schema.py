@@ -36,7 +36,6 @@ from gsbench.settings import (
     PathName,
     TargetName,
     Threads,
-    check_settings,
     check_values,
     is_folder_name,
 )
@@ -86,9 +85,6 @@ class TrackingConfig:
     images: NonNegativeInt = 4  # test renders mirrored per trial
     model: bool = False  # keep the PLY as an artifact (MLflow, W&B)
 
-    def __post_init__(self) -> None:
-        check_settings(self, "tracking")
-
 
 @dataclass
 class LaunchConfig:
@@ -118,7 +114,6 @@ class LaunchConfig:
     sbatch: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        check_settings(self, "launch")
         if self.name != "slurm" and not self.wait:
             raise InputError(
                 "launch.wait=false leaves the trials to Slurm, so it needs launch=slurm, not "
@@ -153,9 +148,6 @@ class TuneSettings:
     at_once: PositiveInt = 1  # points of an arm that are proposed and trained together
     metric: str | None = None  # None: eval.primary, else PSNR
     seed: int | str = 100
-
-    def __post_init__(self) -> None:
-        check_settings(self, TUNE)
 
 
 @dataclass

@@ -18,7 +18,7 @@ from gsbench.config.permissions import (
     check_launch,
     check_program,
     check_target,
-    check_text,
+    check_texts,
     is_allowed,
     is_external,
     load_class,
@@ -104,12 +104,9 @@ def foreign_address(tracking: Mapping[str, Any], allowed: Sequence[str]) -> str:
     The user's own are those ``allowed`` on the command line, and those in the environment.
     """
     known = {*allowed, *map(os.environ.get, ADDRESS_VARIABLES)}
-    given = (str(value) for key, value in tracking.items() if value and _is_place(key, str(value)))
-    return next((address for address in given if address not in known), "")
-
-
-def _is_place(key: str, value: str) -> bool:
-    return key == "uri" or "://" in value
+    given = ((key, str(value)) for key, value in tracking.items() if value)
+    places = (text for key, text in given if key == "uri" or "://" in text)
+    return next((place for place in places if place not in known), "")
 
 
 def check_composed(
@@ -126,38 +123,27 @@ def check_composed(
         (*place, key): value
         for place, key, value in entries_of({"runs": OWN_RUNS, "hydra": installed})
     }
-    hydra = raw.get("hydra")  # Hydra removes its node when it runs a job
-    words = [word for own in hydra["overrides"].values() for word in own] if hydra else []
+    words = [word for own in raw["hydra"]["overrides"].values() for word in own]
     typed = {word.partition("=")[0].lstrip("+~") for word in words}
     for place, key, value in entries_of(raw):
-        if usual.get((*place, key)) == value:
+        path = (*place, key)
+        if usual.get(path) == value:
             continue
-        check_text(".".join((*place, key)), key, value, allowed)
+        if not isinstance(value, dict | list):  # files of packages were not looked at before
+            check_texts({key: value}, allowed, ".".join(place))
         if key in SPECIAL_KEYS:  # `_partial_` makes a function of anything, to be called later
-            raise InputError(
-                f"{'.'.join((*place, key))}: gsbench makes no objects this way: leave it out"
-            )
-        if key == TARGET:
-            _check_place(place, value, allowed)
-        if hydra:
-            _check_hydra((*place, key), value, typed, allowed)
-
-
-def _check_place(place: tuple[str, ...], target: Any, allowed: Sequence[str]) -> None:
-    """Refuse a ``target`` that its ``place`` may not name: Hydra would import and call it."""
-    if not isinstance(target, str) or target == "???":
-        return  # the schema or Hydra reports these
-    group = ".".join(place)
-    # gsbench's classes are allowed in their own group only: `densify._target_=gsbench.init.…` is
-    # refused.
-    own = (
-        HYDRAS_CALLBACKS
-        if place[:2] == ("hydra", "callbacks") and len(place) == 3
-        else packages_allowed_at(place)
-    )
-    check_target(target, group, allowed, own)
-    if is_allowed(target, (PACKAGE,)) and not PUBLIC_CLASS.fullmatch(target):
-        load_class(target, group, allowed)  # refuses names such as gsbench.densify.adc.torch.load
+            raise InputError(f"{'.'.join(path)}: gsbench makes no objects this way: leave it out")
+        # The schema or Hydra reports a target that is no text.
+        if key == TARGET and isinstance(value, str) and value != "???":
+            is_callback = place[:2] == ("hydra", "callbacks") and len(place) == 3
+            # gsbench's classes are allowed in their own group only:
+            # `densify._target_=gsbench.init.…` is refused.
+            own = HYDRAS_CALLBACKS if is_callback else packages_allowed_at(place)
+            check_target(value, ".".join(place), allowed, own)
+            if is_allowed(value, (PACKAGE,)) and not PUBLIC_CLASS.fullmatch(value):
+                # refuses names such as gsbench.densify.adc.torch.load
+                load_class(value, ".".join(place), allowed)
+        _check_hydra(path, value, typed, allowed)
 
 
 def _check_hydra(
@@ -169,43 +155,42 @@ def _check_hydra(
     """
     where, node = ".".join(path), path[1] if path[0] == "hydra" and len(path) > 1 else ""
     key = path[-2] if path[-1].isdigit() else path[-1]
+    text = value if isinstance(value, str) else ""
     if where == "hydra.job.env_set" and value:
         # A variable can name a file that Python, a library or a program loads, and no list of
         # harmless ones is complete.
         raise InputError(
             "hydra.job.env_set can change what runs: set variables in the shell, before the command"
         )
+    if where in WRITTEN and value is not None and where not in typed:
+        raise InputError(
+            f"a file sets {where}={value}, a place to write: type it on the command line"
+        )
     if path[:2] == ("hydra", "sweeper") and path[2:3] and path[2] in SWEPT_TEXTS:
         # A job is composed after this check, and its words could name packages to import
         # configurations from.
-        for text in (path[-1], value):
-            if isinstance(text, str) and NOT_SWEPT.match(text):
-                raise InputError(
-                    f"{'.'.join(path[:-1])}: {text} cannot differ from job to job, and no file can "
-                    "allow it: type it on the command line"
-                )
+        if swept := next(filter(NOT_SWEPT.match, (path[-1], text)), ""):
+            raise InputError(
+                f"{'.'.join(path[:-1])}: {swept} cannot differ from job to job, and no file can "
+                "allow it: type it on the command line"
+            )
         return
-    is_made = node in MADE_NODES and isinstance(value, str)
-    if (is_made or node == "callbacks") and "${" in (value if isinstance(value, str) else ""):
-        # may become a class
+    if node in (*MADE_NODES, "callbacks") and "${" in text:  # may become a class
         raise InputError(f"{where}: write the settings themselves here, without ${{…}}")
-    if is_made and key in CLASS_KEYS:
-        if not is_allowed(value, allowed):
-            advice = permission_advice([value.split(".")[0]], allowed)
+    if not text or node not in MADE_NODES or key == TARGET:
+        return
+    # In any text, logging imports the name after ext://.
+    is_plain = key in FREE_KEYS and "://" not in text and text.isprintable()
+    if key in CLASS_KEYS:
+        if not is_allowed(text, allowed):
+            advice = permission_advice([text.split(".")[0]], allowed)
             raise InputError(
-                f"{where}={value} is not what a package set; if you trust that code, {advice}"
+                f"{where}={text} is not what a package set; if you trust that code, {advice}"
             )
-    elif is_made and key != TARGET and not is_allowed(f"hydra.{node}", allowed):
-        # In any text, logging imports the name after ext://.
-        is_plain = key in FREE_KEYS and "://" not in value and value.isprintable()
-        if not is_plain and value not in FREE_TEXTS:
-            advice = permission_advice([f"hydra.{node}"], allowed)
-            raise InputError(
-                f"{where}={value!r} could start code or write a file; if you trust it, {advice}"
-            )
-    elif where in WRITTEN and value is not None and where not in typed:
+    elif not is_plain and text not in FREE_TEXTS and not is_allowed(f"hydra.{node}", allowed):
+        advice = permission_advice([f"hydra.{node}"], allowed)
         raise InputError(
-            f"a file sets {where}={value}, a place to write: type it on the command line"
+            f"{where}={text!r} could start code or write a file; if you trust it, {advice}"
         )
 
 
@@ -221,10 +206,10 @@ def load_callbacks(callbacks: Any, allowed: Sequence[str]) -> None:
             raise InputError(f"hydra.callbacks.{name} names no {TARGET}: the class to use")
         for place, target in targets_in(callback, ("hydra", "callbacks", str(name))):
             cls = load_class(target, ".".join(place), [*allowed, *HYDRAS_CALLBACKS])
-            if not isinstance(cls, type) or (len(place) == 3 and not issubclass(cls, Callback)):
-                wanted = (
-                    "a class of hydra.experimental.callback.Callback"
-                    if len(place) == 3
-                    else "a class"
-                )
-                raise InputError(f"{'.'.join(place)}.{TARGET}={target} is not {wanted}")
+            base, what = (
+                (Callback, "a class of hydra.experimental.callback.Callback")
+                if len(place) == 3
+                else (object, "a class")
+            )
+            if not isinstance(cls, type) or not issubclass(cls, base):
+                raise InputError(f"{'.'.join(place)}.{TARGET}={target} is not {what}")

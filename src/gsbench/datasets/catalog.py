@@ -7,17 +7,16 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import yaml
 
 from gsbench.errors import InputError
+from gsbench.parsing import table_beside
 from gsbench.system.install import conf_dir
 
 DATA_VARIABLE = "GSBENCH_DATA"
 # the place of the data, as the YAML files of public scenes write it
 SCENE_PATH = re.compile(r"\$\{oc\.env:GSBENCH_DATA,data\}/(?P<folder>.+)")
-CATALOG_FILE = Path(__file__).with_name("catalog.yaml")
 
 
 @dataclass(frozen=True)
@@ -72,9 +71,8 @@ def wanted_files(scene: str, images: str | None = None) -> SceneFiles:
 
 def read_catalog() -> dict[str, PublicDataset]:
     """The data sets of gsbench's catalogue by name."""
-    content: dict[str, Any] = yaml.safe_load(CATALOG_FILE.read_text(encoding="utf-8"))
     datasets = {}
-    for name, entry in content.items():
+    for name, entry in table_beside(__file__, "catalog.yaml").items():
         archives = tuple(
             Archive(archive["url"], archive["scenes"], archive.get("size", ""))
             for archive in entry.pop("archives")

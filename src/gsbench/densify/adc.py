@@ -131,13 +131,17 @@ class ADC(Budgeted):
         if self.due(step) and self.frozen(refinement):
             rules.append(self.skip_round)
         elif self.due(step):
-            rules += [*self.governing(), self.grow_by_gradient, self.prune, self.reset_statistics]
+            rules += [*self.governing(), *self.round_at(step)]
         # As in 3DGS: with a white background, opacities are also reset once at the start of the
         # window.
         first = self.context.white_background and step == self.start
         if step < self.stop and (first or step % self.opacity_reset_interval == 0):
             rules.append(self.reset_opacity)
         return rules
+
+    def round_at(self, step: int) -> list[Rule]:
+        """The rules of a round that is not frozen, behind those of the governor."""
+        return [self.grow_by_gradient, self.prune, self.reset_statistics]
 
     def mean(self, total: str, count: str = "visible_count") -> Tensor:
         """One statistic over another, [N]; 0 where both are."""

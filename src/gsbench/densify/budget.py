@@ -19,21 +19,6 @@ CapKind = Literal["soft", "freeze", "hard", "curve", "governor"]
 BISECTION_STEPS = 40  # of log(factor): the last interval is far below the spacing of float32 scores
 
 
-def allowance(num_gaussians: int, max_gaussians: int | None, cap: CapKind) -> int | None:
-    """The number of Gaussians that a growth step may add; None: no limit.
-
-    - ``soft``: no limit if the count is at most ``max_gaussians``, 0 if it is above. So one step
-      may exceed the cap, as in the paper (its counts end at 3.41 to 3.57 M for a cap of 3.4 M).
-    - ``hard`` and ``curve``: the difference to ``max_gaussians``.
-    - ``freeze`` and ``governor``: no limit within a round.
-    """
-    if max_gaussians is None or cap in ("freeze", "governor"):
-        return None
-    if cap == "soft":
-        return None if num_gaussians <= max_gaussians else 0
-    return max(0, max_gaussians - num_gaussians)
-
-
 def admit(candidates: Tensor, score: Tensor, gain: int, allowed: int | None) -> tuple[Tensor, int]:
     """Choose the candidates with the highest scores, as many as ``allowed`` admits.
 
@@ -169,8 +154,19 @@ class Budgeted(Densifier):
         return round(initial + (self.max_gaussians - initial) * (2 * x - x * x))
 
     def allowance(self, refinement: Refinement) -> int | None:
-        """The number of Gaussians that may be added now; None: no limit."""
-        return allowance(len(refinement.gaussians), self.limit(refinement.step), self.cap)
+        """The number of Gaussians that may be added now; None: no limit.
+
+        - ``soft``: no limit if the count is at most ``max_gaussians``, 0 if it is above. So one
+          step may exceed the cap, as in the paper (its counts end at 3.41 to 3.57 M for 3.4 M).
+        - ``hard`` and ``curve``: the difference to `limit`.
+        - ``freeze`` and ``governor``: no limit within a round.
+        """
+        count, limit = len(refinement.gaussians), self.limit(refinement.step)
+        if limit is None or self.cap in ("freeze", "governor"):
+            return None
+        if self.cap == "soft":
+            return None if count <= limit else 0
+        return max(0, limit - count)
 
     def forecast(self, refinement: Refinement) -> int:
         """The count after a round with this ``strictness`` and ``cull``, without a cap."""

@@ -56,16 +56,15 @@ class FastGS(AbsGS):
     final_opacity: OpenFraction = 0.1
     final_score: Fraction = 0.9
 
-    def rules(self, refinement: Refinement) -> list[Rule]:
-        """The rules of ADC, with scores before growth and the ceiling after pruning.
+    def round_at(self, step: int) -> list[Rule]:
+        """The rules of ADC, with scores before growth and the ceiling after pruning."""
+        grow, prune, reset = super().round_at(step)
+        return [self.score, grow, prune, self.lower_opacity, reset]
 
-        After the window come the final prunings.
-        """
+    def rules(self, refinement: Refinement) -> list[Rule]:
+        """The rules of ADC; after the window, the final prunings."""
         step = refinement.step
-        rules = [rule for rule in super().rules(refinement) if rule != self.lower_opacity]
-        if self.grow_by_gradient in rules:
-            rules.insert(rules.index(self.grow_by_gradient), self.score)
-            rules.insert(rules.index(self.prune) + 1, self.lower_opacity)
+        rules = super(AbsGS, self).rules(refinement)  # its ceiling comes in each round here
         if step > self.stop and step % self.final_interval == 0:
             rules += [self.score, self.prune_finally, self.reset_statistics]
         return rules
@@ -146,12 +145,9 @@ class Taming(ADC):
     weight_error: NonNegativeFloat = 50.0  # of the L1 error in a pixel's value
     weight_edge: NonNegativeFloat = 50.0  # of the edge strength in a pixel's value
 
-    def rules(self, refinement: Refinement) -> list[Rule]:
+    def round_at(self, step: int) -> list[Rule]:
         """The rules of ADC, with scores before growth."""
-        rules = super().rules(refinement)
-        if self.grow_by_gradient in rules:
-            rules.insert(rules.index(self.grow_by_gradient), self.score)
-        return rules
+        return [self.score, *super().round_at(step)]
 
     def score(self, refinement: Refinement) -> None:
         """Compute the score of every Gaussian, as a statistic that the round's edits maintain."""

@@ -109,17 +109,12 @@ class Volumetric(ADC):
                 f"got {self.volume_interval}"
             )
 
-    def rules(self, refinement: Refinement) -> list[Rule]:
+    def round_at(self, step: int) -> list[Rule]:
         """The rules of ADC, with the split by volume inserted according to ``volume_order``."""
-        rules = super().rules(refinement)
-        if self.volume_due(refinement.step):
-            next_rule = {
-                "before_adc": self.grow_by_gradient,
-                "after_adc": self.prune,
-                "after_prune": self.reset_statistics,
-            }[self.volume_order]
-            if next_rule in rules:  # a frozen round has none of them
-                rules.insert(rules.index(next_rule), self.split_by_volume)
+        rules = super().round_at(step)
+        if self.volume_due(step):
+            place = ("before_adc", "after_adc", "after_prune").index(self.volume_order)
+            rules.insert(place, self.split_by_volume)
         return rules
 
     def volume_due(self, step: int) -> bool:

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsbench.errors import InputError, TrainingError
-from gsbench.eval.color_correction import after_correction
 from gsbench.eval.facts import (
     CORRECTED,
     LPIPS,
@@ -27,17 +26,34 @@ from gsbench.eval.facts import (
     lpips_variants,
 )
 from gsbench.eval.flip import flip, flip_map
-from gsbench.eval.images import as_batch, as_unit_range, in_double_precision, replace_ignored
-from gsbench.eval.lpips import BACKBONES, Lpips, load_lpips
+from gsbench.eval.images import (
+    as_batch,
+    as_unit_range,
+    check_pair,
+    in_double_precision,
+    replace_ignored,
+)
+from gsbench.eval.lpips import Lpips, load_lpips
 from gsbench.eval.metric import MaskedMetric, Measure, Metric, UnavailableError
-from gsbench.eval.metrics import psnr
+from gsbench.eval.more import STRUCTURAL, after_correction, load_structural
 from gsbench.eval.protocol import Protocol
 from gsbench.eval.regions import LEAST_SHARE, Regions
 from gsbench.eval.ssim import ssim
-from gsbench.eval.structure import STRUCTURAL, load_structural
 from gsbench.runs.experiments import AT
 from gsbench.weights import MissingWeightsError
 from gsbench.words import raised
+
+
+def psnr(image: Tensor, target: Tensor) -> Tensor:
+    """Peak signal-to-noise ratio in dB, of the mean squared error over pixels and channels.
+
+    Images are in [0, 1]: [H, W, 3] (the value is a 0-dimensional tensor), or a batch [B, 3, H, W]
+    (the values are [B]). Identical images give infinity, which a protocol replaces in reports.
+    """
+    check_pair(image, target)
+    squared = (image - target).square()
+    mse = squared.mean() if image.ndim == 3 else squared.flatten(1).mean(dim=1)  # [] or [B]
+    return -10.0 * mse.log10()
 
 
 def measure_psnr(protocol: Protocol) -> Measure:
@@ -55,54 +71,58 @@ def measure_psnr(protocol: Protocol) -> Measure:
     return measure
 
 
-def _ssim(evaluator: Evaluator) -> Measure:
-    """Structural similarity with the protocol's padding."""
-    padding = evaluator.protocol.ssim_padding
-    return lambda image, truth, mask: float(
-        ssim(in_double_precision(image), in_double_precision(truth), padding, mask)
-    )
+def measure_gsbench(key: str, evaluator: Evaluator) -> Measure:
+    """gsbench's metric ``key``; raises UnavailableError if weights or a package are missing."""
+    protocol = evaluator.protocol
+    match key:
+        case "psnr":
+            return measure_psnr(protocol)
+        case "ssim":
+            return lambda image, truth, mask: float(
+                ssim(
+                    in_double_precision(image),
+                    in_double_precision(truth),
+                    protocol.ssim_padding,
+                    mask,
+                )
+            )
+        case "flip":
+            return partial(_flip, protocol.flip_ppd)
+        case "cc_gain":
+            return after_correction(measure_psnr(protocol), gain=True)
+    if key.endswith(CORRECTED):
+        return after_correction(measure_gsbench(key.removesuffix(CORRECTED), evaluator))
+    if key.startswith(LPIPS):
+        net, _, raw = key.removeprefix(LPIPS).partition("_")
+        return partial(_lpips, evaluator.network(net), bool(raw))
+    return partial(_structural, load_structural(key), STRUCTURAL[key].min_side)
 
 
-def _lpips(evaluator: Evaluator, net: str, raw: bool = False) -> Measure:
+def _flip(ppd: float, image: Tensor, truth: Tensor, mask: Tensor | None) -> float:
+    if mask is None:
+        return float(flip(image, truth, ppd))
+    return float(in_double_precision(flip_map(image, truth, ppd))[mask].mean())
+
+
+def _lpips(network: Lpips, raw: bool, image: Tensor, truth: Tensor, mask: Tensor | None) -> float:
     """LPIPS by one network, fed [-1, 1] as it is defined, or [0, 1] if ``raw``."""
-    network = evaluator.network(net)
-
-    def measure(image: Tensor, truth: Tensor, mask: Tensor | None) -> float:
-        _require_size(image, network.backbone.min_size)
-        first, second = as_batch(image), as_batch(truth)  # [1, 3, H, W] each
-        if not raw:
-            first, second = 2 * first - 1, 2 * second - 1
-        return float(network(first, second, mask))
-
-    return measure
+    _require_size(image, network.backbone.min_size)
+    first, second = as_batch(image), as_batch(truth)  # [1, 3, H, W] each
+    if not raw:
+        first, second = 2 * first - 1, 2 * second - 1
+    return float(network(first, second, mask))
 
 
-def _flip(evaluator: Evaluator) -> Measure:
-    """FLIP for the protocol's viewer."""
-    ppd = evaluator.protocol.flip_ppd
-
-    def measure(image: Tensor, truth: Tensor, mask: Tensor | None) -> float:
-        if mask is None:
-            return float(flip(image, truth, ppd))
-        return float(in_double_precision(flip_map(image, truth, ppd))[mask].mean())
-
-    return measure
-
-
-def _structural(evaluator: Evaluator, key: str) -> Measure:
+def _structural(
+    function: Callable[[Tensor, Tensor], float],
+    min_side: int,
+    image: Tensor,
+    truth: Tensor,
+    mask: Tensor | None,
+) -> float:
     """A structural metric by its authors' definition, which is the same in all protocols."""
-    function, min_side = load_structural(key), STRUCTURAL[key].min_side  # px
-
-    def measure(image: Tensor, truth: Tensor, mask: Tensor | None) -> float:
-        _require_size(image, min_side)
-        return function(in_double_precision(image), in_double_precision(truth))
-
-    return measure
-
-
-def _corrected(evaluator: Evaluator, key: str, gain: bool = False) -> Measure:
-    """The metric ``key`` after a correction of the colours, or what that adds."""
-    return after_correction(MEASURES[key](evaluator), gain)
+    _require_size(image, min_side)
+    return function(in_double_precision(image), in_double_precision(truth))
 
 
 def _require_size(image: Tensor, min_side: int) -> None:
@@ -112,34 +132,35 @@ def _require_size(image: Tensor, min_side: int) -> None:
         raise UnavailableError(f"a view is {width}x{height} px, below {min_side} px a side")
 
 
-# Makes each metric of `gsbench.eval.facts.METRICS`, or raises UnavailableError if weights are
-# missing.
-MEASURES: dict[str, Callable[[Evaluator], Measure]] = {
-    "psnr": lambda evaluator: measure_psnr(evaluator.protocol),
-    "ssim": _ssim,
-    "lpips_vgg_raw": partial(_lpips, net="vgg", raw=True),
-    "flip": _flip,
-    **{f"{LPIPS}{net}": partial(_lpips, net=net) for net in BACKBONES},
-}
-MEASURES |= {key: partial(_structural, key=key) for key in STRUCTURAL}
-MEASURES |= {
-    f"{key}{CORRECTED}": partial(_corrected, key=key)
-    for key in list(MEASURES)
-    if f"{key}{CORRECTED}" in further_keys()
-}
-MEASURES["cc_gain"] = partial(_corrected, key="psnr", gain=True)
+def measure_own(name: str, metric: Metric) -> Measure:
+    """A user's metric, which may not know masks. It raises InputError for what it does wrong."""
 
+    def measure(image: Tensor, truth: Tensor, mask: Tensor | None) -> float:
+        value: Any
+        try:
+            if mask is not None and isinstance(metric, MaskedMetric):
+                value = metric.measure_masked(image, truth, mask)
+            else:
+                value = metric.measure(image, truth)
+        except UnavailableError:
+            raise
+        except SystemExit as error:  # would end gsbench without a message
+            raise InputError(
+                f"eval.extra.{name} ended the process (exit code {error.code}): it must return"
+            ) from error
+        except Exception as error:
+            raise InputError(f"eval.extra.{name} raised {raised(error)}: correct it") from error
+        if isinstance(value, Tensor | np.ndarray | np.generic) and math.prod(value.shape) == 1:
+            value = value.item()
+        must = f"eval.extra.{name} must return a number for each view, got"
+        if isinstance(value, bool) or not isinstance(value, Real):
+            raise InputError(f"{must} {value!r:.80}")
+        try:
+            return float(value)
+        except OverflowError:
+            raise InputError(f"{must} one that is too large") from None
 
-def _own(metric: Metric) -> Measure:
-    """A user's metric, which may not know masks."""
-    if isinstance(metric, MaskedMetric):
-        masked: MaskedMetric = metric
-        return lambda image, truth, mask: (
-            masked.measure(image, truth)
-            if mask is None
-            else masked.measure_masked(image, truth, mask)
-        )
-    return lambda image, truth, mask: metric.measure(image, truth)
+    return measure
 
 
 class Evaluator:
@@ -182,11 +203,8 @@ class Evaluator:
         wanted = {f"{LPIPS}{variant}" for variant in (variants if lpips is None else lpips)}
         wanted |= {facts.key for facts in METRICS if not facts.setting}
         wanted |= {*more, *(["flip"] if flip else [])}
-        self._load_lpips = partial(
-            load_lpips, folder=weights, download=download, device=self.device
-        )
-        # each loaded once, or the error for missing weights
-        self._networks: dict[str, Lpips | MissingWeightsError] = {}
+        self._lpips = weights, download
+        self._networks: dict[str, Lpips | MissingWeightsError] = {}  # each looked for once
         self._metrics: dict[str, Measure] = {}
         for facts in METRICS:
             if facts.setting == MORE and facts.key not in wanted:
@@ -196,10 +214,10 @@ class Evaluator:
             try:
                 if facts.key not in wanted:
                     raise UnavailableError(f"not asked for ({facts.setting})")
-                self._metrics[facts.key] = MEASURES[facts.key](self)
+                self._metrics[facts.key] = measure_gsbench(facts.key, self)
             except UnavailableError as error:
                 self._leave_out(facts.key, error)
-        self._metrics |= {name: _own(metric) for name, metric in extra.items()}
+        self._metrics |= {name: measure_own(name, metric) for name, metric in extra.items()}
         self._in_regions = [
             key
             for key in self._metrics
@@ -211,7 +229,7 @@ class Evaluator:
         """The LPIPS network ``net``; raises UnavailableError if its weights are missing."""
         if net not in self._networks:
             try:
-                self._networks[net] = self._load_lpips(net)
+                self._networks[net] = load_lpips(net, *self._lpips, self.device)
             except MissingWeightsError as error:
                 self._networks[net] = error
         network = self._networks[net]
@@ -252,37 +270,13 @@ class Evaluator:
             if is_left_out(key, self.unavailable):
                 continue
             try:
-                value = self._measure(key.partition(AT)[0], image, target, within)
+                value = self._metrics[key.partition(AT)[0]](image, target, within)
                 if not math.isfinite(value):
                     raise UnavailableError(f"the value of a view is {value}")
                 values[key] = value
             except UnavailableError as error:
                 self._leave_out(key, error)
         return values
-
-    def _measure(self, key: str, image: Tensor, target: Tensor, mask: Tensor | None) -> float:
-        value: Any
-        try:
-            value = self._metrics[key](image, target, mask)
-        except UnavailableError:
-            raise
-        except SystemExit as error:  # would end gsbench without a message
-            raise InputError(
-                f"eval.extra.{key} ended the process (exit code {error.code}): it must return"
-            ) from error
-        except Exception as error:
-            if key not in self.own:
-                raise
-            raise InputError(f"eval.extra.{key} raised {raised(error)}: correct it") from error
-        if isinstance(value, Tensor | np.ndarray | np.generic) and math.prod(value.shape) == 1:
-            value = value.item()
-        must = f"eval.extra.{key} must return a number for each view, got"
-        if isinstance(value, bool) or not isinstance(value, Real):
-            raise InputError(f"{must} {value!r:.80}")
-        try:
-            return float(value)
-        except OverflowError:
-            raise InputError(f"{must} one that is too large") from None
 
     def _leave_out(self, key: str, error: UnavailableError) -> None:
         self.unavailable[key] = " ".join(str(error).split())

@@ -1,15 +1,19 @@
-"""One table of facts about gsbench's metrics, such as labels, units and directions. Loads no torch.
+"""Facts about metrics, such as labels, units and directions; gsbench's own are in metrics.yaml.
+
+Loads no torch.
 
 A metric of your own needs no entry here: ``eval.extra.NAME._target_=mine.MyMetric``
 (docs/metric.md).
 """
 
 from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
 from typing import Annotated, Literal
 
 from annotated_types import Interval, Predicate
 from pydantic import PositiveFloat, StrictStr
 
+from gsbench.parsing import read_yaml
 from gsbench.runs.experiments import AT
 from gsbench.runs.trial_record import MetricRecord
 from gsbench.settings import check_values
@@ -41,64 +45,13 @@ class MetricFacts:
         return f"{self.label} ({self.unit})" if self.unit else self.label
 
 
-def _lpips(variant: str, label: str, words: str) -> MetricFacts:
-    return MetricFacts(f"{LPIPS}{variant}", label, -1, 3, "", 0.005, "eval.lpips", 0.0, words=words)
-
-
-def _bounded(
-    key: str, label: str, direction: Literal[-1, 1], lowest: float, setting: str, words: str
-) -> MetricFacts:
-    """A metric of at most 1 whose smallest worthwhile difference is 0.005."""
-    return MetricFacts(key, label, direction, 3, "", 0.005, setting, lowest, 1.0, words)
-
-
-def _structural(
-    key: str, label: str, direction: Literal[-1, 1], highest: float, words: str
-) -> MetricFacts:
-    """A structural metric without weights files, computed if ``eval.more`` names it."""
-    return MetricFacts(key, label, direction, 4, "", 0.002, MORE, 0.0, highest, words)
-
-
 # the end of the key of a metric that is measured after an affine correction of the colours
 CORRECTED = "_cc"
-
-_PLAIN = (  # `gsbench.eval.evaluator.MEASURES` has the function of each
-    MetricFacts(
-        "psnr", "PSNR", 1, 2, "dB", 0.1, lowest=0.0, words="mean squared error, logarithmic"
-    ),
-    _bounded("ssim", "SSIM", 1, -1.0, "", "means, contrast and structure in windows of 11 px"),
-    _lpips("vgg_raw", "LPIPS VGG raw", "distance between VGG features of images in [0, 1]"),
-    _lpips("vgg", "LPIPS VGG", "distance between VGG features"),
-    _lpips("alex", "LPIPS Alex", "distance between AlexNet features"),
-    _lpips("squeeze", "LPIPS Squeeze", "distance between SqueezeNet features"),
-    _bounded("flip", "FLIP", -1, 0.0, "eval.flip", "difference one sees when two images alternate"),
-    _structural("ms_ssim", "MS-SSIM", 1, 1.0, "SSIM's structure at five scales"),
-    _structural(
-        "iw_ssim", "IW-SSIM", 1, 1.0, "the same, weighted by the information that a place carries"
-    ),
-    _structural(
-        "fsim", "FSIMc", 1, 1.0, "edges and lines: phase congruency, contrast and colour there"
-    ),
-    _structural("gmsd", "GMSD", -1, 0.5, "how unevenly the gradients agree"),
-)
-_CORRECTED = tuple(
-    replace(
-        facts,
-        key=f"{facts.key}{CORRECTED}",
-        label=f"{facts.label} cc",
-        setting=MORE,
-        words=f"{facts.label} after a correction of the colours",
-    )
-    for facts in _PLAIN
-    if facts.key in ("psnr", "ssim") or facts.key.startswith(LPIPS)
-)
-_ADDED = "what the correction of the colours adds to PSNR"
-GAIN = MetricFacts("cc_gain", "gain by cc", 0, 2, "dB", setting=MORE, words=_ADDED)
-METRICS = (*_PLAIN, *_CORRECTED, GAIN)
-# Measured of the trained model, not of its pictures, and separately in the evaluation.
-_RENDERS = "renders of the test views at one size"
-FPS = MetricFacts("fps", "speed", 1, 2, "frames/s", None, "eval.fps", 0.0, words=_RENDERS)
-ALL = (*METRICS, FPS)  # in the order of tables
+# `gsbench.eval.evaluator.Evaluator` measures each but the last, which is measured of the trained
+# model, not of its pictures, and separately in the evaluation.
+*METRICS, FPS = ALL = [
+    MetricFacts(**row) for row in read_yaml(Path(__file__).with_name("metrics.yaml"))
+]
 
 
 def known_keys() -> tuple[str, ...]:

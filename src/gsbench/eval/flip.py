@@ -3,7 +3,7 @@
 Andersson et al. 2020, "FLIP: a difference evaluator for alternating images"; constants, separated
 filters and repeated borders are those of the authors' code (github.com/NVlabs/flip, version 1.7).
 That code adds up the mean in single precision and one pixel after the other, which makes it wrong
-by 3 % for 16 megapixels. Images are as in `gsbench.eval.metrics`.
+by 3 % for 16 megapixels. Images are as in `gsbench.eval.evaluator.psnr`.
 """
 
 import math

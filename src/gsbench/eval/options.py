@@ -19,11 +19,12 @@ from gsbench.eval.facts import (
     lpips_variants,
 )
 from gsbench.eval.protocol import PROTOCOLS
-from gsbench.eval.regions import DISTANCE, DISTANCES
 from gsbench.runs.experiments import AT, QUESTIONS, metric_and_question
 from gsbench.settings import MISSING, FolderName, PathName, check_settings
 from gsbench.words import did_you_mean
 
+DISTANCE = "distance"  # the value of ``eval.regions`` that asks for `DISTANCES`
+DISTANCES = ("near", "middle", "far")
 METRIC_NAME = re.compile(r"[a-z][a-z0-9_]*")
 # keys of metrics, the column of views, and the protocol's LPIPS
 RESERVED_NAMES = (*known_keys(), "view", "lpips")
@@ -122,13 +123,12 @@ class EvalConfig:
                 f"eval.primary={key} is not a metric{did_you_mean(key, known)} (known are "
                 f"{', '.join(known)}; your own metric by its name under eval.extra)"
             )
-        if facts.setting == "eval.flip" and not self.flip:
-            raise InputError("eval.primary=flip is not measured with eval.flip=false")
-        if facts is FPS and self.fps is None:
-            raise InputError("eval.primary=fps is not measured: add eval.fps=[1920,1080]")
-        if facts.setting == MORE and key not in self.more:
-            raise InputError(f"eval.primary={key} is not measured: add {key} to eval.more")
-        if facts.setting == "eval.lpips" and key.removeprefix(LPIPS) not in self.lpips:
-            raise InputError(
-                f"eval.primary={key} is not measured: add {key.removeprefix(LPIPS)} to eval.lpips"
-            )
+        variant = key.removeprefix(LPIPS)
+        is_lacking, mend = {
+            "eval.flip": (not self.flip, " with eval.flip=false"),
+            FPS.setting: (self.fps is None, ": add eval.fps=[1920,1080]"),
+            MORE: (key not in self.more, f": add {key} to eval.more"),
+            "eval.lpips": (variant not in self.lpips, f": add {variant} to eval.lpips"),
+        }.get(facts.setting, (False, ""))
+        if is_lacking:
+            raise InputError(f"eval.primary={key} is not measured{mend}")

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator
@@ -53,17 +52,16 @@ def look_at(path: Path) -> Look:
             is_webp = file.read(16)[12:] == LOSSY_WEBP
         try:
             orientation = int(image.getexif().get(EXIF_ORIENTATION, 1))
-            transparent = image.has_transparency_data and _lowest_alpha(image) < 255
+            transparent = image.has_transparency_data
+            if transparent:
+                alphas = np.asarray(image.convert("RGBA").getchannel("A"))
+                transparent = bool((alphas < 255).any())
         except DAMAGE as error:
             raise InputError(
                 f"{path}: the image is damaged ({error}): replace or remove it"
             ) from error
         lossy = image.format in ("JPEG", "MPO") or is_webp
         return Look(image.size, image.mode, lossy, wide, transparent, orientation)
-
-
-def _lowest_alpha(image: Image.Image) -> int:
-    return int(np.asarray(image.convert("RGBA").getchannel("A")).min())
 
 
 def read_picture(path: Path, is_render: bool) -> NDArray[np.uint8]:

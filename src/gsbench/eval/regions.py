@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from gsbench.eval.options import DISTANCES
 from gsbench.scene.types import Camera
 
-DISTANCE = "distance"  # the value of ``eval.regions`` that asks for `DISTANCES`
-DISTANCES = ("near", "middle", "far")
 LEAST_SHARE = 0.01  # of a view's pixels; metrics of fewer say little, and are left out
 
 Depth = NDArray[np.float32]

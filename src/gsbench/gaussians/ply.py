@@ -2,18 +2,17 @@
 
 import logging
 import math
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from plyfile import PlyData, PlyElement, PlyProperty
+from plyfile import PlyData, PlyElement
 
 from gsbench.errors import InputError
-from gsbench.files import DAMAGE, atomic, require_regular
+from gsbench.files import DAMAGE, atomic
 from gsbench.gaussians.model import MAX_SH_DEGREE, NUM_SH_REST, Gaussians
 from gsbench.gaussians.ply_files import (
     check_columns,
@@ -40,7 +39,7 @@ COLUMNS = [
     *["opacity", *SCALES, *ROTATIONS],
 ]
 Column = NDArray[Any]  # [N]
-Columns = dict[str, Column]
+T = TypeVar("T")
 
 # Marks files of gsbench, whose values need no doubt.
 OWN_COMMENT = "written by gsbench"
@@ -51,7 +50,6 @@ REST_COUNTS = tuple(3 * ((degree + 1) ** 2 - 1) for degree in range(MAX_SH_DEGRE
 MAX_LOGIT = 23 * math.log(2)
 # typical scale of a Gaussian over the size of its model; medians of trained models: 0.009 to 0.035
 TYPICAL_SCALE = 0.02
-MIN_TEXT_BYTES = 2  # minimum bytes of a value in an ASCII file: a digit and a space
 
 
 def write_ply(gaussians: Gaussians, path: Path, normalization: Normalization = IDENTITY) -> None:
@@ -62,9 +60,11 @@ def write_ply(gaussians: Gaussians, path: Path, normalization: Normalization = I
     reads.
     """
     raw = gaussians.detach().map(lambda tensor: tensor.float().cpu())
+    own = raw.means.numpy()
+    if not normalization.is_identity:
+        own = normalization.undo(own)  # [N, 3]
     table = torch.cat(
         [
-            raw.means,
             torch.zeros_like(raw.means),
             raw.sh_dc,
             raw.sh_rest.transpose(1, 2).reshape(len(raw), NUM_REST),
@@ -73,16 +73,11 @@ def write_ply(gaussians: Gaussians, path: Path, normalization: Normalization = I
             raw.quaternions,
         ],
         dim=1,
-    ).numpy()  # [N, 62]
-    types = dict.fromkeys(COLUMNS, "<f4")
-    vertices = np.ascontiguousarray(table, dtype="<f4").view(list(types.items())).reshape(len(raw))
-    if not normalization.is_identity:
-        if normalization.is_far:
-            types |= dict.fromkeys(POSITION, "<f8")
-        vertices = vertices.astype(list(types.items()))
-        own = normalization.undo(raw.means.numpy())  # [N, 3]
-        for axis, name in enumerate(POSITION):
-            vertices[name] = own[:, axis]
+    ).numpy()  # [N, 59]
+    far = dict.fromkeys(POSITION, "<f8") if normalization.is_far else {}
+    vertices = np.empty(len(raw), list({**dict.fromkeys(COLUMNS, "<f4"), **far}.items()))
+    for name, column in zip(COLUMNS, (*own.T, *table.T), strict=True):
+        vertices[name] = column
     element = PlyElement.describe(vertices, "vertex")
     with atomic(path, sync=False) as temporary:
         PlyData([element], byte_order="<", comments=[OWN_COMMENT]).write(str(temporary))
@@ -90,81 +85,36 @@ def write_ply(gaussians: Gaussians, path: Path, normalization: Normalization = I
 
 def check_ply(path: Path) -> None:
     """Raise InputError if the header or the length of a file shows that it is no readable PLY."""
-    with _checked(path):
-        pass
+    _checked(read_header, path)
 
 
-@contextmanager
-def _checked(path: Path) -> Iterator[None]:
-    """Check a file's length, and turn any error from damage into an InputError with its path."""
+def _checked(read: Callable[[Path], T], path: Path) -> T:
+    """The result of ``read``; an error from damage becomes an InputError with the path."""
     try:
-        _check_length(path)
-        yield
+        return read(path)
     except DAMAGE as error:
         raise InputError(f"{path}: not a readable PLY of Gaussians ({error})") from error
 
 
-def _check_length(path: Path) -> None:
-    """Raise ValueError if the header announces more data than the file can hold."""
-    # plyfile allocates memory for the announced data before it reads: a wrong count could fill the
-    # memory.
-    require_regular(path)
-    header = read_header(path)
-    is_text = b"format ascii" in header
-    announced = count = 0  # announced: bytes
-    for line in header.decode("ascii", errors="replace").splitlines():
-        words = line.split()
-        if words[:1] == ["element"]:
-            count = int(words[2])
-            if count < 0:
-                raise ValueError("the count of an element is negative")
-        elif words[:1] == ["property"]:
-            announced += count * (MIN_TEXT_BYTES if is_text else _bytes_of(words[1]))
-    if announced > path.stat().st_size:
-        raise ValueError(f"it is cut short: its header promises {announced} bytes or more")
-
-
-def _bytes_of(kind: str) -> int:
-    """The bytes of a value of a PLY's type; of a list, those of its length at least."""
-    return 1 if kind == "list" else np.dtype(PlyProperty("", kind).dtype()).itemsize
-
-
-def _finite_logits(logits: Column, path: Path) -> Column:
-    """Replace infinite logits by plus or minus `MAX_LOGIT`, with a warning.
-
-    Other programs write them for opacities of exactly 0 and 1.
-    """
-    infinite = np.isinf(logits) if logits.dtype.kind == "f" else np.zeros(len(logits), bool)
-    if not infinite.any():
-        return logits
-    count = int(infinite.sum())
-    have = "has" if count == 1 else "have"
-    log.warning("%s: %s %s an opacity of exactly 0 or 1", path, counted(count, "Gaussian"), have)
-    return np.where(infinite, np.sign(logits) * MAX_LOGIT, logits)
-
-
 def _check_finite(column: Column, name: str, path: Path) -> None:
-    where = ""
-    if column.dtype.kind in "fiu":
-        with np.errstate(over="ignore"):  # a float64 value may be beyond the range of float32
-            (bad,) = np.nonzero(~np.isfinite(column.astype(np.float32)))
-        if not len(bad):
-            return
-        where = f": it is {column[bad[0]]} in row {bad[0]} and in {len(bad) - 1} more"
-    raise InputError(
-        f"{path}: {name} is not a finite number everywhere{where}: export the model again"
-    )
+    with np.errstate(over="ignore"):  # a float64 value may be beyond the range of float32
+        (bad,) = np.nonzero(~np.isfinite(column.astype(np.float32)))
+    if len(bad):
+        raise InputError(
+            f"{path}: {name} is not a finite number everywhere: it is {column[bad[0]]} in row "
+            f"{bad[0]} and in {len(bad) - 1} more: export the model again"
+        )
 
 
-def _warn_of_activated(vertices: Columns, path: Path) -> None:
+def _warn_of_activated(vertices: Mapping[str, Column], path: Path) -> None:
     """Log a warning if values look as if 3DGS's activations, exp and sigmoid, were applied."""
-    if _look_like_lengths(vertices):
+    opacity = vertices["opacity"]
+    if _look_like_lengths(_stacked(vertices, SCALES), _stacked(vertices, POSITION)):
         log.warning(
             "%s: all scales are positive: they look like lengths, where 3DGS stores their "
             "logarithms",
             path,
         )
-    opacity = vertices["opacity"]
     # As logits, half of all opacities would be 1 to seven digits: then they are bytes.
     for most, is_activated in ((1, opacity.max() <= 1), (255, np.median(opacity) > MAX_LOGIT)):
         if opacity.min() >= 0 and is_activated:
@@ -176,19 +126,14 @@ def _warn_of_activated(vertices: Columns, path: Path) -> None:
             )
 
 
-def _look_like_lengths(vertices: Columns) -> bool:
-    """Return whether the stored scales are more plausible as lengths than as logarithms of lengths.
+def _look_like_lengths(scales: Column, positions: Column) -> bool:
+    """Return whether stored scales [N, 3] are more plausible as lengths than as their logarithms.
 
     The sign does not decide: in a scene measured in millimetres, all logarithms can be positive.
     """
-    scales, positions = (
-        np.stack([vertices[name] for name in names]).astype(np.float64)  # [3, N]
-        for names in (SCALES, POSITION)
-    )
     if not (scales > 0).all():
         return False
-    offsets = positions - np.median(positions, axis=1, keepdims=True)
-    size = float(np.median(np.linalg.norm(offsets, axis=0)))
+    size = float(np.median(np.linalg.norm(positions - np.median(positions, axis=0), axis=1)))
     if size == 0:
         return False
     typical, scale = math.log(TYPICAL_SCALE * size), float(np.median(scales))
@@ -206,36 +151,19 @@ def read_ply(
 
     Raises InputError if the file is not a PLY, lacks a property, or has invalid values.
     """
-    with _checked(path):
-        content = read_ply_data(path)
-        table = content["vertex"].data
-    rest = _check_properties(table, path)
-    vertices = {name: table[name] for name in (*REQUIRED, *rest)}
-    vertices["opacity"] = _finite_logits(vertices["opacity"], path)
-    for name, column in vertices.items():
-        _check_finite(column, name, path)
-    if not np.any([vertices[name] != 0 for name in ROTATIONS], axis=0).all():
-        raise InputError(
-            f"{path}: a Gaussian has a rotation of (0, 0, 0, 0): export the model again"
-        )
-    if OWN_COMMENT not in content.comments:
-        _warn_of_activated(vertices, path)
-        names = [element.name for element in content]
-        report_header([*content.comments, *content.obj_info], names, path)
-    if sizes := [name for name in table.dtype.names if is_filter(name)]:
-        vertices |= filtered(vertices, SCALES, table[sizes[0]], path, MAX_LOGIT)
+    vertices = _read_columns(path)
+    rest = [name for name in vertices if name.startswith(REST)]
 
     def columns(names: Sequence[str]) -> torch.Tensor:
-        stacked = np.stack([vertices[name].astype(np.float32) for name in names], axis=1)
-        return torch.from_numpy(stacked).to(device)
+        return torch.from_numpy(_stacked(vertices, names, np.float32)).to(device)
 
-    positions = np.stack([vertices[name] for name in POSITION], axis=1)  # [N, 3]
-    n, stored = len(table), len(rest) // 3  # coefficients per channel
+    n, stored = len(vertices["opacity"]), len(rest) // 3  # coefficients per channel
     sh_rest = torch.zeros(n, NUM_SH_REST, 3, device=device)
-    if stored:
+    if rest:
         sh_rest[:, :stored] = columns(rest).reshape(n, 3, stored).transpose(1, 2)
+    means = normalization.apply(_stacked(vertices, POSITION)).astype(np.float32)
     return Gaussians(
-        means=torch.from_numpy(normalization.apply(positions).astype(np.float32)).to(device),
+        means=torch.from_numpy(means).to(device),
         log_scales=columns(SCALES) + math.log(normalization.scale),
         quaternions=columns(ROTATIONS),
         opacity_logits=columns(["opacity"]).squeeze(-1),
@@ -244,8 +172,44 @@ def read_ply(
     )
 
 
+def _stacked(
+    vertices: Mapping[str, Column], names: Sequence[str], kind: type[np.floating] = np.float64
+) -> Column:
+    return np.stack([vertices[name].astype(kind) for name in names], axis=1)  # [N, K]
+
+
+def _read_columns(path: Path) -> dict[str, Column]:
+    """The columns of a 3DGS PLY, with valid values; raises as `read_ply` does."""
+    content, table = _checked(read_ply_data, path)
+    names = _check_properties(table, path)
+    vertices: dict[str, Column] = {name: table[name] for name in names}
+    opacity = vertices["opacity"]
+    if count := int(np.isinf(opacity).sum()):  # other programs write them for 0 and 1
+        have = "has" if count == 1 else "have"
+        log.warning(
+            "%s: %s %s an opacity of exactly 0 or 1", path, counted(count, "Gaussian"), have
+        )
+        vertices["opacity"] = np.where(np.isinf(opacity), np.sign(opacity) * MAX_LOGIT, opacity)
+    for name, column in vertices.items():
+        _check_finite(column, name, path)
+    if not _stacked(vertices, ROTATIONS).any(axis=1).all():
+        raise InputError(
+            f"{path}: a Gaussian has a rotation of (0, 0, 0, 0): export the model again"
+        )
+    if OWN_COMMENT not in content.comments:
+        _warn_of_activated(vertices, path)
+        elements = [element.name for element in content]
+        report_header([*content.comments, *content.obj_info], elements, path)
+    for name in [name for name in table.dtype.names or () if is_filter(name)]:
+        logits, sizes = _stacked({**vertices, name: table[name]}, ["opacity", name]).T
+        scales, logits = filtered(_stacked(vertices, SCALES), logits, sizes, path)
+        vertices |= dict(zip(SCALES, scales.T, strict=True))
+        vertices["opacity"] = logits.clip(-MAX_LOGIT, MAX_LOGIT)
+    return vertices
+
+
 def _check_properties(vertices: Any, path: Path) -> list[str]:
-    """The names of the harmonics above degree 0.
+    """The names of the columns to read.
 
     Raises InputError unless the properties are those of a 3DGS PLY.
     """
@@ -268,10 +232,14 @@ def _check_properties(vertices: Any, path: Path) -> list[str]:
         if missing == ["scale_2"]:
             hint = ": it has flat Gaussians (2DGS), and gsbench draws 3D Gaussians alone"
         raise InputError(f"{path}: not a 3DGS PLY; missing or odd properties: {listed}{hint}")
-    for name in (*REQUIRED, *rest):
-        if name not in POSITION and vertices.dtype[name].kind in "iu":
+    names = [*REQUIRED, *rest]
+    for name in names:
+        kind = vertices.dtype[name].kind
+        if kind not in "fiu":  # a list
+            raise InputError(f"{path}: {name} is not a number: export the model again")
+        if kind != "f" and name not in POSITION:
             raise InputError(
                 f"{path}: {name} has whole numbers, as in a compressed model: export it with "
                 "floating-point numbers"
             )
-    return rest
+    return names

@@ -6,22 +6,23 @@ import logging
 import re
 import zipfile
 import zlib
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from plyfile import PlyData, PlyParseError
+from plyfile import PlyData, PlyParseError, PlyProperty
 
 from gsbench.errors import InputError
-from gsbench.files import DAMAGE, GIT_LFS, LFS_REMEDY
+from gsbench.files import DAMAGE, GIT_LFS, LFS_REMEDY, require_regular
 from gsbench.words import some_of
 
 log = logging.getLogger(__name__)
 
 MAX_HEADER = 1 << 16  # bytes
 END = b"end_header"
+MIN_TEXT_BYTES = 2  # minimum bytes of a value in an ASCII file: a digit and a space
 NOT_ASCII = re.compile(rb"[^\x00-\x7f]")
 # Formats that are not PLY, by the first bytes of a file. Sources: Niantic's repository "spz" (files
 # are compressed by gzip until version 3, later they start with NGSP); PlayCanvas's page on SOG (a
@@ -37,8 +38,10 @@ CHECKPOINT_SUFFIXES = (".pth", ".pt", ".ckpt")
 def read_header(path: Path) -> bytes:
     """Return the header of a PLY without its last line.
 
-    Raises ValueError if there is none; the message names other formats of Gaussians.
+    Raises ValueError if there is none, with the name of another format of Gaussians, or if it
+    announces more data than the file can hold; and InputError for a pipe or a device.
     """
+    require_regular(path)
     with path.open("rb") as stream:
         start = stream.read(MAX_HEADER)
     start = start.removeprefix(codecs.BOM_UTF8)
@@ -49,7 +52,27 @@ def read_header(path: Path) -> bytes:
         raise ValueError("it has no header")
     if b"element chunk" in header and b"packed_position" in header:
         raise ValueError(f"it is a compressed PLY, as SuperSplat writes it: {_how_to_unpack(path)}")
+    _check_length(header, path.stat().st_size)
     return header
+
+
+def _check_length(header: bytes, size: int) -> None:
+    # plyfile allocates memory for the announced data before it reads: a wrong count could fill the
+    # memory.
+    announced = count = 0  # announced: bytes
+    for line in header.decode("ascii", errors="replace").splitlines():
+        match line.split():
+            case ["element", _, number, *_]:
+                count = int(number)
+                if count < 0:
+                    raise ValueError("the count of an element is negative")
+            case ["property", kind, *_] if b"format ascii" in header:
+                announced += count * MIN_TEXT_BYTES
+            case ["property", kind, *_]:  # of a list, at least the byte of its length
+                kind = "char" if kind == "list" else kind
+                announced += count * np.dtype(PlyProperty("", kind).dtype()).itemsize
+    if announced > size:
+        raise ValueError(f"it is cut short: its header promises {announced} bytes or more")
 
 
 def recognised_format(path: Path) -> str:
@@ -107,22 +130,27 @@ def _how_to_unpack(path: Path) -> str:
     return f"unpack it with npx @playcanvas/splat-transform {path.name} out.ply"
 
 
-def read_ply_data(path: Path) -> PlyData:
-    """Return the content of a PLY file.
+def read_ply_data(path: Path) -> tuple[PlyData, NDArray[Any]]:
+    """Return the content of a PLY file, and the table of its vertices.
 
     Unlike plyfile, it accepts a byte order mark and comments with characters beyond ASCII. Raises
-    ValueError as `read_header` does, and other errors of `gsbench.files.DAMAGE`.
+    as `read_header` does, ValueError without vertices, and other errors of `gsbench.files.DAMAGE`.
     """
     header = read_header(path)
     with path.open("rb") as stream:
         marked = stream.read(len(codecs.BOM_UTF8)) == codecs.BOM_UTF8
-    try:
-        if header.isascii() and not marked:
-            return PlyData.read(str(path))
+    source: Any = str(path)
+    if marked or not header.isascii():
         content = path.read_bytes().removeprefix(codecs.BOM_UTF8)
-        return PlyData.read(io.BytesIO(NOT_ASCII.sub(b"?", header) + content[len(header) :]))
+        source = io.BytesIO(NOT_ASCII.sub(b"?", header) + content[len(header) :])
+    try:
+        data = PlyData.read(source)
     except PlyParseError as error:
         raise ValueError(str(error)) from error
+    if "vertex" not in data:
+        elements = ", ".join(element.name for element in data)
+        raise ValueError(f"it has no element vertex, only {elements or 'a header'}")
+    return data, data["vertex"].data
 
 
 FILTER = "filter_3D"
@@ -192,28 +220,19 @@ def is_filter(name: str) -> bool:
 
 
 def filtered(
-    vertices: Mapping[str, NDArray[Any]],
-    names: Sequence[str],
-    column: NDArray[Any],
-    path: Path,
-    largest_logit: float,
-) -> dict[str, NDArray[Any]]:
-    """Scales (the columns ``names``) and opacities after Mip-Splatting's 3D filter; logs a line.
+    logs: NDArray[Any], logits: NDArray[Any], sizes: NDArray[Any], path: Path
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Log scales [N, 3] and opacities' logits [N] after Mip-Splatting's 3D filter; logs a line.
 
-    As its ``create_fused_ply.py``: each scale s becomes sqrt(s² + f²), and the opacity is
-    multiplied by the ratio of the volumes before and after (Yu et al. 2024, equation 7). Logits
-    are limited to ``largest_logit``.
+    As its ``create_fused_ply.py``: each scale s becomes sqrt(s² + f²) for the filter's ``sizes``
+    [N], and the opacity is multiplied by the ratio of the volumes before and after (Yu et al. 2024,
+    equation 7).
     """
-    sizes = column.astype(np.float64)  # [N]
     if not (np.isfinite(sizes) & (sizes >= 0)).all():
         raise InputError(f"{path}: {FILTER} is negative or not a finite number: export it again")
     log.warning("%s: Mip-Splatting's %s is applied to scales and opacities", path, FILTER)
-    logs = np.stack([vertices[name] for name in names]).astype(np.float64)  # [3, N]
-    logits = vertices["opacity"].astype(np.float64)
     with np.errstate(divide="ignore"):
-        fused = 0.5 * np.logaddexp(2 * logs, 2 * np.log(sizes))  # log sqrt(s² + f²)
+        fused = 0.5 * np.logaddexp(2 * logs, 2 * np.log(sizes[:, None]))  # log sqrt(s² + f²)
         # log of the new opacity, then its logit: log p - log(1 - p)
-        log_opacity = -np.logaddexp(0.0, -logits) + (logs - fused).sum(axis=0)
-        new_logits = log_opacity - np.log(-np.expm1(np.minimum(log_opacity, 0.0)))
-    opacities = new_logits.clip(-largest_logit, largest_logit)
-    return {**dict(zip(names, fused, strict=True)), "opacity": opacities}
+        log_opacity = -np.logaddexp(0.0, -logits) + (logs - fused).sum(axis=1)
+        return fused, log_opacity - np.log(-np.expm1(np.minimum(log_opacity, 0.0)))

@@ -173,16 +173,6 @@ class InitReport:
         return json.loads(json.dumps(asdict(self), default=str))  # str: paths among the settings
 
 
-@dataclass(frozen=True)
-class Preparation:
-    """Time, counts, settings and warnings of the preparation before COLMAP, for the report."""
-
-    seconds: Mapping[str, float] = field(default_factory=dict)
-    counts: Mapping[str, int] = field(default_factory=dict)
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    warnings: tuple[str, ...] = ()
-
-
 class Initializer(ABC):
     """Makes cameras and an initial cloud. Subclasses are dataclasses; their fields are settings.
 

@@ -35,7 +35,7 @@ from gsbench.scene.images import read_image
 from gsbench.scene.masks import read_mask
 from gsbench.scene.types import Array, Capture
 from gsbench.settings import AnyPath, check_settings
-from gsbench.system.isolate import run_with_progress
+from gsbench.system.isolate import run_isolated
 
 if TYPE_CHECKING:
     import pycolmap
@@ -66,15 +66,13 @@ class PlacedCloud(Initializer):
                 "with init=sfm first"
             )
         output_dir.mkdir(parents=True, exist_ok=True)
-        given = capture, output_dir, reference
-        return run_with_progress(self.build, given, progress, what=self.name)
+        return run_isolated(self.build, capture, output_dir, reference, what=self.name)
 
-    def build(self, given: tuple[Capture, Path, Path | None], progress: Progress) -> InitReport:
+    def build(self, capture: Capture, output_dir: Path, reference: Path | None) -> InitReport:
         """Write the model and the report; runs in the isolated process."""
-        from gsbench.init.colmap.reconstruct import load_reference
+        from gsbench.init.colmap.models import load_reference
         from gsbench.init.report import make_report, write_result
 
-        capture, output_dir, reference = given
         timer = Timer()
         with timer.phase("read"):
             model = load_reference(capture, reference)
@@ -86,7 +84,6 @@ class PlacedCloud(Initializer):
             "shared",
             capture,
             model,
-            ("pycolmap", "numpy"),
             scale_to_reference=1.0,
             settings=asdict(self),  # type: ignore[call-overload]
             seconds=timer.rounded(),
@@ -137,7 +134,7 @@ class Dataset(PlacedCloud):
         self, model: pycolmap.Reconstruction, capture: Capture, output_dir: Path
     ) -> TrainingPoints | None:
         from gsbench.init.colmap.database import readable_images
-        from gsbench.init.colmap.reconstruct import keep_training_points
+        from gsbench.init.colmap.models import keep_training_points
 
         if model.num_points3D() == 0:
             raise InputError(
@@ -168,7 +165,7 @@ class Random(PlacedCloud):
     seed: Seed = 0  # of positions and colours
 
     def cloud(self, capture: Capture, model: pycolmap.Reconstruction) -> PointCloud:
-        from gsbench.init.colmap.alignment import training_centers, training_extent
+        from gsbench.init.colmap.models import training_centers, training_extent
 
         extent = training_extent(model, capture)
         if extent == 0:
@@ -192,15 +189,12 @@ def points_in_view(
     image = model.find_image_with_name(name)
     if image is None or not image.has_pose:
         return np.empty(0, np.int64), np.empty((0, 2)), np.empty(0)
-    pose, camera = image.cam_from_world(), model.cameras[image.camera_id]
-    local = points @ pose.rotation.matrix().T + pose.translation  # [P, 3]
-    (ahead,) = np.nonzero(local[:, 2] > 0)
-    pixels = np.asarray(camera.img_from_cam(local[ahead])).reshape(-1, 2)  # [A, 2]
+    local, camera = image.cam_from_world() * points, model.cameras[image.camera_id]
+    pixels = np.asarray(camera.img_from_cam(local))  # [P, 2]; NaN behind the camera
     with np.errstate(invalid="ignore"):
-        # NaN is outside
-        inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
-    seen = ahead[inside]
-    return seen, pixels[inside], np.linalg.norm(local[seen], axis=1)
+        inside = (pixels >= 0) & (pixels < (camera.width, camera.height))
+    (seen,) = np.nonzero(inside.all(axis=1))
+    return seen, pixels[seen], np.linalg.norm(local[seen], axis=1)
 
 
 MAX_LISTED = 3  # models that an error lists

@@ -37,7 +37,8 @@ PTS_LAYOUTS = LAYOUTS | {4: "x y z intensity", 7: "x y z intensity red green blu
 # Colours up to this are fractions, even if tone mapping or rounding went beyond 1. As bytes they
 # would all be black.
 MAX_FRACTION = 2.0
-ASIDE = ("#", "//")  # begin a comment, or the line of names
+ROW = re.compile(r'"?[-+.]?\d')
+NO_ROW = re.compile(r"\d+$|#|//")  # a count of points, or a comment
 OF_COLMAP = "it belongs to a COLMAP model: init=dataset reads its folder"
 REMEDY = (
     "wanted are rows of x y z [red green blue] with decimal points, below a first line such as "
@@ -57,7 +58,8 @@ def read_points(path: Path) -> tuple[Array, NDArray[np.uint8] | None]:
     require_regular(path)
     try:
         if suffix == ".ply":
-            columns = _read_ply(path)
+            _, vertices = read_ply_data(path)
+            columns: Columns = {name: vertices[name] for name in vertices.dtype.names or ()}
         elif suffix in TEXT_SUFFIXES:
             columns = _read_table(path)
         else:
@@ -91,15 +93,6 @@ def _other_format(path: Path) -> str:
     return f"known are {known}: convert it to PLY, for example with CloudCompare"
 
 
-def _read_ply(path: Path) -> Columns:
-    content = read_ply_data(path)
-    if "vertex" not in content:
-        elements = ", ".join(element.name for element in content)
-        raise ValueError(f"it has no element vertex, only {elements or 'a header'}")
-    vertices = content["vertex"].data
-    return {name: vertices[name] for name in vertices.dtype.names or ()}
-
-
 def _read_table(path: Path) -> Columns:
     """Read rows of numbers; raises ValueError for other tables.
 
@@ -110,8 +103,8 @@ def _read_table(path: Path) -> Columns:
     if "POINT3D_ID" in text[:1000]:
         raise ValueError(OF_COLMAP)
     lines = [line.strip(" \t,;") for line in text.splitlines() if line.strip()]
-    first = next((k for k, line in enumerate(lines) if _is_row(line)), len(lines))
-    rows = [line for line in lines[first:] if not (line.isdecimal() or line.startswith(ASIDE))]
+    first = next((k for k, line in enumerate(lines) if ROW.match(line)), len(lines))
+    rows = [line for line in lines[first:] if not NO_ROW.match(line)]
     if not rows:
         raise ValueError(f"no line is a row of numbers: {REMEDY}")
     between = next((mark for mark in ",;" if mark in rows[0]), r"\s+")
@@ -120,13 +113,14 @@ def _read_table(path: Path) -> Columns:
         values = table.to_numpy(dtype=np.float64)  # [P, columns]
     except ValueError as error:  # pandas' errors are
         raise ValueError(f"{error}; {REMEDY}") from error
-    count, written = values.shape[1], _words(lines[first - 1]) if first else []
-    if len(written) != count:
+    head, count = lines[first - 1].strip("/# ") if first else "", values.shape[1]
+    words = re.split("[,;]" if re.search("[,;]", head) else r"\s+", head)
+    if len(words) != count:
         layouts = PTS_LAYOUTS if path.suffix.lower() == ".pts" else LAYOUTS
-        written = layouts.get(count, "").split()
-        if not written:
-            raise ValueError(f"it has {count} columns without names: {REMEDY}")
-    return dict(zip(written, values.T, strict=True))
+        words = layouts.get(count, "").split()
+    if not words:
+        raise ValueError(f"it has {count} columns without names: {REMEDY}")
+    return {word.strip(" \t\"'"): column for word, column in zip(words, values.T, strict=True)}
 
 
 def _points_and_colors(columns: Columns, path: Path) -> tuple[Array, NDArray[np.generic] | None]:
@@ -136,13 +130,14 @@ def _points_and_colors(columns: Columns, path: Path) -> tuple[Array, NDArray[np.
     """
 
     def stacked(names: Iterable[str]) -> NDArray[np.generic]:
-        return np.stack([columns[known.get(name, name)] for name in names], axis=1)
+        return np.stack([known[name] for name in names], axis=1)
 
-    known = {_plain(name): name for name in columns} | {name.lower(): name for name in columns}
+    known = {_plain(name): column for name, column in columns.items()}
+    known |= {name.lower(): column for name, column in columns.items()}
     if lacking := [name for name in "xyz" if name not in known]:
         raise ValueError(f"it has no column {', '.join(lacking)}: {REMEDY}")
     points = stacked("xyz").astype(np.float64)
-    if columns.keys() >= {*DC_NAMES}:  # a model of Gaussians
+    if known.keys() >= {*DC_NAMES}:  # a model of Gaussians
         dc = stacked(DC_NAMES).astype(np.float64)
         return points, np.clip(0.5 + SH_C0 * dc, 0.0, 1.0)  # NaN stays; `read_points` refuses it
     for group in COLOR_NAMES:
@@ -153,20 +148,6 @@ def _points_and_colors(columns: Columns, path: Path) -> tuple[Array, NDArray[np.
             "%s: it has no red, green and blue, and its %s is not used", path, ", ".join(others)
         )
     return points, None
-
-
-def _words(line: str) -> list[str]:
-    line = line.strip(" \t,;/#")
-    words = re.split(r"[,;]" if "," in line or ";" in line else r"\s+", line)
-    return [word.strip(" \t\"'") for word in words]
-
-
-def _is_row(line: str) -> bool:
-    try:
-        float(_words(line)[0])
-    except ValueError:
-        return False
-    return not line.startswith(ASIDE)
 
 
 def _plain(word: str) -> str:

@@ -6,7 +6,7 @@ import logging
 import shutil
 from abc import abstractmethod
 from collections import Counter
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +16,6 @@ from gsbench.init.base import (
     REGISTERED_SHARE,
     WORK_FOLDER,
     InitReport,
-    Preparation,
     Timer,
     TrainingPoints,
     UnplacedError,
@@ -27,7 +26,7 @@ from gsbench.logs import Progress, no_progress
 from gsbench.scene.images import lens_of
 from gsbench.scene.rules import MIN_IMAGES
 from gsbench.scene.types import Capture
-from gsbench.system.isolate import run_with_progress
+from gsbench.system.isolate import run_isolated
 from gsbench.words import counted, some_of
 
 if TYPE_CHECKING:
@@ -38,7 +37,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 LOG_FILE = "colmap.log"
-ALL_PAIRS = "all_pairs"  # below the work folder: the output of a second attempt
+Facts = dict[str, Any]  # arguments of `gsbench.init.report.make_report`
 
 
 @dataclass(frozen=True)
@@ -59,22 +58,11 @@ class Job:
 class Reconstruction(ColmapOptions):
     """Base of the initialisers that reconstruct; subclasses differ in features and matches."""
 
-    @property
-    def packages(self) -> tuple[str, ...]:
-        """The packages whose versions are in the report."""
-        return "pycolmap", "numpy"
-
-    def prepare(self, job: Job, progress: Progress) -> Preparation:
-        """Work before COLMAP's process starts, which `fill` uses."""
-        return Preparation()
-
     @abstractmethod
-    def fill(
-        self, job: Job, task: DatabaseTask, progress: Progress, timer: Timer
-    ) -> dict[str, int]:
-        """Write features, matches and verified geometries into the database, and return counts.
+    def fill(self, job: Job, task: DatabaseTask, progress: Progress, timer: Timer) -> Facts:
+        """Write features, matches and verified geometries into the database.
 
-        It runs in COLMAP's process.
+        Returns ``counts`` and more for the report. It runs in COLMAP's process.
         """
 
     def check(self, capture: Capture, reference: Path | None) -> None:
@@ -105,34 +93,15 @@ class Reconstruction(ColmapOptions):
         ``output_dir`` until the run succeeds, so that an interrupted run continues there.
         """
         self.check(capture, reference)
-        given = self.uses_reference_cameras and (reference or capture.model) is not None
-        if given:
+        if self.uses_reference_cameras and (reference or capture.model) is not None:
             report_unused(self)
         elif self.camera == "exif":
             report_lenses(capture)
         work = output_dir / WORK_FOLDER if work_dir is None else work_dir
         for folder in (output_dir, work):
             folder.mkdir(parents=True, exist_ok=True)
-        job, total = Job(self, capture, output_dir, work, reference), len(capture.image_names)
-        lacks_pairs = self.pairs == "auto" and total > ALL_PAIRS_UP_TO
-        report = None
-        try:
-            report = run_job(job, progress)
-        except UnplacedError:
-            if not lacks_pairs:
-                raise
-        placed = report.num_registered if report else 0
-        if report is None or (
-            lacks_pairs and report.mapped_by is not None and placed < REGISTERED_SHARE * total
-        ):
-            logger.warning(
-                "%s: %d of %d images placed from the pairs of init.pairs=auto: the others are "
-                "matched, too",
-                self.name,
-                placed,
-                total,
-            )
-            report = with_all_pairs(job, progress, report)
+        job, log = Job(self, capture, output_dir, work, reference), output_dir / LOG_FILE
+        report = run_isolated(build_model, job, what=self.name, log=log, progress=progress)
         if work_dir is None:
             shutil.rmtree(work)
         for warning in report.warnings:
@@ -140,40 +109,14 @@ class Reconstruction(ColmapOptions):
         return report
 
 
-def run_job(job: Job, progress: Progress) -> InitReport:
-    """Make features, matches and the model, each in a process of its own."""
-    preparation = job.options.prepare(job, progress)
-    what, log = job.options.name, job.output_dir / LOG_FILE
-    return run_with_progress(build_model, (job, preparation), progress, what=what, log=log)
-
-
-def with_all_pairs(job: Job, progress: Progress, report: InitReport | None) -> InitReport:
-    """Reconstruct again from all pairs; the model that places more images is kept."""
-    second = job.work_dir / ALL_PAIRS
-    shutil.rmtree(second, ignore_errors=True)
-    second.mkdir()
-    everything = replace(job, options=replace(job.options, pairs="exhaustive"), output_dir=second)
-    try:
-        more = run_job(everything, progress)
-    except InputError:
-        if report is None:
-            raise
-        return report
-    if report is not None and more.num_registered <= report.num_registered:
-        return report
-    shutil.copytree(second, job.output_dir, dirs_exist_ok=True)
-    return more
-
-
 def report_unused(options: ColmapOptions) -> None:
     """Write a line on each setting for cameras to be estimated, where cameras are given."""
-    for entry in fields(ColmapOptions):
-        value = getattr(options, entry.name)
-        if entry.name in ("camera", "camera_model", "focal_length") and value != entry.default:
+    for name in ("camera", "camera_model", "focal_length"):
+        if (value := getattr(options, name)) != getattr(ColmapOptions, name):
             logger.warning(
                 "init.%s=%s is not used, since the cameras are given: init.poses=own "
                 "init.intrinsics=estimate estimates them",
-                entry.name,
+                name,
                 value,
             )
 
@@ -191,7 +134,7 @@ def report_lenses(capture: Capture) -> None:
         )
 
 
-def build_model(given: tuple[Job, Preparation], progress: Progress) -> InitReport:
+def build_model(job: Job, progress: Progress) -> InitReport:
     """Make a model from the photographs, write it, and return the report on it.
 
     Calls native code that can abort the process: run it isolated.
@@ -199,71 +142,103 @@ def build_model(given: tuple[Job, Preparation], progress: Progress) -> InitRepor
     import pycolmap
 
     from gsbench.init import report
-    from gsbench.init.colmap import database, reconstruct
+    from gsbench.init.colmap.alignment import align
+    from gsbench.init.colmap.models import load_reference
 
     # without this, COLMAP logs a line for each image; the log is for warnings
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.WARNING)
-    job, preparation = given
-    options, capture = job.options, job.capture
-    timer = Timer(dict(preparation.seconds))
-    reference = reconstruct.load_reference(capture, job.reference)
-    task = database.create_task(options, capture, reference, job.work_dir)
-    found = options.fill(job, task, progress, timer)
-    counts = {**preparation.counts, **found, **database.database_counts(task.database)}
-    if counts["pairs_verified"] == 0:
-        raise UnplacedError(
-            f"{options.name}: no pair of images shares enough matches: the photos need more "
-            "overlap or texture"
-        )
-    model, poses, further = _cameras_and_points(job, task, reference, timer, progress)
-    counts |= further.pop("counts", {})
-    warnings = [*preparation.warnings, *further.pop("warnings", ())]
+    capture, timer = job.capture, Timer()
+    reference = load_reference(capture, job.reference)
+    options, model, facts = _best_attempt(job, reference, timer, progress)
+    if facts["poses"] == "own":
+        exact = capture.exact_poses and job.reference is None
+        own_gauge = job.output_dir / OWN_GAUGE_FOLDER if options.align else None
+        compared = align(model, reference, capture, exact, own_gauge)
+        facts["warnings"] += compared.pop("warnings", [])
+        facts |= compared
     made = report.make_report(
         options.name,
-        poses,
-        capture,
-        model,
-        options.packages,
-        warnings,
-        settings={**asdict(options), **preparation.settings},
+        capture=capture,
+        model=model,
+        settings={**asdict(options), **facts.pop("settings", {})},
         seconds=timer.rounded(),
-        counts=counts,
-        **further,
+        **facts,
     )
     report.write_result(model, made, job.output_dir)
     return made
 
 
-def _cameras_and_points(
-    job: Job,
-    task: DatabaseTask,
-    reference: pycolmap.Reconstruction | None,
-    timer: Timer,
-    progress: Progress,
-) -> tuple[pycolmap.Reconstruction, str, dict[str, Any]]:
-    """Triangulate under the reference's cameras, or map: the model, its poses, and more facts."""
-    from gsbench.init.colmap import mapping, reconstruct
-    from gsbench.init.colmap.alignment import align
+# the options, the model that they give, and facts for the report
+Attempt = tuple[Reconstruction, "pycolmap.Reconstruction", Facts]
+
+
+def _best_attempt(
+    job: Job, reference: pycolmap.Reconstruction | None, timer: Timer, progress: Progress
+) -> Attempt:
+    """The job's model; if ``pairs=auto`` places few images, that of all pairs if it has more."""
+    options, total = job.options, len(job.capture.image_names)
+    lacks_pairs = options.pairs == "auto" and total > ALL_PAIRS_UP_TO
+    made, placed = None, 0
+    try:
+        made = _attempt(job, reference, timer, progress)
+        placed = made[1].num_reg_images()
+    except UnplacedError:
+        if not lacks_pairs:
+            raise
+    if made and (not lacks_pairs or made[2]["poses"] == "shared"):
+        return made
+    if made and placed >= REGISTERED_SHARE * total:
+        return made
+    logger.warning(
+        "%s: %d of %d images placed from the pairs of init.pairs=auto: the others are matched, too",
+        options.name,
+        placed,
+        total,
+    )
+    everything = replace(job, options=replace(options, pairs="exhaustive"))
+    try:
+        again = _attempt(everything, reference, timer, progress)
+    except UnplacedError:
+        if made is None:
+            raise
+        return made
+    return made if made and again[1].num_reg_images() <= placed else again
+
+
+def _attempt(
+    job: Job, reference: pycolmap.Reconstruction | None, timer: Timer, progress: Progress
+) -> Attempt:
+    """Match, then triangulate under the reference's cameras, or map.
+
+    Raises UnplacedError if the matches place no cameras.
+    """
+    from gsbench.init.colmap import database, mapping
+    from gsbench.init.colmap.models import keep_training_points
 
     options, capture = job.options, job.capture
+    task = database.create_task(options, capture, reference, job.work_dir)
+    facts = {"warnings": [], **options.fill(job, task, progress, timer)}
+    facts["counts"] |= database.database_counts(task.database)
+    if facts["counts"]["pairs_verified"] == 0:
+        raise UnplacedError(
+            f"{options.name}: no pair of images shares enough matches: the photos need more "
+            "overlap or texture"
+        )
     # an interrupted mapping is not continued but started again
     scratch = job.work_dir / "mapping"
     shutil.rmtree(scratch, ignore_errors=True)
     if options.poses == "shared" and reference is not None:
-        points = None
         with timer.phase("triangulate"):
             model = mapping.triangulate(task, scratch, reference, options, progress)
         if options.ignores_test_photographs(reference):
             points = TrainingPoints(options.points_from, model.num_points3D(), None, None)
-        return model, "shared", {"scale_to_reference": 1.0, "training_points": points}
+            facts["training_points"] = points
+        return options, model, {**facts, "poses": "shared", "scale_to_reference": 1.0}
     with timer.phase("map"):
-        model, counts, strategy, warnings = mapping.map_images(task, scratch, options, progress)
-    further: dict[str, Any] = {"counts": {"models": counts}, "mapped_by": strategy}
+        found = mapping.map_images(task, scratch, options, progress)
+    facts["counts"]["models"] = found.models
+    facts["warnings"] += found.warnings
     if options.points_from == "train":
-        points = reconstruct.keep_training_points(model, capture.train_names, task.images)
-        further["training_points"] = points
-    own_gauge = job.output_dir / OWN_GAUGE_FOLDER if options.align else None
-    exact = capture.exact_poses and job.reference is None
-    further |= align(model, reference, capture, exact, own_gauge)
-    further["warnings"] = [*warnings, *further.get("warnings", ())]
-    return model, "own", further
+        points = keep_training_points(found.model, capture.train_names, task.images)
+        facts["training_points"] = points
+    return options, found.model, {**facts, "poses": "own", "mapped_by": found.strategy}

@@ -13,9 +13,9 @@ from typing import Any
 
 import pycolmap
 
-from gsbench.init.base import MODEL_FOLDER, REPORT_FILE, InitReport
-from gsbench.init.colmap.alignment import measure_gauge, training_extent
-from gsbench.init.colmap.reconstruct import poses_by_name
+from gsbench.gaussians.paper_values import VOLUME_THRESHOLD
+from gsbench.init.base import MODEL_FOLDER, REPORT_FILE, Gauge, InitReport
+from gsbench.init.colmap.models import posed_images, training_extent
 from gsbench.runs.trial_record import Oddity
 from gsbench.scene.colmap import save_model
 from gsbench.scene.rules import Finding, inspect
@@ -27,13 +27,13 @@ def make_report(
     poses: str,
     capture: Capture,
     model: pycolmap.Reconstruction,
-    packages: Sequence[str],
+    packages: Sequence[str] = (),
     warnings: Sequence[str] = (),
     scale_to_reference: float | None = None,
     **further: Any,
 ) -> InitReport:
-    """The report on ``model``, with versions of ``packages`` and further fields."""
-    placed = poses_by_name(model)
+    """The report on ``model``, with versions of its ``packages``, and further fields."""
+    placed = posed_images(model)
     observed = any(point.track.length() > 0 for point in model.points3D.values())
     report = InitReport(
         init=init,
@@ -48,11 +48,29 @@ def make_report(
             camera.mean_focal_length() for _, camera in sorted(model.cameras.items())
         ),
         gauge=measure_gauge(training_extent(model, capture), scale_to_reference),
-        versions={package: metadata.version(package) for package in packages},
+        versions={
+            package: metadata.version(package) for package in ("pycolmap", "numpy", *packages)
+        },
         **further,
     )
     odd = find_oddities(report, model, capture)
     return replace(report, warnings=tuple(warnings), oddities=odd)
+
+
+def measure_gauge(extent: float, scale_to_reference: float | None) -> Gauge:
+    """Express the paper's V_th in the units of a model with the scene extent ``extent``."""
+    # a sphere of volume V_th: 4/3 pi r^3 = V_th
+    radius = (3 * VOLUME_THRESHOLD / (4 * math.pi)) ** (1 / 3)
+    scale = scale_to_reference
+    return Gauge(
+        scene_extent=extent,
+        scale_to_reference=scale,
+        volume_threshold=VOLUME_THRESHOLD,
+        threshold_over_extent_cubed=VOLUME_THRESHOLD / extent**3 if extent > 0 else None,
+        threshold_radius=radius,
+        threshold_radius_over_extent=radius / extent if extent > 0 else None,
+        threshold_in_reference=None if scale is None else VOLUME_THRESHOLD * scale**3,
+    )
 
 
 def write_result(model: pycolmap.Reconstruction, report: InitReport, output_dir: Path) -> None:

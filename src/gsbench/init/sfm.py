@@ -11,7 +11,7 @@ from gsbench.errors import InputError
 from gsbench.init.base import Timer
 from gsbench.init.colmap.pairs import STRONGEST, proposed_pairs
 from gsbench.init.options import SiftOptions
-from gsbench.init.reconstruction import Job, Reconstruction
+from gsbench.init.reconstruction import Facts, Job, Reconstruction
 from gsbench.logs import Progress
 
 if TYPE_CHECKING:
@@ -28,9 +28,7 @@ class Sfm(Reconstruction, SiftOptions):
     name: ClassVar[str] = "sfm"
     is_own_reference: ClassVar[bool] = True
 
-    def fill(
-        self, job: Job, task: DatabaseTask, progress: Progress, timer: Timer
-    ) -> dict[str, int]:
+    def fill(self, job: Job, task: DatabaseTask, progress: Progress, timer: Timer) -> Facts:
         from gsbench.init.colmap.database import database_counts, linked, strongest_descriptors
         from gsbench.init.colmap.matches import extract_sift, match_sift
 
@@ -52,7 +50,7 @@ class Sfm(Reconstruction, SiftOptions):
             counts = {"pairs_selected": len(pairs), "pairs_left_out": len(task.pairs) - len(pairs)}
         with timer.phase("match"):
             match_sift(task.database, pairs, self, progress)
-        return counts
+        return {"counts": counts}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -112,16 +112,18 @@ def missing_folders(trials: Sequence[Trial]) -> list[str]:
 
 def missing_weights(trials: Sequence[Trial]) -> list[str]:
     """A line for each missing folder of weights that the trials name."""
-    lines = []
-    for group in ("eval", "init"):
-        named = {trial.values[group].get("weights") for trial in trials} - {None}
-        for folder in sorted(map(str, named)):
-            if not Path(folder).expanduser().is_dir():
-                lines.append(
-                    f"{group}.weights={folder}: no such folder; without it, weights are looked for "
-                    "where gsbench keeps them"
-                )
-    return lines
+    named = {
+        (group, str(folder))
+        for trial in trials
+        for group in ("eval", "init")
+        if (folder := trial.values[group].get("weights"))
+    }
+    return [
+        f"{group}.weights={folder}: no such folder; without it, weights are looked for where "
+        "gsbench keeps them"
+        for group, folder in sorted(named)
+        if not Path(folder).expanduser().is_dir()
+    ]
 
 
 def check_parts(trials: Sequence[Trial], on_this_machine: bool) -> None:

@@ -12,14 +12,15 @@ from statistics import fmean
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from gsbench.config.compose import Trial
-from gsbench.launch.states import arm_names, ask_queue, label_of, state_in_queue, summary_of
+from gsbench.errors import InputError
+from gsbench.launch.states import ask_queue, labels_of, state_in_queue, summary_of
 from gsbench.parsing import DamagedError
 from gsbench.runs.layout import RESULTS, TRIAL_GLOB
 from gsbench.runs.nested import sha256_of
 from gsbench.runs.trial_folder import TrialFolder
+from gsbench.scene.images import image_size
 from gsbench.scene.names import IMAGE_SUFFIXES
 from gsbench.scene.options import downscaled_size
 from gsbench.system.resources import available_threads, installed_gpus
@@ -84,7 +85,7 @@ def describe_plan(trials: Sequence[Trial], parallel: int = 1) -> list[str]:
     states: list[str] = []
     finished = FinishedTrials(trials[0].files.runs)
     queue = ask_queue(trial.folder for trial in trials)
-    arms = arm_names({trial.folder: trial.overrides for trial in trials})
+    labels = labels_of(trials)
     for trial in trials:
         folder = trial.files
         state: str = folder.state()
@@ -104,7 +105,7 @@ def describe_plan(trials: Sequence[Trial], parallel: int = 1) -> list[str]:
             learned_from = max(learned_from, known_from)
             without_estimate += seconds == 0
         states.append(state)
-        lines.append(f"{state:<8} {label_of(folder.path, arms)}{note}")
+        lines.append(f"{state:<8} {labels[folder.path]}{note}")
     lines.append(summary_of(states))
     if {*states} == {"done"}:
         return lines
@@ -119,7 +120,7 @@ def describe_plan(trials: Sequence[Trial], parallel: int = 1) -> list[str]:
         at_once = f", {parallel} at once" if parallel > 1 else ""
         duration = readable_time(remaining / parallel)
         sources = [f"estimated from {counted(learned_from, 'finished trial')}"] * (learned_from > 0)
-        sources += [guess] * bool(guess)
+        sources += [f"{guess}; without compiling (once) and initial clouds (SfM)"] * bool(guess)
         time = f"about {duration}{at_once}, {'; '.join(sources)}"
     return [*lines, f"time: {time}"]
 
@@ -205,9 +206,8 @@ def _first_size(path: str, images: str) -> tuple[int, int] | None:
     for place in (folder / images, folder) if path else ():
         for file in _files(place):
             try:
-                with Image.open(file) as picture:  # reads the header alone
-                    return picture.size
-            except (OSError, ValueError, Image.DecompressionBombError):
+                return image_size(file)
+            except InputError:
                 continue
     return None
 

@@ -24,7 +24,7 @@ from gsbench.config.compose import Trial
 from gsbench.errors import InputError
 from gsbench.files import DiskFullError, require_no_links
 from gsbench.launch.outcomes import Outcome, Repeats, outcome_of_error, outcome_of_results
-from gsbench.launch.states import arm_names, forget_submission, label_of
+from gsbench.launch.states import forget_submission, labels_of
 from gsbench.logs import bar, set_up_logging
 from gsbench.runs.commands import digest_of
 from gsbench.runs.layout import JOBS
@@ -59,12 +59,6 @@ def say_last(outcomes: Sequence[Outcome], labels: Mapping[Path, str]) -> None:
     """Log the outcome of the trial that ended last, and how many have ended."""
     last, label = outcomes[-1], labels[outcomes[-1].folder]
     log.info("%s: %s  (%d of %d)", label, last.message, len(outcomes), len(labels))
-
-
-def labels_of(trials: Sequence[Trial]) -> dict[Path, str]:
-    """The names of trials in messages, with the settings that distinguish their arms."""
-    names = arm_names({trial.folder: trial.overrides for trial in trials})
-    return {folder: label_of(folder, names) for folder in names}
 
 
 def run_serial(trials: Sequence[Trial], mirror: Mirror) -> list[Outcome]:

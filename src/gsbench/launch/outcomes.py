@@ -36,6 +36,11 @@ class Outcome:
     def label(self) -> str:
         return TrialFolder(self.folder).label
 
+    @property
+    def error(self) -> GsbenchError:
+        """The error of a failed trial."""
+        return (InputError if self.bad_input else GsbenchError)(self.message)
+
 
 def outcome_of_results(folder: Path, results: TrialRecord) -> Outcome:
     """The outcome of a complete trial."""
@@ -58,7 +63,6 @@ ALL = (*CLOUD, "densify", "raster", "train", "eval", "device")
 # the settings that a stage reads; in other stages, any setting may be the cause
 READ_BY = {"scene": SCENE, "ground_truth": SCENE, "init": CLOUD}
 PARTS = ("densify", "raster", "train", "eval")
-NOT_NAMED = ("name",)  # settings whose values make no trial fail
 
 
 @dataclass
@@ -98,10 +102,9 @@ def setting_in(message: str, values: dict[str, Any]) -> str:
 
 
 def _values(trial: Trial, read: Sequence[str]) -> dict[str, Any]:
-    """The settings of a trial in the groups ``read``, without those of `NOT_NAMED`."""
+    """The settings of a trial in the groups ``read``, without the names of choices."""
     return {
-        group: {key: value for key, value in values.items() if key not in NOT_NAMED}
-        if isinstance(values := trial.values.get(group), dict)
-        else values
-        for group in read
+        key: value
+        for key, value in flatten(trial.values).items()
+        if (group := key.partition(".")[0]) in read and key != f"{group}.name"
     }

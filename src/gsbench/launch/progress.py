@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 
 from gsbench.analysis.results import TrialResult, read_experiment
 from gsbench.errors import InputError
-from gsbench.launch.states import STATES, TrialState, names_of, states_of_experiment
+from gsbench.launch.states import STATES, TrialState, arm_names, states_of_experiment
 from gsbench.runs.experiments import experiment_home
 from gsbench.runs.layout import CURVES
-from gsbench.runs.rows import read_rows
+from gsbench.runs.trial_files import read_rows
 from gsbench.runs.trial_folder import TrialFolder
 
 if TYPE_CHECKING:
@@ -35,8 +35,9 @@ def progress_frame(runs: Path, experiment: str) -> pd.DataFrame:
 
     home = experiment_home(runs, experiment)
     # A superseded trial will never be done, so with it no sweep would end.
-    states = [state for state in states_of_experiment(home) if state.state != "superseded"]
-    names = names_of(states)
+    found = read_experiment(home)
+    states = [one for one in states_of_experiment(home, found) if one.state != "superseded"]
+    names = {path: (arm, path.parents[1].name) for path, arm in arm_names(states).items()}
     columns: dict[str, float] = {"done": 0, "running": 0, "failed": 0, "waiting": 0, SPEED: 0.0}
     rows = {arm: columns.copy() for arm in sorted({arm for arm, _ in names.values()})}
     for state in states:
@@ -45,7 +46,7 @@ def progress_frame(runs: Path, experiment: str) -> pd.DataFrame:
         if state.state == "running":
             row[SPEED] += _speed(TrialFolder(state.folder))
     frame = pd.DataFrame.from_dict(rows, orient="index", columns=[*columns])
-    done = [trial for trial in read_experiment(home).trials if trial.path in names]
+    done = [trial for trial in found.trials if trial.path in names]
     frame.attrs["seconds_left"] = _seconds_left(states, names, done)
     return frame
 

@@ -15,7 +15,6 @@ from gsbench.launch.jobs import (
     SECONDS_BETWEEN_POLLS,
     TrialJob,
     collect,
-    labels_of,
     new_job_folder,
     say_last,
 )
@@ -24,6 +23,7 @@ from gsbench.launch.states import (
     ask_queue,
     current_user,
     forget_submission,
+    labels_of,
     read_queue,
     read_submission,
     record_submission,

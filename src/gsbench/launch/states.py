@@ -6,19 +6,19 @@ A file in a trial's folder names its Slurm job. Loads no torch.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import psutil
 from pydantic import Field
 
-from gsbench.analysis.results import newest_code, read_experiment
+from gsbench.analysis.results import Experiment, group_by, newest_code, read_experiment
 from gsbench.errors import InputError
 from gsbench.files import write_json
 from gsbench.parsing import Record, read_if_sound
-from gsbench.runs.commands import PlannedTrial, read_history
+from gsbench.runs.commands import PlannedTrial
 from gsbench.runs.config_hash import determining_settings
 from gsbench.runs.experiments import trial_folders
 from gsbench.runs.layout import CONFIG, FAILED, LOCK, RESULTS, SEED, SUBMITTED
@@ -26,6 +26,9 @@ from gsbench.runs.trial_folder import State, TrialFolder
 from gsbench.system.locks import read_holder
 from gsbench.system.programs import answer_of
 from gsbench.words import as_line, counted
+
+if TYPE_CHECKING:
+    from gsbench.config.compose import Trial
 
 
 class Kind(NamedTuple):
@@ -57,9 +60,6 @@ def summary_of(states: Iterable[str]) -> str:
     return f"{counted(counts.total(), 'trial')}: {', '.join(texts)}"
 
 
-EARLIER_CODE = "made by earlier code"
-
-
 @dataclass(frozen=True)
 class TrialState:
     """A trial's state, the time at which it began (Unix time), a note, and its entry in the plan.
@@ -75,10 +75,19 @@ class TrialState:
     note: str
     planned: PlannedTrial | None = None
 
+    @property
+    def overrides(self) -> tuple[str, ...]:
+        """The words of its command, as far as they are known."""
+        return self.planned.words if self.planned else ()
 
-def states_of_experiment(home: Path) -> list[TrialState]:
-    """The states of all trials of the experiment in ``home``, planned or with a folder."""
-    plan = read_history(home).planned
+
+def states_of_experiment(home: Path, experiment: Experiment | None = None) -> list[TrialState]:
+    """The states of all trials of the experiment in ``home``, planned or with a folder.
+
+    ``experiment`` has its results (default: they are read).
+    """
+    experiment = experiment or read_experiment(home)
+    plan = experiment.history.planned
     begun = {
         path
         for path in map(Path, trial_folders(home))
@@ -87,43 +96,33 @@ def states_of_experiment(home: Path) -> list[TrialState]:
     folders = sorted({*plan, *begun})
     queue = ask_queue(folders)
     states = [_state(folder, plan.get(folder), queue) for folder in folders]
-    return _mark_superseded([replace(state, planned=plan.get(state.folder)) for state in states])
+    # In a ledger, each idea has its own code, and its trials are its result.
+    older = () if experiment.history.ledger else newest_code(experiment).older
+    return _mark_superseded(states, {trial.path for trial in older})
 
 
-def states_now(home: Path) -> list[TrialState]:
-    """The same, with finished trials that no table counts as ``superseded``; reads all results."""
-    states = states_of_experiment(home)
-    experiment = read_experiment(home)
-    older = {trial.path for trial in newest_code(experiment).older}
-    if experiment.history.ledger is not None:
-        older = set()  # each idea has its own code, and its trials are its result
-    return [
-        replace(state, state="superseded", note=EARLIER_CODE)
-        if state.state == "done" and state.folder in older
-        else state
-        for state in states
-    ]
+def _mark_superseded(trials: Sequence[TrialState], older: Collection[Path]) -> list[TrialState]:
+    """Mark as superseded the ``older`` ones, and those with whose settings another got further.
 
-
-def _mark_superseded(trials: Sequence[TrialState]) -> list[TrialState]:
-    """Mark failed and stopped trials as superseded if one with the same settings got further.
-
-    Such trials differ only in the code of a user's class, which was repaired in between.
+    Such failed and stopped trials differ from the other one only in the code of a user's class,
+    which was repaired in between.
     """
-    further: dict[tuple[Path, str], list[TrialState]] = {}
-    for trial in trials:
-        if trial.state in ("done", "running", "queued"):
-            further.setdefault(_arm_and_seed(trial.folder), []).append(trial)
-    states = []
-    for trial in trials:
-        if trial.state in ("failed", "partial"):
-            others, settings = further.get(_arm_and_seed(trial.folder), []), _settings(trial.folder)
-            later = next((other for other in others if _settings(other.folder) == settings), None)
-            if settings is not None and later is not None:
-                note = f"{later.folder.name} is {later.state}, made by later code: {trial.note}"
-                trial = replace(trial, state="superseded", note=note)
-        states.append(trial)
-    return states
+    further = group_by(
+        (one for one in trials if one.state in ("done", "running", "queued")),
+        lambda one: _arm_and_seed(one.folder),
+    )
+
+    def marked(trial: TrialState) -> TrialState:
+        if trial.state == "done" and trial.folder in older:
+            return replace(trial, state="superseded", note="made by earlier code")
+        if trial.state in ("failed", "partial") and (settings := _settings(trial.folder)):
+            for other in further.get(_arm_and_seed(trial.folder), ()):
+                if _settings(other.folder) == settings:
+                    note = f"{other.folder.name} is {other.state}, made by later code: {trial.note}"
+                    return replace(trial, state="superseded", note=note)
+        return trial
+
+    return list(map(marked, trials))
 
 
 def _arm_and_seed(folder: Path) -> tuple[Path, str]:
@@ -141,31 +140,31 @@ def _settings(folder: Path) -> dict[str, Any] | None:
 def _state(folder: Path, planned: PlannedTrial | None, queue: Queue | None) -> TrialState:
     """The state of the trial in ``folder``; ``planned`` is its entry in the plan."""
     files = TrialFolder(folder)
-    state, lost = files.state(), ""  # ``lost``: its job has left the queue, without a result
-    if state == "running":
-        holder = read_holder(folder / LOCK)
-        process = "process ? on ?" if holder is None else holder.description
-        since = None if holder is None else holder.since
-        return TrialState(folder, state, since, f"{_progress(folder)} {process}".strip())
-    if state not in ("done", "damaged") and (submission := read_submission(folder)):
+    state: Any = files.state()
+    lost = ""  # its job has left the queue, without a result
+    if state not in ("done", "damaged", "running") and (submission := read_submission(folder)):
         if in_queue := state_in_queue(folder, queue):
             job = queue.get(submission.job) if queue is not None else None
             answer = job.words if job else "Slurm does not answer"
             note = f"{_progress(folder)} Slurm job {submission.job}, {answer}".strip()
-            return TrialState(folder, in_queue, _changed(folder / SUBMITTED), note)
+            return TrialState(folder, in_queue, _changed(folder / SUBMITTED), note, planned)
         lost = f"; Slurm job {submission.job} has ended, log: {submission.log}"
-    if state == "done":
-        file, note = RESULTS, files.record().remark
+    if state == "running":
+        holder = read_holder(folder / LOCK)
+        since = None if holder is None else holder.since
+        process = "process ? on ?" if holder is None else holder.description
+        note = f"{_progress(folder)} {process}".strip()
+    elif state == "done":
+        since, note = _changed(folder / RESULTS), files.record().remark
     elif state == "damaged":
-        file, note = RESULTS, str(files.change() or files.why_not_done({}))
+        since, note = _changed(folder / RESULTS), str(files.change() or files.why_not_done({}))
     elif state == "failed":
-        file, note = FAILED, files.failure().reason
+        since, note = _changed(folder / FAILED), files.failure().reason
     elif state == "partial":
-        file, note = CONFIG, f"stopped {_progress(folder)}".strip() + lost
+        since, note = _changed(folder / CONFIG), f"stopped {_progress(folder)}".strip() + lost
     else:
-        since = None if planned is None else planned.time
-        return TrialState(folder, state, since, "never started" + lost)
-    return TrialState(folder, state, _changed(folder / file), note)
+        since, note = planned.time if planned else None, "never started" + lost
+    return TrialState(folder, state, since, note, planned)
 
 
 def _progress(folder: Path) -> str:
@@ -283,38 +282,31 @@ def current_user() -> str:
 OF_A_PLACE = ("seed", "scene", "scene.path", "name")  # overrides that tell no arms apart
 
 
-def arm_names(overrides: Mapping[Path, Iterable[str]]) -> dict[Path, tuple[str, str]]:
-    """Arm and scene of each trial's folder, from the overrides of its command.
+def arm_names(trials: Iterable[Trial | TrialState]) -> dict[Path, str]:
+    """The arm of each trial's folder, from the words of its command.
 
-    If an arm's folder has several settings, the overrides in which their commands differ are added:
-    ``sfm-momentum[decay=0.9]``. Without such overrides it is the settings' hash.
+    If an arm's folder has several settings, the words in which their commands differ are added:
+    ``sfm-momentum[decay=0.9]``. Without such words it is the settings' hash.
     """
-    by_arm: dict[str, list[Path]] = {}
-    for folder in overrides:
-        by_arm.setdefault(folder.parent.name, []).append(folder)
     names = {}
-    for arm, of_arm in by_arm.items():
-        given = {folder: _settings_of(overrides[folder]) for folder in of_arm}
-        shared = set.intersection(*given.values())
-        several = len({folder.name.partition(SEED)[0] for folder in of_arm}) > 1
-        for folder in of_arm:
-            values = ", ".join(sorted(given[folder] - shared)) or folder.name.partition(SEED)[0]
-            names[folder] = (f"{arm}[{values}]" if several else arm, folder.parents[1].name)
+    words = {trial.folder: _settings_of(trial.overrides) for trial in trials}
+    for arm, folders in group_by(words, lambda folder: folder.parent.name).items():
+        shared = set.intersection(*(words[folder] for folder in folders))
+        hashes = {folder: folder.name.partition(SEED)[0] for folder in folders}
+        for folder in folders:
+            values = ", ".join(sorted(words[folder] - shared)) or hashes[folder]
+            names[folder] = f"{arm}[{values}]" if len({*hashes.values()}) > 1 else arm
     return names
 
 
-def names_of(states: Sequence[TrialState]) -> dict[Path, tuple[str, str]]:
-    """`arm_names` of trials from their entries in the plan."""
-    return arm_names(
-        {state.folder: state.planned.words if state.planned else () for state in states}
-    )
-
-
-def label_of(folder: Path, names: Mapping[Path, tuple[str, str]]) -> str:
-    """``TrialFolder.label`` with the arm's name of `arm_names`."""
-    (arm, scene), (hash8, _, seed) = names[folder], folder.name.partition(SEED)
-    arm = arm.removesuffix(f"[{hash8}]")
-    return f"{scene}/{arm} seed {seed} ({hash8})"
+def labels_of(trials: Sequence[Trial | TrialState]) -> dict[Path, str]:
+    """``TrialFolder.label`` of each trial's folder, with the arm's name of `arm_names`."""
+    labels = {}
+    for folder, arm in arm_names(trials).items():
+        hash8, _, seed = folder.name.partition(SEED)
+        arm = arm.removesuffix(f"[{hash8}]")
+        labels[folder] = f"{folder.parents[1].name}/{arm} seed {seed} ({hash8})"
+    return labels
 
 
 def _settings_of(overrides: Iterable[str]) -> set[str]:

@@ -12,8 +12,8 @@ from gsbench.parsing import read_json, read_typed
 from gsbench.runs import keys, layout
 from gsbench.runs.config_hash import arm_hash, config_hash
 from gsbench.runs.nested import flatten, sha256_of
-from gsbench.runs.rows import read_rows
 from gsbench.runs.store import StoredResult, read_manifest
+from gsbench.runs.trial_files import read_rows
 from gsbench.runs.trial_record import (
     FROM_MODEL,
     FROM_RENDERS,

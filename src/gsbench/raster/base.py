@@ -128,10 +128,8 @@ class Footprint:
 
 def view_depths(gaussians: Gaussians, camera: Camera) -> Tensor:
     """View z of each mean, [N] world units."""
-    return (
-        gaussians.means.detach() @ gaussians.means.new_tensor(camera.rotation[2])
-        + camera.translation[2]
-    )
+    axis = gaussians.means.new_tensor(camera.rotation[2])
+    return gaussians.means @ axis + float(camera.translation[2])
 
 
 @dataclass

@@ -8,15 +8,9 @@ import torch
 from torch import Tensor
 
 from gsbench.gaussians.model import C0, Gaussians
-from gsbench.raster.base import MEDIAN, Rasterizer, RenderOutput
+from gsbench.raster.base import MEDIAN, Rasterizer, RenderOutput, view_depths
 from gsbench.raster.reference import tiles_of
 from gsbench.scene.types import Camera
-
-
-def _view_z(gaussians: Gaussians, camera: Camera) -> Tensor:
-    """z along the camera's axis, [N] world units, with its gradient."""
-    axis = gaussians.means.new_tensor(camera.rotation[2])
-    return gaussians.means @ axis + float(camera.translation[2])
 
 
 def render_depth(
@@ -28,7 +22,7 @@ def render_depth(
     also the render of z as colour, whose ``screen_points`` get a gradient of their own.
     """
     # z as grey: at degree 0 a colour is 0.5 + C0 sh_dc, cut at 0 below; z is above 0 in front.
-    grey = ((_view_z(gaussians, camera) - 0.5) / C0)[:, None].expand(-1, 3)
+    grey = ((view_depths(gaussians, camera) - 0.5) / C0)[:, None].expand(-1, 3)
     black = gaussians.means.new_zeros(3)
     render = rasterizer.render(replace(gaussians, sh_dc=grey), camera, 0, black)
     alpha = render.alpha
@@ -43,7 +37,7 @@ def median_depth(rasterizer: Rasterizer, gaussians: Gaussians, camera: Camera) -
     It is 0 where the transmittance stays above. Only that z has a gradient. An executor without
     ``median_gaussians`` lets the operations of the reference choose.
     """
-    z = _view_z(gaussians, camera)
+    z = view_depths(gaussians, camera)
     choose = getattr(rasterizer, "median_gaussians", median_gaussians)
     chosen = choose(gaussians, camera)  # [H, W]
     return torch.where(chosen >= 0, z[chosen.clamp_min(0)], 0.0)

@@ -7,6 +7,7 @@ functions for numba or Triton. No formula subtracts large numbers (see `spread`)
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from types import FunctionType, SimpleNamespace
 from typing import Any
@@ -16,19 +17,31 @@ import numpy as np
 from gsbench.raster.base import CONSTANTS
 
 BLUR: Any = CONSTANTS.blur
+EIGENVALUE_FLOOR: Any = CONSTANTS.eigenvalue_floor
+SIGMA_EXTENT: Any = CONSTANTS.sigma_extent
+MAX_RADIUS: Any = CONSTANTS.max_radius
+CONTOUR_MARGIN: Any = CONSTANTS.contour_margin
+LOG2_E: Any = 1.0 / math.log(2.0)
 select: Any = np.where
 minimum: Any = np.minimum
 maximum: Any = np.maximum
 square_root: Any = np.sqrt
+floor: Any = np.floor
+ceil: Any = np.ceil
 
 
-def compiled(compiler: Callable[..., Any], **operations: Any) -> SimpleNamespace:
+def compiled(
+    compiler: Callable[..., Any], constant: Callable[[float], Any] = float, **operations: Any
+) -> SimpleNamespace:
     """All formulas, compiled by ``compiler``, with ``operations`` in place of those of numpy.
 
-    The functions call each other by name, so they share one set of global names.
+    ``constant`` makes a constant of the compiler. The functions call each other by name, so they
+    share one set of global names.
     """
+    numbers = {name: value for name, value in globals().items() if isinstance(value, float)}
+    constants = {name: constant(value) for name, value in numbers.items()}
     formulas = [f for f in globals().values() if getattr(f, "__module__", None) == __name__]
-    names: dict[str, Any] = {"__name__": __name__, "BLUR": BLUR, **operations}
+    names: dict[str, Any] = {"__name__": __name__, **constants, **operations}
     made = SimpleNamespace()
     for formula in formulas:
         if isinstance(formula, FunctionType) and formula is not compiled:
@@ -140,6 +153,46 @@ def spread(m0, m1):
     return xx + BLUR, xy, yy, 1.0 / given
 
 
+def image_axes(free_x, free_y, inverse_z, quaternion, v):
+    """R, and the rows of N = A R; ``free_x`` and ``free_y`` are x/z and y/z without limits.
+
+    With the scales S, the covariance on the image is M M^T + BLUR I, M = N S (3DGS eq. 5 and 6).
+    """
+    slope_x, slope_y = clamped_slopes(free_x, free_y, v)
+    axis_x, axis_y = image_rows(slope_x, slope_y, inverse_z, v)
+    matrix = rotation_matrix(quaternion)
+    return matrix, times(axis_x, matrix), times(axis_y, matrix)
+
+
+def radius_of(xx, xy, yy):
+    """ceil(3 sqrt(largest eigenvalue)), px, as preprocessCUDA of 3DGS computes it.
+
+    The discriminant (trace / 2)^2 - det is written as a sum of squares, so it is never negative.
+    """
+    half = (xx - yy) * 0.5
+    largest = (xx + yy) * 0.5 + square_root(maximum(half * half + xy * xy, EIGENVALUE_FLOOR))
+    return minimum(ceil(square_root(largest) * SIGMA_EXTENT), MAX_RADIUS)
+
+
+def tile_range(low, high, tiles, size):
+    """First and past-the-last tile of ``size`` px for the pixels ``low`` to ``high`` - 1."""
+    first = floor(minimum(maximum(low * (1.0 / size), 0.0), tiles))
+    return first, floor(minimum(maximum((high + (size - 1)) * (1.0 / size), 0.0), tiles))
+
+
+def contour_range(center, half, tiles, size):
+    """The tiles of the pixels within ``half`` px of ``center``, with a margin for rounding."""
+    half = half * (1 + CONTOUR_MARGIN) + CONTOUR_MARGIN
+    return tile_range(ceil(center - half), floor(center + half) + 1.0, tiles, size)
+
+
+def record_entries(column, row, shear, a, curve_y, log2_opacity, rgb):
+    """The first nine entries of a record (`raster.cpu.layout`)."""
+    curve_t = a * (-0.5 * LOG2_E)
+    red, green, blue = maximum(0.0, rgb[0]), maximum(0.0, rgb[1]), maximum(0.0, rgb[2])
+    return column, row, shear, curve_t, curve_y, log2_opacity, red, green, blue
+
+
 def covariance_gradients(q00, q01, q11, n0, n1, shear, scales):
     """Gradients by the log scales, by small turns, and by the rows of A = J W, through C.
 
@@ -205,7 +258,7 @@ def position_gradient(a0, a1, g_column, g_row, free_x, free_y, inverse_z, v):
 
 
 def splitting_entries(d00, d01, d11, shear, rows):
-    """xx, xy, xz, yy, yz, zz of the splitting matrix F^T U^T (D G D - h D) U F.
+    """The splitting matrix F^T U^T (D G D - h D) U F, row by row.
 
     F = ``rows`` is the derivative of the projected mean; ``d00``, ``d01`` and ``d11`` are the
     entries of D G D - h D. The second derivative of alpha by the projected mean is alpha
@@ -215,11 +268,10 @@ def splitting_entries(d00, d01, d11, shear, rows):
     r1 = rows[1]
     r0 = plus(rows[0], shear, r1)
     s0, s1 = mixed(d00, r0, d01, r1), mixed(d01, r0, d11, r1)
-    return (
-        r0[0] * s0[0] + r1[0] * s1[0],
+    xy, xz, yz = (
         r0[0] * s0[1] + r1[0] * s1[1],
         r0[0] * s0[2] + r1[0] * s1[2],
-        r0[1] * s0[1] + r1[1] * s1[1],
         r0[1] * s0[2] + r1[1] * s1[2],
-        r0[2] * s0[2] + r1[2] * s1[2],
     )
+    xx, yy = r0[0] * s0[0] + r1[0] * s1[0], r0[1] * s0[1] + r1[1] * s1[1]
+    return xx, xy, xz, xy, yy, yz, xz, yz, r0[2] * s0[2] + r1[2] * s1[2]

@@ -4,8 +4,8 @@ It is [3, 3] per world unit squared: the sum over pixels of (d loss / d s) times
 derivative of s by the mean. s is the opacity times the density at the pixel, before the clamp to
 ``alpha_max``. Here the projection is linearised and the 2D covariance is constant.
 
-This module has the definition, for the reference. `raster.cpu.splitting` and
-`raster.triton.splitting` compute the same from the sums of the backward pass.
+This module has the definition, for the reference. The compiled executors compute the same from the
+sums of the backward pass (`raster.formulas.splitting_entries`).
 """
 
 import torch

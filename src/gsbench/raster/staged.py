@@ -1,4 +1,4 @@
-"""Code that executors share: checks of inputs, asynchronous reads, autograd for compiled stages."""
+"""Code that executors share: checks of inputs, asynchronous reads, autograd for kernels."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -313,3 +313,46 @@ class _Render(torch.autograd.Function):
         )
         g_background = None if alpha is None else (g_image * (1 - alpha).unsqueeze(-1)).sum((0, 1))
         return None, None, g_background, gradients.screen, gradients.extra, *gradients.tensors
+
+
+class KernelLoss(ABC):
+    """The loss of float32 images by kernels that know its gradient."""
+
+    def __call__(self, image: Tensor, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        if target.dtype != torch.uint8:
+            target = target.to(torch.float32)
+        loss, l1, similarity = _Differentiable.apply(self, image, target.contiguous())
+        return loss, l1, similarity
+
+    @abstractmethod
+    def compute(
+        self, image: Tensor, target: Tensor, differentiate: bool
+    ) -> tuple[Tensor, Tensor | None]:
+        """Return loss, L1 and SSIM, [3], and the loss's gradient by ``image``, if wanted.
+
+        ``image`` and ``target``, which is uint8 or float32, are contiguous.
+        """
+
+
+class _Differentiable(torch.autograd.Function):
+    """Computes the gradient in ``forward``; ``backward`` only scales it."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, compiled: KernelLoss, image: Tensor, target: Tensor
+    ) -> tuple[Tensor, ...]:
+        pixels, wanted = image.detach().contiguous(), ctx.needs_input_grad[1]
+        values, ctx.gradient = compiled.compute(pixels, target, wanted)
+        loss, *shown = values.unbind()
+        ctx.mark_non_differentiable(*shown)
+        ctx.set_materialize_grads(False)
+        return loss, *shown
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, g_loss: Tensor | None, *_: None) -> tuple[None, Tensor | None, None]:
+        if g_loss is None or ctx.gradient is None:
+            return None, None, None
+        # On a GPU, a look at the factor would wait for the device.
+        is_one = g_loss.device.type == "cpu" and float(g_loss) == 1.0
+        return None, ctx.gradient if is_one else ctx.gradient * g_loss, None

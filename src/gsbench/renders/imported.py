@@ -28,7 +28,7 @@ from gsbench.eval.pictures import PicturePair, read_picture
 from gsbench.files import atomic, file_sha256, write_text
 from gsbench.pipeline.results import versions
 from gsbench.pipeline.steps.evaluate import summary_of, write_per_view
-from gsbench.renders.truth import ReferenceImages
+from gsbench.renders.sources import ReferenceImages
 from gsbench.runs.commands import (
     Command,
     History,
@@ -159,13 +159,14 @@ def import_trial(
     folder = arm / f"{identity[:8]}{SEED}{destination.seed}"
     config = _config(destination, measured.truth, runs)
     # Two trainings with one seed would count as one pair in every comparison.
-    others = [other for other in arm.glob(f"*{SEED}{destination.seed}") if other != folder]
-    own = dict(destination.settings)
-    if taken := [other for other in others if _has(other, own)]:
-        raise InputError(
-            f"seed {destination.seed} of {name} on {destination.scene} is taken ({taken[0]}): "
-            "give another --seed, or remove that folder"
-        )
+    for other in arm.glob(f"*{SEED}{destination.seed}"):
+        read = config_if_readable(other)
+        is_same = not read or all(read.get(key) == value for key, value in destination.settings)
+        if other != folder and is_same:
+            raise InputError(
+                f"seed {destination.seed} of {name} on {destination.scene} is taken ({other}): "
+                "give another --seed, or remove that folder"
+            )
     for pair in measured.pairs:
         files = {RENDERS: pair.picture, GROUND_TRUTH: pair.photograph, MASKS: pair.mask}
         for kind, file in files.items():
@@ -270,12 +271,6 @@ def _config(destination: Destination, truth: ReferenceImages, runs: Path) -> dic
         group, _, name = key.partition(".")
         config[group] = dict(config.get(group, {})) | {name: value}
     return config
-
-
-def _has(folder: Path, settings: Mapping[str, Any]) -> bool:
-    """Return whether a trial has these settings, or none that tell its arm apart."""
-    config = config_if_readable(folder)
-    return not config or all(config.get(key) == value for key, value in settings.items())
 
 
 def _trials(home: Path, scene: str) -> list[TrialResult]:

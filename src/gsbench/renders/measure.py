@@ -21,10 +21,10 @@ from gsbench.files import storage_errors
 from gsbench.logs import progress
 from gsbench.pipeline.parts import build_metrics, make_evaluator
 from gsbench.renders.imported import Measured, check_destination, find_destination, import_trial
-from gsbench.renders.predictions import opened_renders
-from gsbench.renders.truth import (
+from gsbench.renders.sources import (
     ReferenceImages,
     find_reference_images,
+    opened_renders,
     picture_names,
     pictures_in,
     reference_images_of,

@@ -47,12 +47,22 @@ from gsbench.system.locks import hold
 from gsbench.words import counted
 
 ERROR_RATE = 0.05
-BY_COMMAND = "command"  # the rule that gives a question its level
-SCREENING, LOND, CONFIRMATION = "screening", "lond", "confirmation"  # rules of a ledger
 BASELINE = "baseline"  # the name of a ledger's own baseline among its ideas
 ID_CHARACTERS, LINK_CHARACTERS = 12, 16
 LEVELS = 3  # folders of scene, arm and trial
 Place = tuple[str, int]  # scene and seed
+# sources of a question's level: a command, the rules of a ledger, a gate, a table of results
+# (declared before it, or not), a declaration of gsbench 0.1
+Rule = Literal[
+    "command",
+    "screening",
+    "lond",
+    "confirmation",
+    "gate",
+    "table",
+    "declared table",
+    "declaration",
+]
 # arm, hash of the settings and, after a plus, that of the code: ``sfm-mine/3fa9c1d2+9ab01c22``
 Digest = str
 
@@ -126,7 +136,7 @@ class Question(Record):
     digests: dict[str, tuple[Digest, Digest]] = field(default_factory=dict)
     seeds: dict[str, tuple[Count, ...]] = field(default_factory=dict)
     looks: tuple[Count, ...] = ()
-    rule: str = BY_COMMAND
+    rule: Rule = "command"
     n: Count = 1
     level: Amount = ERROR_RATE
     untested: str = ""

@@ -1,34 +1,22 @@
-"""Purpose of each setting, in one table, and the hash of those that determine a result.
+"""Purpose of each setting (purposes.yaml), and the hash of those that determine a result.
 
 The hash names a trial's folder.
 """
 
 from collections.abc import Mapping
 from functools import cache
+from pathlib import Path
 from typing import Any
 
+from gsbench.parsing import read_yaml
 from gsbench.runs.nested import GSBENCH, TARGET, flatten, sha256_of
-from gsbench.runs.user_code import PERMISSIONS, user_modules
+from gsbench.runs.user_code import user_modules
 
-# Purpose of a setting that does not simply determine the trained model.
-BOOKKEEPING = "names, machines and folders: in no hash"
-READING = "what is accepted, how results are read, what may be turned off: in no hash"
-PLACE = "where files lie: in the hash, but two trials that differ in it are not unlike"
-APART = "it determines a result, but not the trained model"
-# A setting stands for itself and all below it; the longest name counts.
+BOOKKEEPING, READING, PLACE = "bookkeeping", "reading", "place"
 PURPOSES = {
-    **dict.fromkeys(("name", "seed", "device", "threads", "runs", PERMISSIONS), BOOKKEEPING),
-    **dict.fromkeys(("questions", "error_rate", "tracking", "launch"), BOOKKEEPING),
-    **dict.fromkeys(("scene.accept", "densify.switches"), READING),
-    **dict.fromkeys(("eval.primary", "eval.baseline", "eval.controls"), READING),
-    "train.steps_scaler": READING,  # it has been applied to the steps
-    "train.by_autograd": READING,
-    **dict.fromkeys(("scene.path", "hydra", "experiment"), PLACE),
-    **dict.fromkeys(("eval", "scene.name", "raster.name", "densify.name", "train.name"), APART),
-    **dict.fromkeys(("init.name", "init.device", "init.weights", "init.download"), APART),
-    **dict.fromkeys(("init.threads", "densify.time_limit_minutes", "train.log_every"), APART),
-    **dict.fromkeys(("train.checkpoint_every", "train.checkpoint_minutes"), APART),
-    "train.volume_histogram": APART,
+    key: purpose
+    for purpose, keys in read_yaml(Path(__file__).with_name("purposes.yaml")).items()
+    for key in keys
 }
 # Options that cannot change a result, and are in no hash. This holds for gsbench's own classes; a
 # user's class may use the names otherwise.

@@ -117,7 +117,7 @@ class Store:
     def find(self, step: Step) -> StoredResult | None:
         """The result of ``step`` if it is finished and sound, else None."""
         try:
-            return self._read(self.path(step))
+            return self._read(self.path(step), thorough=False)
         except ValueError:
             return None
 
@@ -128,10 +128,8 @@ class Store:
         full, and InputError if the store is read-only.
         """
         final = self.path(step)
-        # An existing result may become the input of further steps, so its checksums are compared
-        # once in each process: a flipped bit changes neither size nor time of change.
         with suppress(ValueError):
-            found = self._read_verified(final)
+            found = self._read(final, thorough=True)
             log.debug("store: %s %s is there", step.stage.name, step.key[:8])
             return found
         with storage_errors(self.root.parent):
@@ -141,24 +139,25 @@ class Store:
                 # another process may have built it while this one waited
                 if os.path.lexists(final):
                     try:
-                        return self._read_verified(final)
+                        return self._read(final, thorough=True)
                     except ValueError as error:
                         log.warning("store: %s is damaged (%s) and is built again", final, error)
                         remove(final)
                 log.debug("store: %s %s is computed", step.stage.name, step.key[:8])
                 return self._build(step)
 
-    def _read_verified(self, path: Path) -> StoredResult:
-        result = self._read(path, thorough=path not in self._verified)
-        self._verified.add(path)
-        return result
+    def _read(self, path: Path, thorough: bool) -> StoredResult:
+        """The result in ``path``; ``thorough`` compares checksums once in each process.
 
-    def _read(self, path: Path, thorough: bool = False) -> StoredResult:
+        An existing result may become the input of further steps, and a flipped bit changes neither
+        size nor time of change.
+        """
         if path.is_symlink():
             raise ValueError("it is a link")
-        return StoredResult(
-            path, path.name, read_manifest(path, thorough=thorough).seconds, cached=True
-        )
+        manifest = read_manifest(path, thorough=thorough and path not in self._verified)
+        if thorough:
+            self._verified.add(path)
+        return StoredResult(path, path.name, manifest.seconds, cached=True)
 
     def _build(self, step: Step) -> StoredResult:
         """Build or finish the partial folder, and publish it.

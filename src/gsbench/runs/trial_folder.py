@@ -45,8 +45,15 @@ from gsbench.runs.freshness import (
     origin_of,
 )
 from gsbench.runs.nested import sha256_of
-from gsbench.runs.rows import Row, read_rows
-from gsbench.runs.trial_files import Building, Configuration, Failure, MadeOf, ResultsFile
+from gsbench.runs.trial_files import (
+    Building,
+    Configuration,
+    Failure,
+    MadeOf,
+    ResultsFile,
+    Row,
+    read_rows,
+)
 from gsbench.runs.trial_record import TrialRecord, UnfinishedError, record_from
 from gsbench.runs.user_code import PERMISSIONS
 from gsbench.system.locks import is_held

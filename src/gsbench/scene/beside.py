@@ -24,25 +24,16 @@ MILLIMETRE = 0.001  # of a world in metres: the step of most sensors
 Pixels = NDArray[Any]  # [H, W] or [H, W, C]
 
 
-def files_beside(capture: Capture, kinds: Sequence[str]) -> dict[str, dict[str, Path]]:
+def files_beside(capture: Capture, kinds: Sequence[str]) -> dict[str, Mapping[str, Path]]:
     """The files of each kind by photograph; raises InputError for a kind that none has."""
-    found: dict[str, dict[str, Path]] = {}
     for kind in kinds:
-        files = (
-            capture.depths
-            if kind == DEPTH
-            else {name: more[kind] for name, more in capture.more.items() if kind in more}
-        )
-        if not files:
-            present = {kind for more in capture.more.values() for kind in more}
-            present |= {DEPTH} if capture.depths else set()
+        if kind not in capture.beside:
             raise InputError(
                 f"scene.beside={kind}: no photograph of {capture.images} has such a picture; there "
-                f"are: {listed(sorted(present)) or 'none'}; put them into a folder beside the "
-                "photographs', named like this and like a kind of picture (docs/captures.md)"
+                f"are: {listed(sorted(capture.beside)) or 'none'}; put them into a folder beside "
+                "the photographs', named like this and like a kind of picture (docs/captures.md)"
             )
-        found[kind] = dict(files)
-    return found
+    return {kind: capture.beside[kind] for kind in kinds}
 
 
 def read_beside(path: Path, kind: str, depth_scale: float | None = None) -> Pixels:

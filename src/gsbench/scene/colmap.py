@@ -97,15 +97,16 @@ def read_reference(capture: Capture) -> pycolmap.Reconstruction:
         if not image.has_pose or image.name not in names:
             continue
         name, camera = names[image.name], model.cameras[image.camera_id]
-        size = image_size(capture.images / name)
-        check_size(capture.images / name, size, (camera.width, camera.height))
-        key = (image.camera_id, size)
+        file_camera = camera_of_file(camera, capture.images / name)
+        size = file_camera.width, file_camera.height
+        key = image.camera_id, size
         if key not in camera_ids:
             if image.camera_id in camera_ids.values():
                 camera_ids[key], next_camera_id = next_camera_id, next_camera_id + 1
             else:
                 camera_ids[key] = image.camera_id
-            fitted.add_camera_with_trivial_rig(rescaled_camera(camera, *size, camera_ids[key]))
+            file_camera.camera_id = camera_ids[key]
+            fitted.add_camera_with_trivial_rig(file_camera)
         scale = np.array(size) / (camera.width, camera.height)
         points = np.array([point.xy for point in image.points2D], dtype=np.float64).reshape(-1, 2)
         resized = pycolmap.Image(
@@ -115,6 +116,13 @@ def read_reference(capture: Capture) -> pycolmap.Reconstruction:
         kept.add(image_id)
     _copy_points(model, fitted, kept)
     return fitted
+
+
+def camera_of_file(camera: pycolmap.Camera, path: Path) -> pycolmap.Camera:
+    """The camera at the size of the image ``path``; raises InputError for another shape."""
+    size = image_size(path)
+    check_size(path, size, (camera.width, camera.height))
+    return rescaled_camera(camera, *size, camera.camera_id)
 
 
 def rescaled_camera(

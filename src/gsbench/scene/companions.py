@@ -12,36 +12,23 @@ from functools import cache
 from pathlib import Path, PurePosixPath
 
 from gsbench.errors import InputError
-from gsbench.scene.names import IMAGE_SUFFIXES, match_anywhere, stem_of
+from gsbench.scene.names import FILES, IMAGE_SUFFIXES, match_anywhere, stem_of
 from gsbench.scene.record import RawCapture
 from gsbench.words import counted
 
 log = logging.getLogger(__name__)
 
-DEPTH = ("depth", "depthmap", "monodepth", "disparity")
+DEPTH = FILES["depth"]
 # words in the names of folders and files that hold something else than photographs
-WORDS = frozenset(
-    word + ending
-    for word in (
-        *("mask", "thumb", "thumbnail", "preview", *DEPTH),
-        *("normal", "normalmap", "segmentation", "seg", "semantic", "instance", "label", "matte"),
-        *("annotation", "overlay", "flow", "heatmap", "render", "undistorted", "lowres", "half"),
-        *("tn", "sam"),
-    )
-    for ending in ("", "s")
-)
+WORDS = frozenset(word + ending for word in DEPTH + FILES["others"] for ending in ("", "s"))
 # a folder of this name may hold the photographs of a lens that is neither wide nor long
 FOLDER_WORDS = WORDS - {"normal"}
-# folders of file systems: Synology, QNAP, Windows, macOS, Linux
-SYSTEM = frozenset({"@eadir", "#recycle", "@recycle", "$recycle.bin", "__macosx", "lost+found"})
 THUMBNAIL = re.compile(r"SYNO(PHOTO|VIDEO|INDEX)_", re.IGNORECASE)  # files of Synology
 WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
 PART = re.compile(r"[^\W\d_]+|\d+")  # of a file's name
-# words in the names of photographs where those of their companions have another word
-PHOTOGRAPH = frozenset({"rgb", "color", "colour", "image", "img", "photo", "frame"})
+PHOTOGRAPH = frozenset(FILES["own"])
 FORMATS = frozenset(suffix[1:] for suffix in IMAGE_SUFFIXES)
 SMALLER = re.compile(r"(.+?)[_-]([248])")  # images_4: copies a quarter as wide
-WORKSPACES = ("store", "stereo")  # sub-folders of gsbench's runs and of COLMAP's dense workspace
 
 
 def photographs_among(folder: Path, names: Sequence[str], report: bool = True) -> list[str]:
@@ -107,7 +94,7 @@ def _reasons(folder: Path, names: Sequence[str]) -> dict[str, str]:
 
 
 def _is_side_folder(folder: Path) -> bool:
-    if folder.name.casefold() in SYSTEM or FOLDER_WORDS.intersection(_words(folder.name)):
+    if folder.name.casefold() in FILES["systems"] or FOLDER_WORDS.intersection(_words(folder.name)):
         return True
     if found := SMALLER.fullmatch(folder.name):
         larger = [""]
@@ -115,7 +102,7 @@ def _is_side_folder(folder: Path) -> bool:
             larger += [f"{mark}{size}" for mark in "_-" for size in "248" if size < found[2]]
         if any((folder.parent / f"{found[1]}{ending}").is_dir() for ending in larger):
             return True
-    return any((folder / name).is_dir() for name in WORKSPACES)
+    return any((folder / name).is_dir() for name in FILES["workspaces"])
 
 
 def _words(name: str) -> list[str]:

@@ -7,12 +7,13 @@ the principal axis of their centres, so that planes across the axis separate the
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from gsbench.errors import InputError
 from gsbench.scene.options import SplitRule
-from gsbench.scene.types import Array, Camera, CameraModel
+from gsbench.scene.types import Array
 from gsbench.words import counted, some_of
 
 # degrees: cameras with a wider gap between azimuths are on one side of the scene
@@ -25,20 +26,16 @@ PARALLEL = 1e-3
 AZIMUTH_DECIMALS = 6
 
 
-def reference_camera(camera: CameraModel, rotation: Array, translation: Array) -> Camera:
-    """A camera that tells where it is and in which direction it looks; not for rendering."""
-    width, height = camera.width, camera.height
-    return Camera(width, height, width, width, width / 2, height / 2, rotation, translation)
-
-
-def arrange_cameras(cameras: Sequence[Camera]) -> tuple[list[int], str]:
+def arrange_cameras(cameras: Sequence[Any]) -> tuple[list[int], str]:
     """Order cameras by azimuth if they surround the scene, else along their principal axis.
 
-    The azimuths start at the first camera, or after a gap of more than 30 degrees. Returns indices,
-    and what the cameras are ordered by, and why.
+    They have a ``rotation`` and a ``center``, as a `Camera` and a `Photograph` have. The azimuths
+    start at the first camera, or after a gap of more than 30 degrees. Returns indices, and what the
+    cameras are ordered by, and why.
     """
     centers = np.array([camera.center for camera in cameras])  # [V, 3]
-    azimuths, fault = _azimuths(cameras, centers)
+    axes = np.array([camera.rotation for camera in cameras])  # [V, 3, 3] right, down, ahead
+    azimuths, fault = _azimuths(axes, centers)
     if azimuths is not None:
         order = np.argsort(azimuths, kind="stable")
         around = azimuths[order]
@@ -90,9 +87,8 @@ def _principal_axes(centers: Array) -> Array:
     return axes
 
 
-def point_looked_at(cameras: Sequence[Camera], centers: Array) -> Array | None:
+def point_looked_at(forwards: Array, centers: Array) -> Array | None:
     """The point [3] nearest to all viewing axes in least squares; None if they are parallel."""
-    forwards = np.array([camera.rotation[2] for camera in cameras])  # [V, 3]
     across = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]  # [V, 3, 3]
     normal = across.mean(axis=0)
     if float(np.linalg.eigvalsh(normal)[0]) < PARALLEL:
@@ -103,29 +99,25 @@ def point_looked_at(cameras: Sequence[Camera], centers: Array) -> Array | None:
     return solution
 
 
-def scene_up(cameras: Sequence[Camera], centers: Array) -> Array:
+def scene_up(downs: Array, centers: Array) -> Array:
     """The mean up direction [3] or, if directions cancel out, the normal of the centres' plane."""
-    mean = -np.array([camera.rotation[1] for camera in cameras]).mean(axis=0)
+    mean: Array = -downs.mean(axis=0)
     length = float(np.linalg.norm(mean))
-    if length > 0.5:
-        up: Array = mean / length
-        return up
-    normal: Array = _principal_axes(centers)[-1]
-    return normal
+    return mean / length if length > 0.5 else _principal_axes(centers)[-1]
 
 
-def _azimuths(cameras: Sequence[Camera], centers: Array) -> tuple[Array | None, str]:
+def _azimuths(axes: Array, centers: Array) -> tuple[Array | None, str]:
     """Azimuths [V] in [0, 360) from the first camera, counter-clockwise; or None and the reason."""
-    center = point_looked_at(cameras, centers)
+    forwards = axes[:, 2]  # [V, 3]
+    center = point_looked_at(forwards, centers)
     if center is None:
         return None, "the cameras look in one direction"
-    forwards = np.array([camera.rotation[2] for camera in cameras])  # [V, 3]
     facing = float((((center - centers) * forwards).sum(axis=1) > 0).mean())
     if facing < FACING:
         return None, f"the cameras do not look at one place; {facing:.0%} do"
-    up = scene_up(cameras, centers)
+    up = scene_up(axes[:, 1], centers)
     flat = (centers - center) - ((centers - center) @ up)[:, None] * up  # [V, 3]
-    first = flat[0] / np.linalg.norm(flat[0]) if np.linalg.norm(flat[0]) > 0 else np.zeros(3)
+    first = flat[0] / (np.linalg.norm(flat[0]) or 1.0)
     aside = np.cross(up, first)
     degrees = np.degrees(np.arctan2(flat @ aside, flat @ first))  # [V]
     return np.round(degrees, AZIMUTH_DECIMALS).astype(np.float64) % 360.0, ""
@@ -160,9 +152,8 @@ def split_names(
             f"the split lists hold {some_of(both)} for training and for testing: name each "
             "image once"
         )
-    kept = set(names if train is None else train)
-    training = [name for name in names if name in kept and name not in held_out]
-    testing = [name for name in names if name in held_out]
+    kept = set(names if train is None else train) - held_out
+    training, testing = ([name for name in names if name in side] for side in (kept, held_out))
     if not training:
         raise InputError(
             f"the split leaves no training view of {len(names)}: raise scene.test_every or "
@@ -175,7 +166,7 @@ def split_names(
 
 # names for training, names for testing
 SplitLists = tuple[Sequence[str] | None, ...]
-CamerasByName = Callable[[Sequence[str]], Sequence[Camera]]
+CamerasByName = Callable[[Sequence[str]], Sequence[Any]]
 
 
 @dataclass(frozen=True)

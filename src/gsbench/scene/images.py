@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,18 +19,14 @@ from PIL import Image, UnidentifiedImageError
 
 from gsbench.errors import InputError
 from gsbench.files import GIT_LFS, LFS_REMEDY, MAX_NAME_BYTES, require_regular
-from gsbench.scene.names import IMAGE_SUFFIXES
-from gsbench.scene.options import Backdrop
+from gsbench.scene.names import FILES, IMAGE_SUFFIXES
+from gsbench.scene.options import Backdrop, Resample
 from gsbench.words import counted, is_one_line, some_of
 
 log = logging.getLogger(__name__)
 
-Resample = Literal["lanczos", "area", "bicubic"]
-
 # photographs and videos that are not read, and how they are called
-NOT_READ = dict.fromkeys((".heic", ".heif"), "HEIC") | {".avif": "AVIF", ".jxl": "JPEG XL"}
-NOT_READ |= dict.fromkeys((".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"), "raw")
-NOT_READ |= {".exr": "EXR", ".gif": "GIF"} | dict.fromkeys((".mp4", ".mov", ".insv"), "video")
+NOT_READ = {suffix: kind for kind, own in FILES["not_read"].items() for suffix in own}
 # The formats of files with these suffixes. Without this list, Pillow would try some forty formats
 # on every file.
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")  # JPEG includes MPO, which holds several JPEGs
@@ -53,30 +49,29 @@ def list_images(folder: Path) -> list[str]:
     """
     names: list[str] = []
     unread: Counter[str] = Counter()
-    folders, links = [folder], list[Path]()
     # A stranger's capture with a link to / would be a search of the whole disk for photographs.
     seen = {_identity(parent) for parent in folder.resolve().parents}
-    while folders or links:
-        # Links come last, so that images are listed under their real folder rather than under a
-        # link to it.
-        parent = folders.pop() if folders else links.pop(0)
-        if (identity := _identity(parent)) in seen:  # also ends circles of links
-            continue
-        seen.add(identity)
-        for entry in sorted(_entries(parent), key=lambda entry: entry.name):
-            if entry.name.startswith("."):
+    places = [folder]
+    for place in places:
+        for parent, folders, files in os.walk(place):
+            if (identity := _identity(Path(parent))) in seen:  # also ends circles of links
+                folders.clear()
                 continue
-            if entry.is_dir():
-                (links if entry.is_symlink() else folders).append(Path(entry.path))
-            elif Path(entry.name).suffix.lower() in IMAGE_SUFFIXES:
-                names.append(Path(entry.path).relative_to(folder).as_posix())
-            elif kind := NOT_READ.get(Path(entry.name).suffix.lower()):
-                unread[kind] += 1
+            seen.add(identity)
+            folders[:] = sorted(name for name in folders if not name.startswith("."))
+            # Links come last, so that images are listed under their real folder rather than under a
+            # link to it.
+            places += [path for name in folders if (path := Path(parent, name)).is_symlink()]
+            for path in (Path(parent, name) for name in files if not name.startswith(".")):
+                if path.suffix.lower() in IMAGE_SUFFIXES:
+                    names.append(path.relative_to(folder).as_posix())
+                elif kind := NOT_READ.get(path.suffix.lower()):
+                    unread[kind] += 1
     if unread:
-        files = " and ".join(counted(count, f"{kind} file") for kind, count in unread.items())
+        kinds = " and ".join(counted(count, f"{kind} file") for kind, count in unread.items())
         is_one = unread.total() == 1
         log.warning(
-            "%s: %s %s not read: save as PNG or JPEG", folder, files, "is" if is_one else "are"
+            "%s: %s %s not read: save as PNG or JPEG", folder, kinds, "is" if is_one else "are"
         )
     if strange := sorted(name for name in names if not is_one_line(name)):
         advice = "rename them"
@@ -91,14 +86,6 @@ def list_images(folder: Path) -> list[str]:
 def _identity(folder: Path) -> tuple[int, int]:
     status = folder.stat()
     return status.st_dev, status.st_ino
-
-
-def _entries(folder: Path) -> list[os.DirEntry[str]]:
-    try:
-        with os.scandir(folder) as entries:
-            return list(entries)
-    except PermissionError:  # treated as an empty folder
-        return []
 
 
 def check_picture_names(names: Iterable[str], folder: Path) -> None:

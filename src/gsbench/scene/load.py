@@ -15,7 +15,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field
@@ -30,15 +30,12 @@ from gsbench.runs.trial_record import Oddity
 from gsbench.scene.beside import DEPTH, files_beside, view_of_file
 from gsbench.scene.colmap_files import model_files
 from gsbench.scene.images import (
-    Resample,
-    check_size,
-    image_size,
     read_image,
     resize_image,
     write_png,
 )
 from gsbench.scene.masks import WHITE, read_mask, resize_mask, write_mask
-from gsbench.scene.options import downscaled_size
+from gsbench.scene.options import PrincipalPoint, Resample, downscaled_size
 from gsbench.scene.rules import MIN_IMAGES, inspect, settle
 from gsbench.scene.types import Camera, CameraModel, Capture, Scene, View, to_pinhole
 from gsbench.scene.undistortion import lens_findings, undistort
@@ -48,7 +45,6 @@ from gsbench.system.resources import in_threads
 
 log = logging.getLogger(__name__)
 
-PrincipalPoint = Literal["used", "centred"]
 CAMERAS_FILE = "cameras.json"
 INTRINSICS = ("width", "height", "fx", "fy", "cx", "cy")
 # images per isolated process: limits what a crash loses, and progress is reported after each chunk
@@ -187,14 +183,14 @@ def views_step(
         cameras: dict[str, Camera] = {}
         changes: dict[str, ImageToPrepare] = {}
         models = _model_cameras(capture, model_dir)
-        for index, (name, (model, _)) in enumerate(models.items()):
+        for index, (name, (lens, _)) in enumerate(models.items()):
             target, mask = folder / f"{index:05d}.png", capture.masks.get(name)
-            image = ImageToPrepare(capture.images / name, model, target, mask, **shrinking)
-            size = model.width, model.height
-            if model.distorted or image.final_size(*size) != size:
+            image = ImageToPrepare(capture.images / name, lens, target, mask, **shrinking)
+            size = lens.width, lens.height
+            if lens.distorted or image.final_size(*size) != size:
                 changes[name] = image
             else:
-                cameras[name] = to_pinhole(model)
+                cameras[name] = to_pinhole(lens)
         lenses = {name: image.camera for name, image in changes.items() if image.camera.distorted}
         odd = inspect("lens", lens_findings(lenses), f"scene {capture.name}", capture.accept)
         prepared = prepare_all(list(changes.values()), progress)
@@ -218,7 +214,7 @@ def _model_cameras(
 ) -> dict[str, tuple[CameraModel, list[list[float]]]]:
     """The COLMAP camera at the file's size and the 3x4 pose of every posed image of the capture."""
     # not needed if the views are cached
-    from gsbench.scene.colmap import plain_camera, read_model, rescaled_camera
+    from gsbench.scene.colmap import camera_of_file, plain_camera, read_model
 
     model = read_model(model_dir)
     wanted = set(capture.image_names)
@@ -227,17 +223,14 @@ def _model_cameras(
         if not image.has_pose or image.name not in wanted:
             continue
         camera = model.cameras[image.camera_id]
-        size = image_size(capture.images / image.name)
-        check_size(capture.images / image.name, size, (camera.width, camera.height))
-        plain = plain_camera(rescaled_camera(camera, *size, camera_id=camera.camera_id))
-        cameras[image.name] = (plain, image.cam_from_world().matrix().tolist())
+        fitted = camera_of_file(camera, capture.images / image.name)
+        cameras[image.name] = plain_camera(fitted), image.cam_from_world().matrix().tolist()
     if len(cameras) < MIN_IMAGES:
         raise InputError(
             f"scene {capture.name}: {len(cameras)} of {len(wanted)} images have a pose in "
             f"{model_dir}, but at least {MIN_IMAGES} are needed: take more overlapping photos, or "
             "another init"
         )
-    _inspect_views(capture, cameras)  # before hours of work
     return dict(sorted(cameras.items()))
 
 

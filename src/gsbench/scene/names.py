@@ -11,11 +11,14 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from os.path import commonprefix
 from pathlib import PurePosixPath
+from typing import Any
 
 from gsbench.errors import InputError
+from gsbench.parsing import table_beside
 from gsbench.words import counted, some_of
 
-IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"})
+FILES: dict[str, Any] = table_beside(__file__, "files.yaml")
+IMAGE_SUFFIXES = frozenset(FILES["photographs"])
 
 Key = Callable[[str], str]
 

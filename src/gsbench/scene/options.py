@@ -123,6 +123,8 @@ class SplitRule:
 
 
 Backdrop = Literal["black", "white"]  # the colour under transparent pixels
+Resample = Literal["lanczos", "area", "bicubic"]
+PrincipalPoint = Literal["used", "centred"]
 MAX_SIZE = 16_384  # px, the longest side of a view of the courtyard
 
 
@@ -154,12 +156,12 @@ class SceneConfig(SplitRule):
     depth_scale: PositiveFloat | None = None
     downscale: PositiveInt = 1  # divides both sides
     max_size: Annotated[int, Ge(MIN_SIZE)] | None = None  # longest side, px; never enlarges
-    resample: Literal["lanczos", "area", "bicubic"] = "lanczos"
+    resample: Resample = "lanczos"
     max_images: Annotated[int, Ge(MIN_IMAGES)] = MAX_IMAGES  # evenly spaced over the sorted names
     # ids of rules (docs/captures.md) whose refusal becomes a line in log, results and tables
     accept: list[str] = field(default_factory=list)
     # centred: moved to the image centre, as 3DGS assumes
-    principal_point: Literal["used", "centred"] = "used"
+    principal_point: PrincipalPoint = "used"
     # courtyard only, as are the next three: in steps of 7.5 degrees; 48 close the ring
     views: Annotated[int, Interval(ge=3, le=9999)] = 48
     width: Annotated[int, Interval(ge=MIN_SIZE, le=MAX_SIZE)] = 400  # px
@@ -203,16 +205,16 @@ class SceneConfig(SplitRule):
     def _check_that_all_is_read(self) -> None:
         """Raise InputError for a setting that the scene's kind or split would ignore."""
         defaults = {entry.name: entry.default for entry in fields(self)}
-        for kinds, keys in READ_BY.items():
-            for key in keys:
-                if self.kind not in kinds and getattr(self, key) != defaults[key]:
-                    raise InputError(
-                        f"scene.{key}={getattr(self, key)} is not read by scene.kind={self.kind}, "
-                        f"only by {' and '.join(kinds)}: leave it out (default: {defaults[key]})"
-                    )
-        for key in () if self.split == "sector" or self.match_views else ("sector", "sectors"):
+        unread = {
+            key: f"by scene.kind={self.kind}, only by {' and '.join(kinds)}: leave it out "
+            f"(default: {defaults[key]})"
+            for kinds, keys in READ_BY.items()
+            if self.kind not in kinds
+            for key in keys
+        }
+        if self.split != "sector" and not self.match_views:
+            why = f"with scene.split={self.split}: add scene.split=sector, or leave it out"
+            unread |= dict.fromkeys(("sector", "sectors"), why)
+        for key, why in unread.items():
             if getattr(self, key) != defaults[key]:
-                raise InputError(
-                    f"scene.{key}={getattr(self, key)} is not read with scene.split={self.split}: "
-                    "add scene.split=sector, or leave it out"
-                )
+                raise InputError(f"scene.{key}={getattr(self, key)} is not read {why}")

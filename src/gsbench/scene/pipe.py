@@ -2,11 +2,12 @@
 
 import hashlib
 import logging
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -14,8 +15,9 @@ from gsbench.errors import InputError
 from gsbench.files import require_regular
 from gsbench.normalization import IDENTITY, find_normalization
 from gsbench.parsing import text_of
+from gsbench.scene.beside import DEPTH
 from gsbench.scene.colmap_files import model_files, require_subfolder
-from gsbench.scene.hold_out import SplitLists, hold_out, reference_camera, select_images
+from gsbench.scene.hold_out import SplitLists, hold_out, select_images
 from gsbench.scene.images import check_picture_names
 from gsbench.scene.masks import check_masks, find_masks
 from gsbench.scene.names import match
@@ -47,11 +49,10 @@ def hold_out_views(raw: RawCapture, options: SceneConfig, lists: SplitLists) -> 
     train, test = (_resolve(wanted, names, raw.folder) for wanted in lists)
     if train is not None and test is not None:
         names = sorted({*train, *test})
-    cameras = (
-        (lambda chosen: [reference_camera(*by_name[name].posed) for name in chosen])
-        if raw.has_cameras
-        else None
-    )
+
+    def cameras(chosen: Sequence[str]) -> list[Any]:
+        return [by_name[name] for name in chosen]
+
     split = hold_out(select_images(names, options.max_images), options, (train, test), cameras)
     roles: dict[str, Role] = dict.fromkeys(split.train, "train")
     roles.update((name, "test") for name in split.test)
@@ -113,6 +114,11 @@ def prepare(raw: RawCapture, options: SceneConfig, root: Path, model: Path | Non
     exact = options.kind == "courtyard"
     rows = raw.photographs
     masks = {row.name: row.mask for row in rows if row.mask is not None}
+    beside: dict[str, dict[str, Path]] = defaultdict(dict)
+    for row in rows:
+        for kind, file in {**row.more, DEPTH: row.depth}.items():
+            if file is not None:
+                beside[kind][row.name] = file
     return Capture(
         name=str(options.name),
         images=raw.folder,
@@ -125,8 +131,7 @@ def prepare(raw: RawCapture, options: SceneConfig, root: Path, model: Path | Non
         ),
         held_out=raw.held_out,
         masks=masks,
-        depths={row.name: row.depth for row in rows if row.depth is not None},
-        more={row.name: row.more for row in rows if row.more},
+        beside=beside,
         read_from=raw.files,
         left_out=raw.left_out,
         oddities=oddities,
@@ -141,13 +146,13 @@ def fingerprint(
     folder: Path,
     names: Iterable[str],
     model_files: Iterable[Path] = (),
-    masks: Mapping[str, Path] = MappingProxyType({}),
+    masks: Mapping[str, Path] | None = None,
 ) -> str:
     """sha256 over names and contents of images, model files and masks, wherever they lie."""
     digest = hashlib.sha256()
     entries = [(f"image/{name}", folder / name) for name in sorted(names)]
     entries += [(f"model/{file.name}", file) for file in sorted(model_files)]
-    entries += [(f"mask/{name}", file) for name, file in sorted(masks.items())]
+    entries += [(f"mask/{name}", file) for name, file in sorted((masks or {}).items())]
     for label, file in entries:
         require_regular(file)
         try:

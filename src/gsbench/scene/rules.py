@@ -9,21 +9,18 @@ import logging
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-import yaml
 
 from gsbench.errors import InputError
-from gsbench.parsing import MAX_NUMBER, SafeLoader
+from gsbench.parsing import MAX_NUMBER, table_beside
 from gsbench.runs.trial_record import Oddity
 from gsbench.scene.types import Array, Camera, Scene
 from gsbench.words import FORM, did_you_mean, listed
 
 log = logging.getLogger(__name__)
 
-TABLE = Path(__file__).with_name("rules.yaml")
 GIVEN = ""  # the measure of a rule whose findings the subject has
 Range = tuple[float, float]  # the ends belong to it
 ANY: Range = (-math.inf, math.inf)
@@ -222,10 +219,7 @@ MEASURES = {
     "brightest": _brightest,
     "fields_of_view": lambda model: model.fields_of_view,
 }
-RULES = tuple(
-    _rule(name, **row)
-    for name, row in yaml.load(TABLE.read_text(encoding="utf-8"), Loader=SafeLoader).items()
-)
+RULES = tuple(_rule(name, **row) for name, row in table_beside(__file__, "rules.yaml").items())
 BY_ID = {rule.id: rule for rule in RULES}
 # with two views, no third one can reveal a wrong geometry; the smallest side in px
 MIN_IMAGES, MIN_SIZE = (int(BY_ID[name].fine[0]) for name in ("too-few-images", "view-size"))

@@ -21,13 +21,7 @@ from pydantic_core import from_json
 
 from gsbench.errors import InputError
 from gsbench.files import GIT_LFS, LFS_REMEDY
-from gsbench.parsing import (
-    DamagedError,
-    parse_typed,
-    read_bytes,
-    resolved,
-    text_of,
-)
+from gsbench.parsing import DamagedError, parse_typed, read_bytes, resolved, table_beside, text_of
 from gsbench.scene.colmap_files import require_subfolder
 from gsbench.scene.images import list_images
 from gsbench.scene.names import IMAGE_SUFFIXES, match
@@ -40,7 +34,6 @@ from gsbench.scene.transforms_cameras import (
     TransformsRecord,
     applied_transform_of,
     camera_of,
-    focal_ratios,
     pose_of,
 )
 from gsbench.words import counted, some_of
@@ -91,10 +84,10 @@ def read_transforms(
     find = _FileFinder(folder, image_folder)
     rows: dict[str, Photograph] = {}
     points: PointsFile | None = None
-    all_missing: list[str] = []
+    missing: list[str] = []
     ratios: list[Finding] = []
     for split, record in records.items():
-        path, missing = files[split], []
+        path = files[split]
         applied = applied_transform_of(path, record)
         for frame in record.frames:
             name = find(path, frame.file_path)
@@ -103,8 +96,8 @@ def read_transforms(
                 continue
             if name in rows:
                 raise InputError(f"{path}: {name} is there twice: name each image once")
-            camera = camera_of(folder / name, path, record, frame)
-            ratios += focal_ratios(record, frame, camera)
+            camera, compared = camera_of(folder / name, path, record, frame)
+            ratios += compared
             rows[name] = Photograph(
                 name,
                 folder / name,
@@ -114,26 +107,21 @@ def read_transforms(
                 depth=_beside(path, frame.depth_file_path),
                 role=ROLES[split] if len(files) > 1 else "",
             )
-        all_missing += missing
         points = _points(path, record, applied, points)
-    lacking = f", while {some_of(all_missing)} have no file" if all_missing else ""
-    first = next(iter(files.values()))
-    require_enough(
-        len(rows),
-        folder,
-        f"with a file and a camera in {first.name}{lacking}",
-        "set scene.images to the folder of the photographs" if all_missing else "",
-    )
+    which, mend = f"with a file and a camera in {next(iter(files.values())).name}", ""
+    if missing:
+        which += f", while {some_of(missing)} have no file"
+        mend = "set scene.images to the folder of the photographs"
+    require_enough(len(rows), folder, which, mend)
     if "" in files:
         roles = _named_split(files[""], records[""], rows, find)
         rows = {name: replace(row, role=roles.get(name, row.role)) for name, row in rows.items()}
-    read_from = (*files.values(), *(() if points is None else (points.path,)))
+    read_from = [*files.values()]
+    if points is not None:
+        read_from.append(points.path)
     ordered = tuple(rows[name] for name in sorted(rows))
-    noted = {
-        "no-file": [Finding(len(all_missing), all_missing)],
-        "focal-length-and-field": ratios,
-    }
-    return RawCapture(folder, ordered, points, read_from, noted=noted)
+    noted = {"no-file": [Finding(len(missing), missing)], "focal-length-and-field": ratios}
+    return RawCapture(folder, ordered, points, tuple(read_from), noted=noted)
 
 
 def _beside(path: Path, written: str | None) -> Path | None:
@@ -232,66 +220,22 @@ def _named_split(
             f"{path}: {some_of(both)} would be trained and tested on: correct its lists of "
             "filenames"
         )
-    others: Role = "train" if train is None else "unused"
-    roles = dict.fromkeys(images, others)
-    roles.update((name, "train") for name in chosen["train"])
-    roles.update((name, "test") for name in chosen["held-out"])
-    return roles
+    roles: dict[str, Role] = dict.fromkeys(images, "train" if train is None else "unused")
+    roles |= dict.fromkeys(chosen["train"], "train")
+    return roles | dict.fromkeys(chosen["held-out"], "test")
 
 
-# Keys that change no photograph, camera or initial point: how another program frames, thins or
-# samples the scene; data besides photographs, on which gsbench does not train; notes.
-HARMLESS = frozenset(
-    (
-        # The box, axes and scale in which instant-ngp and nerfstudio train; gsbench keeps the
-        # coordinates of the file.
-        *("aabb", "aabb_scale", "render_aabb", "near", "far"),
-        *("scale", "offset", "up", "from_na", "orientation_override"),
-        *("depth_path", "integer_depth_scale", "enable_depth_loading", "depth_unit_scale_factor"),
-        *(
-            "enable_ray_loading",
-            "normal_file_path",
-            "envmap",
-            "importance_sampling",
-            "n_extra_learnable_dims",
-        ),
-        "black_transparent",  # black pixels are: harmless where these are blended over black
-        *("sharpness", "blur_score", "colmap_im_id", "camera_id"),
-        *("rotation", "timestamp", "camera_label"),
-    )
-)
-# Keys that change pixels, cameras or the choice of frames, and why a file that uses them is
-# refused.
-REFUSED = {
-    "rolling_shutter": "photographs with a rolling shutter have no single pose",
-    **dict.fromkeys(
-        ("transform_matrix_start", "transform_matrix_end"), "a frame that moves has no single pose"
-    ),
-    **{f"ftheta_p{power}": "the F-theta lens is not known" for power in range(5)},
-    **dict.fromkeys(("latlong", "equirectangular"), "a panorama is no pinhole image"),
-    **dict.fromkeys(("s1", "s2", "s3", "s4"), "thin-prism distortion is not read"),
-    "distortion_params": "write its numbers as k1, k2, k3, k4, p1 and p2",
-    "normal_mts_args": "Mitsuba's axes are not known",
-    "n_frames": "it cuts the list of frames: shorten the list itself",
-    "sharpness_discard_threshold": "it leaves out frames: shorten the list itself",
-    "sharpen": "it changes the photographs: sharpen the files themselves",
-    "fix_premult": "it changes the photographs: save them without premultiplied alpha",
-    "white_transparent": "it makes white pixels transparent: save the files so",
-    "time": "a scene that moves cannot be trained as one that stands still",
-}
-BLACK_BECOMES_WHITE = {
-    "black_transparent": "it makes black pixels transparent, which scene.transparent=white "
-    "makes white: save the files so"
-}
+KEYS = table_beside(__file__, "transforms_keys.yaml")
 
 
 def check_keys(path: Path, document: Any, backdrop: Backdrop) -> None:
     """Check the keys of a file that gsbench does not use.
 
-    ``backdrop`` is the colour under transparent pixels. Raises InputError for a key of `REFUSED`
-    whose value has an effect (`says_something`). Logs one line that names unknown keys.
+    ``backdrop`` is the colour under transparent pixels. Raises InputError for a refused key whose
+    value has an effect (`says_something`). Logs one line that names unknown keys.
     """
-    refused = REFUSED if backdrop == "black" else REFUSED | BLACK_BECOMES_WHITE
+    refused = KEYS["refused"] | (KEYS["refused_over_white"] if backdrop == "white" else {})
+    known = {*KEYS["harmless"], *refused}
     unknown: set[str] = set()
     frames = [(f" (frame {number})", frame) for number, frame in enumerate(document["frames"])]
     for place, record in [("", document), *frames]:
@@ -299,7 +243,7 @@ def check_keys(path: Path, document: Any, backdrop: Backdrop) -> None:
         for key, value in record.items():
             if key in refused and says_something(key, value):
                 raise InputError(f"{path}: {key}{place}: {refused[key]}")
-            if not (key in used or key in HARMLESS or key in REFUSED):
+            if key not in used | known:
                 unknown.add(key)
     if unknown:
         are = f"{counted(len(unknown), 'key')} {'is' if len(unknown) == 1 else 'are'}"

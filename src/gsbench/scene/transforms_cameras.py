@@ -140,40 +140,54 @@ def intrinsics_of(record: TransformsRecord, frame: FrameRecord) -> dict[str, Any
     return found
 
 
-def camera_of(image: Path, path: Path, record: TransformsRecord, frame: FrameRecord) -> CameraModel:
-    """The camera of a frame."""
-    where, given = f"{path}: {frame.file_path}", intrinsics_of(record, frame)
+def camera_of(
+    image: Path, path: Path, record: TransformsRecord, frame: FrameRecord
+) -> tuple[CameraModel, list[Finding]]:
+    """The camera of a frame, and its focal lengths over those that its fields of view mean."""
+    where, known = f"{path}: {frame.file_path}", intrinsics_of(record, frame)
     _check_own_size(where, record, frame)
-    width, height, cx, cy = (given[key] for key in ("w", "h", "cx", "cy"))
+    width, height, cx, cy = (known[key] for key in ("w", "h", "cx", "cy"))
     if width is None or height is None:
         width, height = image_size(image)
         _check_center(where, width, height, cx, cy)
     if width != int(width) or height != int(height) or min(width, height) < 1:
         raise InputError(f"{where}: w and h must be whole numbers of px, got {width} and {height}")
-    sides = _focal_lengths(given, width, height)
-    focals = [meant if written is None else written for written, meant in sides]
+    focals, compared = [], []
+    for side, axis in ((width, "x"), (height, "y")):
+        written, degrees = known[f"fl_{axis}"], known[f"{axis}_fov"]
+        angle = known[f"camera_angle_{axis}"]
+        if angle is None and degrees is not None:
+            angle = math.radians(degrees)
+        meant = written
+        if angle is not None:
+            meant = side / (2 * math.tan(angle / 2)) if 0 < angle < math.pi else 0.0
+            if written and meant:
+                facts = {"given": written, "meant": meant}
+                compared.append(Finding(written / meant, [frame.file_path], facts))
+        focals.append(meant if written is None else written)
     # Pixels are square if only one of both is given, as in instant-ngp and nerfstudio.
-    known = [focal for focal in focals if focal is not None]
-    if not known or min(known) <= 0.0:
+    found = [focal for focal in focals if focal is not None]
+    if not found or min(found) <= 0.0:
         raise InputError(
             f"{where}: no focal length: fl_x, camera_angle_x (between 0 and pi) or x_fov (between "
             "0 and 180) must be given, or the same for y"
         )
     center = (width / 2 if cx is None else cx, height / 2 if cy is None else cy)
-    model, distortion = _distortion(where, given)
-    params = known[0], known[-1], *center, *distortion
-    return CameraModel(model, int(width), int(height), params)
+    model, distortion = _distortion(where, known)
+    params = found[0], found[-1], *center, *distortion
+    return CameraModel(model, int(width), int(height), params), compared
 
 
 def _check_own_size(where: str, record: TransformsRecord, frame: FrameRecord) -> None:
     """Raise InputError if the file's intrinsics in px belong to another size than the frame's."""
     sizes = [(frame.w, record.w), (frame.h, record.h)]
-    if not any(own is not None and shared is not None and own != shared for own, shared in sizes):
-        return
-    in_pixels = ("fl_x", "fl_y", "cx", "cy")
-    if borrowed := [
-        key for key in in_pixels if getattr(frame, key) is None and getattr(record, key) is not None
-    ]:
+    is_other = any(None not in pair and pair[0] != pair[1] for pair in sizes)
+    borrowed = [
+        key
+        for key in ("fl_x", "fl_y", "cx", "cy")
+        if getattr(frame, key) is None and getattr(record, key) is not None
+    ]
+    if is_other and borrowed:
         raise InputError(
             f"{where}: it has another size (w, h) than the file, whose {', '.join(borrowed)} are "
             "px of the file's size: give the frame its own"
@@ -210,35 +224,3 @@ def _distortion(where: str, intrinsics: Mapping[str, Any]) -> tuple[str, tuple[f
         )
     params = tuple(given[name] for name in MODELS[model])
     return (model, params) if any(params) or model != "OPENCV" else ("PINHOLE", ())
-
-
-def _focal_lengths(
-    given: Mapping[str, Any], width: float, height: float
-) -> list[tuple[float | None, float | None]]:
-    """For x and for y the focal length in px that is given, and that which the field of view means.
-
-    The latter is 0 if the field of view is not between 0 and 180 degrees.
-    """
-    found = []
-    for side, axis in ((width, "x"), (height, "y")):
-        angle, degrees = given[f"camera_angle_{axis}"], given[f"{axis}_fov"]
-        if angle is None and degrees is not None:
-            angle = math.radians(degrees)
-        meant = None
-        if angle is not None:
-            meant = side / (2 * math.tan(angle / 2)) if 0 < angle < math.pi else 0.0
-        found.append((given[f"fl_{axis}"], meant))
-    return found
-
-
-def focal_ratios(
-    record: TransformsRecord, frame: FrameRecord, camera: CameraModel
-) -> list[Finding]:
-    """Focal lengths over those that fields of view mean, where both are given."""
-    return [
-        Finding(written / meant, [frame.file_path], {"given": written, "meant": meant})
-        for written, meant in _focal_lengths(
-            intrinsics_of(record, frame), camera.width, camera.height
-        )
-        if written and meant
-    ]

@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from gsbench.files import file_sha256
+from gsbench.runs.trial_record import TwinViews
 from gsbench.scene.masks import resize_mask
 from gsbench.scene.names import grouped, stem_of
 from gsbench.scene.rules import given
-from gsbench.scene.types import Scene, Twins, View
+from gsbench.scene.types import Scene, View
 
 # Near twins are compared as grey pictures of 24 x 24 cells, whatever their sizes and shapes,
 # because a copy may be shrunk, rounded or cut. In 16 captures, a second shot that is moved by half
@@ -64,7 +65,7 @@ def copies_of_test_views(folder: Path, train: Sequence[str], test: Sequence[str]
 
     def size(name: str) -> str:
         file = folder / name
-        return str(file.stat().st_size) if file.is_file() else name
+        return str(file.stat().st_size) if file.is_file() else name  # a link to nowhere
 
     by_size = grouped(test, size)
     copies: dict[str, str] = {}
@@ -100,7 +101,7 @@ def without_copies(scene: Scene) -> Scene:
             near[name] = max(trained_on)[1]
     train = tuple(view for view in scene.train if view.name not in equal)
     given("no-training-view", len(train), f"scene {scene.name}")
-    return replace(scene, train=train, twins=Twins(left_out=equal, near=near))
+    return replace(scene, train=train, twins=TwinViews(left_out=equal, near=near))
 
 
 SmallPicture = tuple[NDArray[np.float64], NDArray[np.bool_]]  # grey values and counted cells

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from gsbench.errors import InputError
 from gsbench.normalization import IDENTITY, Normalization
-from gsbench.runs.trial_record import Oddity
+from gsbench.runs.trial_record import Oddity, TwinViews
 
 Array = NDArray[np.float64]
 
@@ -113,18 +113,6 @@ def to_pinhole(camera: CameraModel) -> Camera:
 
 
 @dataclass(frozen=True)
-class Twins:
-    """Photographs that occur twice (`gsbench.scene.twins`).
-
-    ``left_out`` maps each photograph that is not used to the one that it copies. ``near`` maps a
-    test view to the training view that looks nearly the same, and is used.
-    """
-
-    left_out: Mapping[str, str] = field(default_factory=dict)
-    near: Mapping[str, str] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
 class Capture:
     """Photographs on disk, and the cameras that came with them, if any.
 
@@ -132,9 +120,10 @@ class Capture:
     ``test_names`` are the held-out ones. ``held_out`` describes in words how they were chosen.
     ``model`` is a COLMAP sparse folder with reference cameras, or None for bare photographs;
     ``exact_poses`` says that its poses are the truth (a procedural scene), not an estimate.
-    ``masks`` are mask files by image name; it is empty if every pixel counts. ``depths`` are depth
-    maps and ``more`` other files of a photograph by kind, by image name. ``fingerprint`` is a
-    sha256 over names and contents of the selected images, their masks and the model. ``read_from``
+    ``masks`` are mask files by image name; it is empty if every pixel counts. ``beside`` are other
+    files of the photographs by kind (``depth`` and names of folders), by image name.
+    ``fingerprint`` is a sha256 over names and contents of the selected images, their masks and the
+    model. ``read_from``
     are further files of the user that the cameras were read from. ``advised_normalization`` maps
     the given coordinates to those in which the scene should be trained
     (`gsbench.scene.colmap.normalize_capture`). ``normalization`` is the map that was applied to
@@ -152,8 +141,7 @@ class Capture:
     fingerprint: str
     held_out: str = ""
     masks: Mapping[str, Path] = field(default_factory=dict)
-    depths: Mapping[str, Path] = field(default_factory=dict)
-    more: Mapping[str, Mapping[str, Path]] = field(default_factory=dict)
+    beside: Mapping[str, Mapping[str, Path]] = field(default_factory=dict)
     read_from: tuple[Path, ...] = ()
     advised_normalization: Normalization = IDENTITY
     normalization: Normalization = IDENTITY
@@ -195,7 +183,7 @@ class Scene:
     name: str
     train: tuple[View, ...]
     test: tuple[View, ...]
-    twins: Twins = field(default_factory=Twins)
+    twins: TwinViews = field(default_factory=TwinViews)
     oddities: tuple[Oddity, ...] = ()
 
     @cached_property

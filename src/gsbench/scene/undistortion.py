@@ -6,9 +6,8 @@ coefficients are zero. Undistorting these again would resample every pixel for n
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,20 +62,34 @@ def flatten(cameras: Sequence[CameraModel]) -> list[Flattened]:
 
     COLMAP's native code can abort, so run it isolated.
     """
-    found = []
-    for camera in cameras:
-        source, pinhole = as_colmap(camera), _pinhole_of(camera)
-        found.append((folded_share(source, pinhole), pinhole.width, pinhole.height))
-    return found
+    pinholes = map(_pinhole_of, cameras)
+    return [
+        (folded_share(as_colmap(camera), pinhole), pinhole.width, pinhole.height)
+        for camera, pinhole in zip(cameras, pinholes, strict=True)
+    ]
 
 
 def _pinhole_of(camera: CameraModel) -> pycolmap.Camera:
     """COLMAP's camera of the undistorted photograph; raises InputError if there is none."""
     import pycolmap
 
-    with _refusing(camera):
-        options = pycolmap.UndistortCameraOptions()
-        return pycolmap.undistort_camera(options, _perspective(camera))
+    return _undistorted(camera, pycolmap.undistort_camera)
+
+
+def _undistorted(camera: CameraModel, undistort: Callable[..., Any], *picture: Any) -> Any:
+    """The result of a function of COLMAP's; raises InputError for what it cannot undistort."""
+    import pycolmap
+
+    source = as_colmap(camera)
+    try:
+        if source.is_spherical():
+            raise ValueError("a full panorama")
+        return undistort(pycolmap.UndistortCameraOptions(), *picture, source)
+    except (ValueError, RuntimeError) as error:
+        raise InputError(
+            f"images of the camera model {camera.name} with parameters {camera.params} cannot be "
+            "made pinhole images: use another camera model"
+        ) from error
 
 
 def as_colmap(camera: CameraModel, camera_id: int = 1) -> pycolmap.Camera:
@@ -94,26 +107,6 @@ def as_values(camera: pycolmap.Camera) -> CameraModel:
     return CameraModel(camera.model_name, camera.width, camera.height, params)
 
 
-def _perspective(camera: CameraModel) -> pycolmap.Camera:
-    """The camera as COLMAP's; raises ValueError for a full panorama."""
-    source = as_colmap(camera)
-    if source.is_spherical():
-        raise ValueError(camera.name)
-    return source
-
-
-@contextmanager
-def _refusing(camera: CameraModel) -> Iterator[None]:
-    """Raise InputError for what COLMAP cannot undistort."""
-    try:
-        yield
-    except (ValueError, RuntimeError) as error:
-        raise InputError(
-            f"images of the camera model {camera.name} with parameters {camera.params} cannot be "
-            "made pinhole images: use another camera model"
-        ) from error
-
-
 def flat_camera(camera: CameraModel) -> Camera:
     """The pinhole camera, at the origin, of what `undistort` makes of a photograph."""
     return to_pinhole(plain_camera(_pinhole_of(camera)) if camera.distorted else camera)
@@ -128,9 +121,7 @@ def undistort(image: NDArray[np.uint8], camera: CameraModel) -> tuple[NDArray[np
     import pycolmap
 
     bitmap = pycolmap.Bitmap.from_array(np.ascontiguousarray(image))
-    with _refusing(camera):
-        options = pycolmap.UndistortCameraOptions()
-        flat, pinhole = pycolmap.undistort_image(options, bitmap, _perspective(camera))
+    flat, pinhole = _undistorted(camera, pycolmap.undistort_image, bitmap)
     return np.array(flat.to_array()), to_pinhole(plain_camera(pinhole))
 
 
@@ -205,9 +196,5 @@ def rays_through(pixels: Array, fx: float, fy: float, cx: float, cy: float) -> A
 
 
 def _pinhole_parameters(camera: pycolmap.Camera) -> list[float]:
-    return [
-        camera.focal_length_x,
-        camera.focal_length_y,
-        camera.principal_point_x,
-        camera.principal_point_y,
-    ]
+    names = "focal_length_x", "focal_length_y", "principal_point_x", "principal_point_y"
+    return [getattr(camera, name) for name in names]

@@ -40,15 +40,16 @@ PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36  # linux/prctl.h
 # time limit for descendants that SIGKILL does not end, such as those of another user
 SECONDS_TO_END = 5.0
 SECONDS_BETWEEN_LOOKS = 0.01
+SIGNALLED = 128  # plus its number: the exit code of a process that a signal ended
 
 
 def continue_in_child() -> bool:
     """Fork, and return True in the child.
 
     This process does not return: it waits for the child, kills all descendants, and ends with the
-    exit status of the child. All of them also end when the standard input of this process is
-    closed, that is, when its parent is gone. Call it while there is only one thread. Returns False,
-    in this process, on systems without fork.
+    exit code of the child, as shells count (`SIGNALLED`). All of them also end when the standard
+    input of this process is closed, that is, when its parent is gone. Call it while there is only
+    one thread. Returns False, in this process, on systems without fork.
     """
     if not hasattr(os, "fork"):
         return False
@@ -65,8 +66,8 @@ def continue_in_child() -> bool:
     while ended != child:
         ended, status = os.waitpid(-1, 0)  # also reaps adopted orphans
     end_descendants()
-    _exit_as(os.waitstatus_to_exitcode(status))
-    return True
+    code = os.waitstatus_to_exitcode(status)
+    os._exit(code if code >= 0 else SIGNALLED - code)
 
 
 def end_descendants() -> None:
@@ -99,19 +100,6 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def _exit_as(code: int) -> None:
-    """End this process with the exit code of a child (negative: by that signal)."""
-    if code < 0:
-        import resource
-
-        # no second core file beside that of the child
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        with suppress(OSError):
-            signal.signal(-code, signal.SIG_DFL)
-        os.kill(os.getpid(), -code)
-    os._exit(code)
-
-
 def _control(option: int, value: int) -> None:
     """Call Linux's prctl; do nothing on other systems."""
     if sys.platform == "linux":
@@ -123,8 +111,8 @@ T = TypeVar("T")
 
 _BOOTSTRAP = (
     "import json, sys; path, own = json.loads(sys.argv[1]); sys.path[:] = path; "
-    "from gsbench.system.programs import adopt_modules; adopt_modules(own); from {module} "
-    "import {name}; {name}()"
+    "from gsbench.system.programs import adopt_modules; adopt_modules(own); "
+    "from gsbench.system.isolate import _child; _child()"
 )
 # time limit for a child to end the programs that it started, before it is killed
 _SECONDS_TO_END = 10.0
@@ -173,41 +161,14 @@ def run_isolated(
     raise value
 
 
-def run_with_progress(
-    function: Callable[[Any, Progress], T],
-    job: Any,
-    progress: Progress,
-    what: str,
-    log: Path | None = None,
-) -> T:
-    """Return ``function(job, progress)``, computed by `run_isolated`; its progress is forwarded."""
-    return run_isolated(function, job, what=what, log=log, progress=progress)
-
-
-def python_command(module: str, name: str, *arguments: str) -> list[str]:
-    """The command of a fresh interpreter that calls ``name`` of ``module``.
-
-    The interpreter has the module search path of this process. The function has no parameters;
-    ``arguments`` are in ``sys.argv[2:]``.
-    """
-    search_path = json.dumps([sys.path, allowed_modules()])
-    # -P: a stranger's capture in the current folder may have a json.py, which must not be imported.
-    return [
-        sys.executable,
-        "-P",
-        "-c",
-        _BOOTSTRAP.format(module=module, name=name),
-        search_path,
-        *arguments,
-    ]
-
-
 def _run_child(call: bytes, output: IO[bytes], progress: Progress) -> tuple[int, Any]:
     """Run the ``call`` in a child; returns its exit code and its result, None without one.
 
     It is ended on any exception, as Ctrl-C.
     """
-    command = python_command("gsbench.system.isolate", "_child", str(len(call)))
+    search_path = json.dumps([sys.path, allowed_modules()])
+    # -P: a stranger's capture in the current folder may have a json.py, which must not be imported.
+    command = [sys.executable, "-P", "-c", _BOOTSTRAP, search_path]
     # In its own session, the child does not receive Ctrl-C. The parent does and ends it: one
     # traceback, not two. After the call nothing is written to the pipe at stdin. When it closes,
     # the child ends, because the parent wants it or is gone.
@@ -223,7 +184,7 @@ def _run_child(call: bytes, output: IO[bytes], progress: Progress) -> tuple[int,
     result = None
     try:
         with suppress(EOFError, pickle.UnpicklingError, BrokenPipeError):  # the child has ended
-            child.stdin.write(call)
+            pickle.dump(call, child.stdin)
             child.stdin.flush()
             while True:
                 content = pickle.load(child.stdout)
@@ -244,15 +205,10 @@ def _run_child(call: bytes, output: IO[bytes], progress: Progress) -> tuple[int,
         except subprocess.TimeoutExpired:
             child.kill()
             child.wait()
-        _end_group(child.pid)
-
-
-def _end_group(leader: int) -> None:
-    """Kill programs that the child left running in its session, the process group ``leader``."""
-    if hasattr(os, "killpg"):
-        # raised if no process is left (on macOS: only zombies)
-        with suppress(ProcessLookupError, PermissionError):
-            os.killpg(leader, signal.SIGKILL)
+        if hasattr(os, "killpg"):  # programs that it left running in its session
+            # raised if no process is left (on macOS: only zombies)
+            with suppress(ProcessLookupError, PermissionError):
+                os.killpg(child.pid, signal.SIGKILL)
 
 
 def _child() -> None:
@@ -262,7 +218,7 @@ def _child() -> None:
     the function itself prints goes to standard error.
     """
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    call = sys.stdin.buffer.read(int(sys.argv[2]))
+    call = pickle.load(sys.stdin.buffer)  # bytes: what they name is imported after the fork
     if not continue_in_child():
         threading.Thread(target=_end_with_parent, daemon=True).start()
     channel, one_at_a_time = os.fdopen(os.dup(1), "wb"), threading.Lock()
@@ -301,11 +257,9 @@ def _portable(error: Exception) -> Exception:
 
 def describe_exit(code: int) -> str:
     """Describe the unexpected end of a process by its exit code: ``crashed (SIGSEGV)``."""
-    if code < 0:
-        try:
-            name = signal.Signals(-code).name
-        except ValueError:
-            name = f"signal {-code}"
+    number = code - SIGNALLED if code > SIGNALLED else -code
+    with suppress(ValueError):  # not the number of a signal
+        name = signal.Signals(number).name
         return f"crashed ({name}{', perhaps out of memory' if name == 'SIGKILL' else ''})"
     return f"ended early (exit code {code})"
 

@@ -1,7 +1,8 @@
-"""`gsbench sync` beside a sweep: a process that sends to trackers what the trials have written.
+"""`gsbench sync --beside`: one process beside a sweep, which sends to trackers what trials write.
 
 Why a process: a tracker's client may hang in a socket, a lock or a C library for any time, and
-crash the interpreter when it exits. A process can be killed, and harms no trial.
+crash the interpreter when it exits. A process can be killed, and harms no trial. It lives as long
+as the sweep, because importing MLflow takes 4 CPU-seconds, and a send a tenth of one.
 """
 
 from __future__ import annotations
@@ -11,27 +12,27 @@ import logging
 import os
 import subprocess
 import sys
+import tempfile
 import threading
 import time
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
-
-import psutil
+from typing import IO, Any
 
 from gsbench.parsing import one_line
 from gsbench.runs.layout import FAILED, RESULTS
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.isolate import describe_exit
-from gsbench.system.programs import safe_environment
+from gsbench.system.programs import allow_modules, safe_environment
+from gsbench.tracking.sync import MirrorError, sync
 
 log = logging.getLogger(__name__)
 
 SECONDS_TO_STOP = 3.0  # patience after a signal that asks to end
-# between two sends: the start of a process that imports a tracker takes 4 CPU-seconds
-SECONDS_BETWEEN_SENDS = 15.0
-# to tell the tracker how trials ended after the sweep's process was killed
-SECONDS_AFTER_PARENT = 10.0
+SECONDS_BETWEEN_SENDS = 5.0  # at least, however many trials end
+SLOW = "the tracker is slow"
+SOON = "\n"  # the line that asks the process to send soon
 
 
 class Mirror:
@@ -42,116 +43,139 @@ class Mirror:
     raised: one line in the log says what is missing.
     """
 
+    _process: subprocess.Popen[bytes] | None = None
+    _said: IO[bytes]  # the process's error output
+    _patience = 0.0
+    _fault = ""
+
     def __init__(self, idle: bool = False) -> None:
         self._idle = idle
-        self._followed: dict[Path, tuple[float, dict[str, Any]]] = {}  # since when, with settings
-        self._looks, self._stop = threading.Event(), threading.Event()
-        self._process: subprocess.Popen[str] | None = None
-        self._thread: threading.Thread | None = None
-        self._fault = ""
+        self._lines: list[str] = []  # what the process was told of each trial
 
     def __enter__(self) -> Mirror:
         return self
 
     def follow(self, folder: Path, values: dict[str, Any]) -> None:
         """Mirror the trial in ``folder`` with the configuration ``values`` from start to end."""
-        if self._idle or not values["tracking"]["enabled"]:
+        tracking = values["tracking"]
+        if self._idle or not tracking["enabled"]:
             return
-        self._followed[folder] = time.time(), values
-        if self._thread is None:
-            self._thread = threading.Thread(target=self._run, daemon=True)
-            self._thread.start()
+        self._patience = float(tracking["patience_seconds"])
+        told = {"folder": str(folder), "since": time.time(), "pause": tracking["flush_seconds"]}
+        self._lines.append(json.dumps(told | {"allowed": permissions(values)}) + "\n")
+        self._tell(self._lines[-1])
 
     def trial_ended(self) -> None:
         """Send soon, since a trial has ended."""
-        self._looks.set()
+        if self._lines:
+            self._tell(SOON)
+
+    def _tell(self, line: str) -> None:
+        """Write a line to the process; one that has crashed is replaced, and told all again."""
+        lines = [line]
+        if self._process is None or self._process.poll() is not None:
+            lines = [*self._lines, SOON]
+            try:
+                self._process = self._started()
+            except OSError as error:
+                self._fault = str(error)
+                return
+        with suppress(BrokenPipeError):  # it has just crashed
+            for text in lines:
+                # The pipe does not block: a process that hangs and reads nothing delays no trial.
+                if self._process.stdin.write(text.encode()) is None:  # type: ignore[union-attr]
+                    self._fault = SLOW
+
+    def _started(self) -> subprocess.Popen[bytes]:
+        runs = TrialFolder(Path(json.loads(self._lines[0])["folder"])).runs
+        self._said = tempfile.TemporaryFile()  # noqa: SIM115 - until the process ends
+        process = subprocess.Popen(
+            [sys.executable, "-P", "-m", "gsbench", "sync", f"--beside={self._patience}"],
+            bufsize=0,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=self._said,
+            env=safe_environment() | {"GSBENCH_RUNS": str(runs)},
+            # Ctrl-C must reach only the trials' process, which then ends this one
+            start_new_session=True,
+        )
+        with suppress(AttributeError):  # Windows, before Python 3.12
+            os.set_blocking(process.stdin.fileno(), False)  # type: ignore[union-attr]
+        return process
 
     def __exit__(self, kind: type[BaseException] | None, error: object, trace: object) -> None:
-        if self._thread is None:
-            return
-        stopped = kind is not None and not issubclass(kind, Exception)
-        _, values = next(iter(self._followed.values()), (0, {}))
-        patience = float(values["tracking"]["patience_seconds"]) if values else SECONDS_TO_STOP
-        self._stop.set()
-        self._looks.set()
-        try:
-            self._thread.join(min(patience, SECONDS_TO_STOP) if stopped else patience)
-            if self._thread.is_alive():
-                self._fault = "the tracker is slow"
-        finally:  # also where a signal interrupts the wait
-            with suppress(AttributeError, OSError):
-                self._process.kill()  # type: ignore[union-attr]
+        if (process := self._process) is not None:
+            is_stopped = kind is not None and not issubclass(kind, Exception)
+            try:
+                process.stdin.close()  # type: ignore[union-attr]
+                process.wait(min(self._patience, SECONDS_TO_STOP) if is_stopped else self._patience)
+                self._fault = self._fault or self._reason(process.returncode)
+            except subprocess.TimeoutExpired:
+                self._fault = SLOW
+            finally:  # also where a signal interrupts the wait
+                process.kill()
+                process.wait()
         if self._fault:
             log.warning(
                 "tracking: %s; the files are complete, `gsbench sync` sends them later", self._fault
             )
 
-    def _run(self) -> None:
-        """Send until the block has ended, and then once more."""
-        last = False
-        while not last:
-            pauses = [
-                values["tracking"]["flush_seconds"] for _, values in [*self._followed.values()]
-            ]
-            pause = min(pauses, default=1.0)
-            self._looks.wait(pause)
-            self._looks.clear()
-            last = self._stop.is_set()
-            self._send()
-            self._stop.wait(min(pause, SECONDS_BETWEEN_SENDS))
-
-    def _send(self) -> None:
-        """Send the followed trials of each experiment, and forget those that have ended."""
-        begun = {place: added for place, added in list(self._followed.items()) if place.is_dir()}
-        ended = [place for place, (since, _) in begun.items() if _has_ended_since(place, since)]
-        homes: dict[Path, list[Path]] = {}
-        for place in begun:
-            homes.setdefault(TrialFolder(place).home, []).append(place)
-        for home, places in homes.items():
-            self._fault = self._sync(home, places, begun[places[0]][1])
-            if not self._fault:
-                for place in {*places} & {*ended}:
-                    self._followed.pop(place, None)
-
-    def _sync(self, home: Path, places: list[Path], values: dict[str, Any]) -> str:
-        """Run ``gsbench sync`` for these trials; returns the reason of a failure, else ""."""
-        words = [sys.executable, "-P", "-m", "gsbench", "sync", home.name]
-        words += [f"--beside={os.getpid()}", f"allow_targets={json.dumps(permissions(values))}"]
-        for place in places:
-            words += ["--trial", place.relative_to(home).as_posix()]
-        environment = safe_environment() | {"GSBENCH_RUNS": str(home.parent)}
-        try:
-            self._process = subprocess.Popen(
-                words,
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.PIPE,
-                text=True,
-                errors="replace",
-                env=environment,
-                # Ctrl-C must reach only the trials' process, which then ends this one
-                start_new_session=True,
-            )
-        except OSError as error:
-            return str(error)
-        said = self._process.communicate()[1]
-        log.debug("gsbench sync %s: %s", home.name, said)
-        if self._process.returncode == 0:
-            return ""
-        lines = said.strip().splitlines() or [f"it {describe_exit(self._process.returncode)}"]
-        return one_line(lines[-1]).removeprefix("gsbench: ")
+    def _reason(self, code: int) -> str:
+        """The reason of a failure of the process that ended with the exit code; else ""."""
+        self._said.seek(0)
+        said = self._said.read().decode(errors="replace")
+        log.debug("gsbench sync: %s", said)
+        lines = said.strip().splitlines() or [f"it {describe_exit(code)}"]
+        return one_line(lines[-1]).removeprefix("gsbench: ") if code else ""
 
 
-def end_with(parent: int) -> None:
-    """End this process soon after the process ``parent`` has ended, even if a tracker hangs."""
+def send_beside(lines: Iterable[str], patience: float) -> None:
+    """Send the trials that ``lines`` name, as `Mirror` writes them, until these end.
 
-    def watch() -> None:
-        while psutil.pid_exists(parent):
-            time.sleep(1)
-        time.sleep(SECONDS_AFTER_PARENT)
+    Then all are sent once more; if that takes longer than ``patience`` seconds, the process ends.
+    So it ends soon after the sweep, even if that was killed. Raises the error of the last send.
+    """
+    followed: list[dict[str, Any]] = []
+    wake, stop = threading.Event(), threading.Event()
+
+    def read() -> None:
+        for line in lines:
+            if line == SOON:
+                wake.set()
+            else:
+                followed.append(json.loads(line))
+        stop.set()
+        wake.set()
+        time.sleep(patience)
         os._exit(1)
 
-    threading.Thread(target=watch, daemon=True).start()
+    threading.Thread(target=read, daemon=True).start()
+    is_last, fault = False, None
+    while not is_last:
+        pause = min((one["pause"] for one in followed), default=1.0)
+        wake.wait(pause)
+        wake.clear()
+        is_last = stop.is_set()
+        fault = _send(followed)
+        stop.wait(min(pause, SECONDS_BETWEEN_SENDS))
+    if fault is not None:
+        raise fault
+
+
+def _send(followed: list[dict[str, Any]]) -> Exception | None:
+    """Send the followed trials, and forget those that have ended; returns a tracker's error."""
+    begun = [one for one in list(followed) if Path(one["folder"]).is_dir()]
+    ended = [one for one in begun if _has_ended_since(Path(one["folder"]), one["since"])]
+    allowed = [name for one in begun for name in one["allowed"]]
+    allow_modules(allowed)
+    try:
+        for line in sync([TrialFolder(Path(one["folder"])) for one in begun], None, allowed):
+            log.debug(line)
+    except (MirrorError, OSError) as error:
+        return error
+    for one in ended:
+        followed.remove(one)
+    return None
 
 
 def permissions(values: dict[str, Any]) -> list[str]:

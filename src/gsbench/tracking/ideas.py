@@ -25,12 +25,11 @@ from gsbench.analysis.results import (
     group_by,
     newest_code,
     read_experiment,
-    seeds_text,
 )
 from gsbench.analysis.sentences import headline
-from gsbench.analysis.statistics import UNDECIDED
 from gsbench.analysis.table_formats import to_markdown
 from gsbench.analysis.tables import build_table
+from gsbench.analysis.trial_result import seeds_text
 from gsbench.errors import InputError
 from gsbench.tracking.mlflow_sink import DESCRIPTION, LOCK, MAX_TAG, connect, ensure_experiment
 from gsbench.tracking.trial import EVAL, numbers_of
@@ -142,10 +141,11 @@ def _tags(arm: Arm, trials: Sequence[TrialResult], comparison: Comparison) -> di
     verdict = "; ".join(answer.badge for answer in own)
     verdict = verdict or ("baseline" if is_baseline else NO_VERDICT)
     scenes = sorted({trial.scene for trial in trials})
+    seeds = {trial.seed for trial in trials}
     lines = [
         *[markdown_text(answer.sentence) for answer in own],
         markdown_text(
-            f"{counted(len(trials), 'trial')} on {', '.join(scenes)}, {seeds_text(trials)}: means "
+            f"{counted(len(trials), 'trial')} on {', '.join(scenes)}, {seeds_text(seeds)}: means "
             f"over scenes, and standard deviations over seeds."
         ),
         _more(comparison.experiment.name),
@@ -202,7 +202,7 @@ def description(experiment: Experiment, comparison: Comparison) -> str:
         lines = [markdown_text(f"No table: {error}")]
     rest = [line for line in lines if not line.startswith("#")]
     # The page shows only the first line until it is clicked: decided ideas come first there.
-    ordered = sorted(comparison.answers, key=lambda one: one.verdict.outcome == UNDECIDED)
+    ordered = sorted(comparison.answers, key=lambda one: one.verdict.outcome == "undecided")
     first = "; ".join(headline(one.verdict) for one in ordered) or NO_VERDICT
     end = f"\n\n{_more(experiment.name)}"
     text = "\n".join([f"**{markdown_text(first)}**", "", *rest]).strip()

@@ -136,28 +136,21 @@ JOURNAL_END = bytes.fromhex("d9d505f920a163d7")  # of a journal that names anoth
 
 
 def require_own_journal(uri: str) -> Path | None:
-    """The file of a SQLite address; InputError if the journal beside it names another file.
+    """The file of a SQLite address, else None; InputError if its journal names another file.
 
     SQLite would delete that file when it opens the database, and the runs folder may be a
     stranger's. Neither MLflow nor gsbench writes such journals; others are rolled back.
     """
-    database = _file_of(uri)
-    if database is None:
+    import sqlalchemy
+
+    name = sqlalchemy.engine.make_url(uri).database if uri.startswith("sqlite:") else None
+    if not name or name == ":memory:":
         return None
-    name = str(database)
     journal = Path(f"{name}-journal")
     with suppress(FileNotFoundError):
         if read_tail(journal, len(JOURNAL_END)) == JOURNAL_END:
             raise InputError(f"{journal} would delete another file: remove it")
-    return database
-
-
-def _file_of(uri: str) -> Path | None:
-    """The file of a SQLite address; None for other addresses."""
-    import sqlalchemy
-
-    name = sqlalchemy.engine.make_url(uri).database if uri.startswith("sqlite:") else None
-    return Path(name) if name and name != ":memory:" else None
+    return Path(name)
 
 
 def _require_plain(database: Path) -> None:

@@ -3,6 +3,7 @@
 import os
 import shutil
 import uuid
+import weakref
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -29,8 +30,8 @@ class Run(Record):
 class Sink(Protocol):
     """One trial in a tracker; a new object is made for each.
 
-    The methods are called in a process of their own; each may raise any error, which ends the
-    mirroring and harms no trial. The process may be killed at any moment, and ends without
+    The methods are called in a process beside the sweep; each may raise any error, which harms no
+    trial, and is called again later. The process may be killed at any moment, and ends without
     clean-up. So `send` must send at once what it gets, and may get it again.
 
     Examples:
@@ -80,6 +81,7 @@ class TensorBoard:
         require_no_links(trial.folder.runs, folder)
         shutil.rmtree(folder, ignore_errors=True)
         self._writer, self._run = SummaryWriter(str(folder)), run
+        weakref.finalize(self, self._writer.close)  # its thread would last as long as the process
         return uuid.uuid4().hex
 
     def send(self, update: Update) -> None:
@@ -127,6 +129,8 @@ class WandB:
             require_no_links(trial.folder.runs, folder / place)
         folder.mkdir(exist_ok=True)
         self._root, scene = trial.folder.path, trial.values["scene"]["name"]
+        if wandb.run is not None:  # of a trial that runs: `init` would return it
+            wandb.run.finish()
         self._run: Any = wandb.init(
             project=trial.values["name"],
             name=trial.label,

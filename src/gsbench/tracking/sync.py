@@ -15,7 +15,7 @@ from gsbench.config.build import build
 from gsbench.config.trust import foreign_address
 from gsbench.errors import InputError
 from gsbench.files import write_json
-from gsbench.parsing import read_if_sound
+from gsbench.parsing import one_line, read_if_sound
 from gsbench.runs.layout import CONFIG, FAILED, LOG
 from gsbench.runs.nested import GSBENCH
 from gsbench.runs.trial_folder import TrialFolder
@@ -223,6 +223,5 @@ def _state_file(folder: TrialFolder, options: Mapping[str, Any]) -> Path:
 
 def refusal(folder: TrialFolder, options: Mapping[str, Any], error: BaseException) -> MirrorError:
     """A MirrorError, in one line, for an ``error`` of the tracker's client about a trial."""
-    lines = str(error).strip().splitlines()
-    reason = f"{type(error).__name__}: {lines[0][:200] if lines else ''}"
+    reason = one_line(f"{type(error).__name__}: {error}")
     return MirrorError(f"{folder.label} could not be sent to {tracker_name(options)} ({reason})")

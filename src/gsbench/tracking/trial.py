@@ -8,16 +8,16 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from gsbench.eval.facts import find_metric
 from gsbench.runs import layout
 from gsbench.runs.commands import read_history
 from gsbench.runs.keys import TRAIN
 from gsbench.runs.nested import flatten, sha256_of
-from gsbench.runs.rows import read_rows
+from gsbench.runs.trial_files import read_rows
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import TrialRecord
+from gsbench.scene.images import read_image
 from gsbench.words import command, markdown_code, markdown_text
 
 NOTE = "note"  # the tag that describes a finished trial, in Markdown
@@ -54,14 +54,6 @@ PICTURE_KINDS = ("1 render", "2 photograph", "3 error")  # of a test view, numbe
 def picture_key(view: str, kind: str) -> str:
     """The name of a picture of a test view, with characters that every tracker takes."""
     return f"{NOT_IN_A_KEY.sub('_', view)}/{kind}"
-
-
-def arm_name(densify: str, init: str) -> str:
-    """The name of an arm.
-
-    The densifier is compared most often. It comes first, since trackers cut long names at the end.
-    """
-    return f"{densify} · {init}"
 
 
 def eval_name(key: str) -> str:
@@ -131,8 +123,12 @@ class TrackedTrial:
 
     @property
     def arm(self) -> str:
-        """The name of the trial's arm."""
-        return arm_name(self.values["densify"]["name"], self.values["init"]["name"])
+        """The name of the trial's arm.
+
+        The densifier is compared most often. It comes first, since trackers cut long names at the
+        end.
+        """
+        return f"{self.values['densify']['name']} · {self.values['init']['name']}"
 
     @property
     def label(self) -> str:
@@ -247,22 +243,17 @@ class TrackedTrial:
         rendered, photographed, wrong = PICTURE_KINDS
         pictures: dict[str, Array] = {}
         for path in self.folder.pictures(layout.RENDERS)[:count]:
-            render = _read_picture(path)
+            render = read_image(path)
             pictures[picture_key(path.stem, rendered)] = render
             photograph = self.folder.path / layout.GROUND_TRUTH / path.name
             if not photograph.exists():
                 continue
-            truth = _read_picture(photograph)
+            truth = read_image(photograph)
             pictures[picture_key(path.stem, photographed)] = truth
             if truth.shape == render.shape:
                 error = np.abs(render.astype(np.int16) - truth.astype(np.int16))
                 pictures[picture_key(path.stem, wrong)] = error.astype(np.uint8)
         return pictures
-
-
-def _read_picture(path: Path) -> Array:
-    with Image.open(path) as image:
-        return np.asarray(image.convert("RGB"))
 
 
 def _seconds(record: Mapping[str, float]) -> float:

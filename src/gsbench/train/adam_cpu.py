@@ -44,12 +44,8 @@ class CpuAdam:
             for tensor in (parameter, state.first, state.second, gradient.contiguous())
         ]
         numbers = (width if active is None else active, *map(np.float32, state.factors))
-
-        def step(first: int, past: int) -> None:
-            begin, end = count * first // SHARDS, count * past // SHARDS
-            adam_rows(np.empty(64, np.float32), begin, end, *arrays, *numbers)
-
-        self._runner.run(SHARDS, step)
+        spare = np.empty((SHARDS, 64), np.float32)
+        self._runner.run(SHARDS, adam_rows, spare, *arrays, *numbers)
 
 
 class FusedStep:
@@ -85,7 +81,7 @@ class FusedStep:
         summed = torch.zeros_like(points) if absolute else None
         request = RenderRequest(camera, degree, self._background, summed, None, Lifetime())
         image, alpha, radii, passed = self._rasterizer.forward(values, request)
-        similarity, l1, g_image = self._loss.compute(image, target, differentiate=True)
+        scalars, g_image = self._loss.compute(image, target.contiguous(), differentiate=True)
         assert g_image is not None
         states = gaussians.count_step()
         adam = AdamStep(
@@ -95,7 +91,6 @@ class FusedStep:
             3 * ((degree + 1) ** 2 - 1),
         )
         points.grad = self._rasterizer.backward_and_step(passed, values, request, g_image, adam)
-        scalars = torch.tensor([self._loss.total(l1, similarity), l1, similarity])
         return RenderOutput(image, alpha, radii, points, summed), scalars
 
     def optimize(self, gaussians: TrainableGaussians) -> None:

@@ -32,9 +32,9 @@ from gsbench.raster.staged import (
     make_probe,
     raise_for_values,
 )
-from gsbench.raster.triton.executor import Started, TritonFrame, TritonRasterizer, camera_numbers
+from gsbench.raster.triton.executor import TritonFrame, TritonRasterizer, camera_numbers
 from gsbench.raster.triton.launch import Workspace
-from gsbench.raster.triton.lists import UNITS_AT_FIRST, Room, check_pairs
+from gsbench.raster.triton.lists import UNITS_AT_FIRST, Room, Started, check_pairs
 from gsbench.scene.types import Camera
 from gsbench.train.adam_triton import TritonAdam
 from gsbench.train.loss_triton import TritonLoss
@@ -232,7 +232,6 @@ class _Plan:
         )
         # results, which the next step overwrites
         self.losses = allocate("losses", (3,), torch.float32)
-        self.one = allocate("one", (), torch.float32).fill_(1.0)
         self.g_image = allocate("g_image", (*size, 3), torch.float32)
         self.gradients = [allocate(f"g_{name}", own, torch.float32) for name, own in shapes.items()]
         absolute = allocate("g_absolute", (count, 2), torch.float32) if shape.absolute else None
@@ -343,8 +342,7 @@ class _Plan:
         self.finished = rasterizer.finish(self.started, self._room)
         image, _, radii, frame = self.finished
         image = replace_ignored(image, self.target, self.mask)
-        measured = loss.measure(image, self.target, self.losses, memory.scratch, True)
-        loss.differentiate(measured, self.one, self.g_image)
+        loss.launch(image, self.target, self.losses, self.g_image, memory.scratch)
         if self.mask is not None:
             self.g_image.masked_fill_(~self.mask, 0.0)
         found = rasterizer.differentiate(

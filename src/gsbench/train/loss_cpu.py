@@ -6,13 +6,9 @@ once, into a ring buffer of 11 rows, which are then filtered vertically. Statist
 are computed again in each step, so views need no further memory.
 """
 
-from typing import Any
-
 import numpy as np
 import torch
-from numba import types
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from gsbench.eval.ssim import C1, C2, WINDOW_RADIUS, window
 from gsbench.raster.cpu.simd import (
@@ -21,13 +17,12 @@ from gsbench.raster.cpu.simd import (
     fma,
     lane_sums,
     load,
-    load_numbers,
     select,
     splat,
     store,
 )
 from gsbench.raster.cpu.workspace import ArenaPool, ShardRunner, TensorPool
-from gsbench.raster.staged import Lifetime
+from gsbench.raster.staged import KernelLoss, Lifetime
 from gsbench.system.jit import inlined, kernel
 from gsbench.system.resources import available_cores
 
@@ -96,7 +91,7 @@ def _read_row(image, row, numbers, divisor, out):
         for i in range(0, numbers, LANES):
             # the last vector overlaps the previous one, to end with the row
             place = min(i, numbers - LANES)
-            store(out, PAD + place, load_numbers(image, start + place) / divisor)
+            store(out, PAD + place, load(image, start + place) / divisor)
 
 
 @inlined
@@ -113,13 +108,17 @@ def _write_row(line, row, numbers, image):
 
 
 @kernel
-def similarity_rows(memory, begin, end, height, width, image, target, divisor, derivatives, sums):
+def similarity_rows(
+    first, past, all_memory, height, width, image, target, divisor, derivatives, sums
+):
     """Write the sums of SSIM and of |image - target| of each row to ``sums`` [H, 2].
 
-    The rows are ``begin`` to before ``end``. ``derivatives`` [3, H, PAD + 3 W rounded up + PAD], if
-    not empty, gets the derivatives of the sum of SSIM by the blurred image, its blurred square and
-    its blurred product with the target, padded with zeros. ``memory`` is scratch.
+    The rows are those of the shards ``first`` to ``past``. ``derivatives`` [3, H, PAD + 3 W rounded
+    up + PAD], if not empty, gets the derivatives of the sum of SSIM by the blurred image, its
+    blurred square and its blurred product with the target, padded with zeros. ``all_memory`` is
+    scratch for all shards.
     """
+    begin, end, memory = height * first // SHARDS, height * past // SHARDS, all_memory[first]
     numbers = width * CHANNELS
     length = (numbers + LANES - 1) // LANES * LANES
     padded = length + 2 * PAD
@@ -191,9 +190,9 @@ def similarity_rows(memory, begin, end, height, width, image, target, divisor, d
 
 @kernel
 def gradient_rows(
-    memory,
-    begin,
-    end,
+    first,
+    past,
+    all_memory,
     height,
     width,
     image,
@@ -204,10 +203,11 @@ def gradient_rows(
     ssim_factor,
     gradient,
 ):
-    """Compute the rows ``begin`` to before ``end`` of ``gradient`` [H * W * 3].
+    """Compute the rows of the shards ``first`` to ``past`` of ``gradient`` [H * W * 3].
 
     The symmetric blur is its own adjoint, so the derivatives are blurred, too.
     """
+    begin, end, memory = height * first // SHARDS, height * past // SHARDS, all_memory[first]
     numbers = width * CHANNELS
     length = (numbers + LANES - 1) // LANES * LANES
     padded = length + 2 * PAD
@@ -239,16 +239,7 @@ def gradient_rows(
         _write_row(line, center, numbers, gradient)
 
 
-# Each kernel and the types of its arguments in a training, where targets are 8-bit photographs.
-_INT, _FLOAT, _FLOATS = types.int64, types.float32, types.float32[::1]
-_IMAGES = (_FLOATS, _INT, _INT, _INT, _INT, _FLOATS, types.uint8[::1], _FLOAT, _FLOATS)
-KERNELS = (
-    (similarity_rows, (*_IMAGES, types.float64[:, ::1])),
-    (gradient_rows, (*_IMAGES, _FLOAT, _FLOAT, _FLOATS)),
-)
-
-
-class CompiledLoss:
+class CompiledLoss(KernelLoss):
     """Calls the CPU kernels with threads and pooled memory; see ``loss.PhotometricLoss``."""
 
     def __init__(self, ssim_weight: float, threads: int | None) -> None:
@@ -257,24 +248,14 @@ class CompiledLoss:
         self._arenas = ArenaPool()
         self._tensors = TensorPool()
 
-    def __call__(self, image: Tensor, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        return _CompiledLossFunction.apply(self, image, target)
-
-    def total(self, l1: float, similarity: float) -> float:
-        return (1 - self.ssim_weight) * l1 + self.ssim_weight * (1 - similarity)
-
     def compute(
         self, image: Tensor, target: Tensor, differentiate: bool
-    ) -> tuple[float, float, Tensor | None]:
-        """Return mean SSIM, mean L1 and, if ``differentiate``, the gradient by ``image``."""
+    ) -> tuple[Tensor, Tensor | None]:
+        """See `gsbench.raster.staged.KernelLoss`."""
         height, width, _ = image.shape
         numbers = image.numel()
-        pixels = image.detach().contiguous().numpy().reshape(-1)
-        if target.dtype != torch.uint8:
-            target = target.to(torch.float32)
-        wanted = target.contiguous().numpy().reshape(-1)
+        pixels, wanted = (pixels.numpy().reshape(-1) for pixels in (image, target))
         divisor = BYTE_MAX if target.dtype == torch.uint8 else ONE
-        edges = [height * shard // SHARDS for shard in range(SHARDS + 1)]
         # One sum for each row, added in the order of rows: threads do not change the bits.
         sums = np.empty((height, 2))
         holder = Lifetime()
@@ -284,51 +265,15 @@ class CompiledLoss:
             "derivatives", (3 * height * padded if differentiate else 0,), np.float32
         )
         memory = arena.take("memory", (SHARDS, MAPS * (TAPS + 1) * padded + LANES), np.float32)
-        common = (height, width, pixels, wanted, divisor, derivatives)
-
-        def similarity(first: int, past: int) -> None:
-            similarity_rows(memory[first], edges[first], edges[past], *common, sums)
-
-        self._runner.run(SHARDS, similarity)
-        total_similarity, total_l1 = (float(value) / numbers for value in sums.sum(0))
+        common = memory, height, width, pixels, wanted, divisor, derivatives
+        self._runner.run(SHARDS, similarity_rows, *common, sums)
+        similarity, l1 = (float(value) / numbers for value in sums.sum(0))
+        loss = (1 - self.ssim_weight) * l1 + self.ssim_weight * (1 - similarity)
+        values = torch.tensor([loss, l1, similarity])
         if not differentiate:
-            return total_similarity, total_l1, None
-
+            return values, None
         gradient = self._tensors.empty(tuple(image.shape))
-        factors = (
-            np.float32((1 - self.ssim_weight) / numbers),
-            np.float32(self.ssim_weight / numbers),
-        )
-        flat = gradient.numpy().reshape(-1)
-
-        def differentiate_rows(first: int, past: int) -> None:
-            gradient_rows(memory[first], edges[first], edges[past], *common, *factors, flat)
-
-        self._runner.run(SHARDS, differentiate_rows)
-        return total_similarity, total_l1, gradient
-
-
-class _CompiledLossFunction(torch.autograd.Function):
-    """Computes the gradient in ``forward``; ``backward`` only scales it."""
-
-    @staticmethod
-    def forward(
-        ctx: Any, compiled: CompiledLoss, image: Tensor, target: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        similarity, l1, ctx.gradient = compiled.compute(image, target, ctx.needs_input_grad[1])
-        l1_tensor, similarity_tensor = torch.tensor(l1), torch.tensor(similarity)
-        ctx.mark_non_differentiable(l1_tensor, similarity_tensor)
-        ctx.set_materialize_grads(False)
-        return (
-            torch.tensor(compiled.total(l1, similarity)),
-            l1_tensor,
-            similarity_tensor,
-        )
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, g_loss: Tensor | None, *_: None) -> tuple[None, Tensor | None, None]:
-        if g_loss is None or ctx.gradient is None:
-            return None, None, None
-        scale = float(g_loss)
-        return None, ctx.gradient if scale == 1.0 else ctx.gradient * scale, None
+        factors = (1 - self.ssim_weight) / numbers, self.ssim_weight / numbers
+        outputs = *map(np.float32, factors), gradient.numpy().reshape(-1)
+        self._runner.run(SHARDS, gradient_rows, *common, *outputs)
+        return values, gradient

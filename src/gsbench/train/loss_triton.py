@@ -8,7 +8,6 @@ after each row.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -16,11 +15,10 @@ import torch
 import triton
 import triton.language as tl
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from gsbench.eval.ssim import C1, C2, WINDOW_RADIUS, window
 from gsbench.raster.executors import load_driver
-from gsbench.raster.staged import Lifetime
+from gsbench.raster.staged import KernelLoss, Lifetime
 from gsbench.raster.triton.launch import Workspace, WorkspacePool, launch_grid
 
 STRIP = 128  # numbers of a row per program
@@ -202,7 +200,6 @@ def differentiate(
     height,
     numbers,
     derivatives,
-    g_loss,
     ssim_weight,
     gradient,
     rows,
@@ -217,7 +214,7 @@ def differentiate(
     zero = tl.zeros([STRIP], tl.float32)
     d_mean, d_square, d_product = _zeros(zero), _zeros(zero), _zeros(zero)
     plane = height.to(tl.int64) * numbers
-    factor = tl.load(g_loss) / (height * numbers).to(tl.float32)
+    factor = 1.0 / (height * numbers).to(tl.float32)
     l1_factor, ssim_factor = factor * (1.0 - ssim_weight), factor * ssim_weight
     for row in range(first - RADIUS, tl.minimum(first + rows, height) + RADIUS):
         limit = tl.where((row >= 0) & (row < height), numbers, 0)
@@ -245,47 +242,7 @@ def differentiate(
         tl.store(gradient + center * numbers + number, sign - ssim_factor * similarity, mask=inside)
 
 
-@dataclass(frozen=True)
-class Measured:
-    """A loss that has been measured, for its gradient. The memory belongs to a workspace."""
-
-    image: Tensor  # [H, W, 3] float32
-    target: Tensor  # [H, W, 3] uint8 or float32
-    values: Tensor  # [3] loss, L1, SSIM
-    derivatives: Tensor  # [3 * 3 H W] of SSIM, see `measure_similarity`; empty if not wanted
-
-    @property
-    def height(self) -> int:
-        return self.image.shape[0]
-
-    @property
-    def numbers(self) -> int:
-        """Numbers of a row."""
-        return 3 * self.image.shape[1]
-
-    @property
-    def rows(self) -> int:
-        return rows_of_program(self.height, self.numbers)
-
-    @property
-    def grid(self) -> tuple[int, int]:
-        return triton.cdiv(self.numbers, STRIP), triton.cdiv(self.height, self.rows)
-
-    def arguments(self) -> dict[str, Any]:
-        """The arguments that both kernels over an image have in common."""
-        return {
-            "image": self.image,
-            "target": self.target,
-            "scale": 1 / 255 if self.target.dtype == torch.uint8 else 1.0,
-            "height": self.height,
-            "numbers": self.numbers,
-            "derivatives": self.derivatives,
-            "rows": self.rows,
-            "STRIP": STRIP,
-        }
-
-
-class TritonLoss:
+class TritonLoss(KernelLoss):
     """Calls the kernels with pooled memory; see ``loss.PhotometricLoss``.
 
     Results have the same bits on every run on one GPU.
@@ -295,75 +252,56 @@ class TritonLoss:
         self.ssim_weight = ssim_weight
         self.pool = WorkspacePool()
 
-    def __call__(self, image: Tensor, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def compute(
+        self, image: Tensor, target: Tensor, differentiate: bool
+    ) -> tuple[Tensor, Tensor | None]:
+        """See `gsbench.raster.staged.KernelLoss`."""
         if image.device.type == "cuda":
             load_driver()
-        if target.dtype != torch.uint8:
-            target = target.to(torch.float32)
-        loss, l1, similarity = _TritonLossFunction.apply(self, image, target.contiguous())
-        return loss, l1, similarity
+        holder = Lifetime()
+        values, gradient = image.new_empty(3), torch.empty_like(image) if differentiate else None
+        with torch.cuda.device_of(image):
+            self.launch(image, target, values, gradient, self.pool.lease(holder, image.device))
+        return values, gradient
 
-    def measure(
-        self, image: Tensor, target: Tensor, values: Tensor, memory: Workspace, differentiated: bool
-    ) -> Measured:
-        """Write loss, L1 and SSIM to ``values`` [3]. Images are contiguous."""
-        numbers = 3 * image.numel() if differentiated else 0
-        derivatives = memory.take("derivatives", numbers, torch.float32)
-        measured = Measured(image, target, values, derivatives)
-        columns, lines = measured.grid
+    def launch(
+        self,
+        image: Tensor,
+        target: Tensor,
+        values: Tensor,
+        gradient: Tensor | None,
+        memory: Workspace,
+    ) -> None:
+        """Write loss, L1 and SSIM to ``values`` [3], and the ``gradient`` by the image, if wanted.
+
+        All are contiguous.
+        """
+        (height, width, _), wanted = image.shape, gradient is not None
+        numbers, size = 3 * width, image.numel()
+        rows = rows_of_program(height, numbers)
+        grid = columns, lines = triton.cdiv(numbers, STRIP), triton.cdiv(height, rows)
         sums = memory.take("sums", 2 * columns * lines, torch.float32)
-        launch_grid(measure_similarity, columns, lines)(
-            **measured.arguments(), sums=sums, DIFFERENTIATE=differentiated, **REGISTERS
-        )
+        common: dict[str, Any] = {
+            "image": image,
+            "target": target,
+            "scale": 1 / 255 if target.dtype == torch.uint8 else 1.0,
+            "height": height,
+            "numbers": numbers,
+            "derivatives": memory.take("derivatives", 3 * size * wanted, torch.float32),
+            "rows": rows,
+            "STRIP": STRIP,
+            **REGISTERS,
+        }
+        launch_grid(measure_similarity, *grid)(**common, sums=sums, DIFFERENTIATE=wanted)
         launch_grid(add_up, 1)(
             sums=sums,
             programs=columns * lines,
-            size=float(image.numel()),
+            size=float(size),
             ssim_weight=self.ssim_weight,
             values=values,
             GROUP=1024,
         )
-        return measured
-
-    def differentiate(self, measured: Measured, g_loss: Tensor, gradient: Tensor) -> None:
-        """Write the gradient by the image to ``gradient`` [H, W, 3], times ``g_loss`` []."""
-        launch_grid(differentiate, *measured.grid)(
-            **measured.arguments(),
-            g_loss=g_loss,
-            ssim_weight=self.ssim_weight,
-            gradient=gradient,
-            **REGISTERS,
-        )
-
-
-class _TritonLossFunction(torch.autograd.Function):
-    """Connects the kernels with autograd."""
-
-    @staticmethod
-    def forward(
-        ctx: Any, loss: TritonLoss, image: Tensor, target: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        image = image.contiguous()
-        ctx.holder = Lifetime()
-        values = torch.empty(3, dtype=torch.float32, device=image.device)
-        with torch.cuda.device_of(image):
-            memory = loss.pool.lease(ctx.holder, image.device)
-            measured = loss.measure(image, target, values, memory, ctx.needs_input_grad[1])
-        ctx.loss, ctx.derivatives = loss, measured.derivatives
-        ctx.save_for_backward(image, target)
-        ctx.set_materialize_grads(False)
-        total, l1, similarity = values.unbind()
-        ctx.mark_non_differentiable(l1, similarity)
-        return total, l1, similarity
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, g_loss: Tensor | None, *_: None) -> tuple[None, Tensor | None, None]:
-        if g_loss is None:
-            return None, None, None
-        image, target = ctx.saved_tensors
-        gradient = torch.empty_like(image)
-        with torch.cuda.device_of(image):
-            measured = Measured(image, target, gradient, ctx.derivatives)
-            ctx.loss.differentiate(measured, g_loss.contiguous(), gradient)
-        return None, gradient, None
+        if wanted:
+            launch_grid(differentiate, *grid)(
+                **common, ssim_weight=self.ssim_weight, gradient=gradient
+            )

@@ -515,13 +515,10 @@ def fast_steps(
         adam = CpuAdam(torch.get_num_threads())
         compiled = loss.implementation(device)
         # a user's subclass may render otherwise
-        if (
-            type(rasterizer) is not CpuRasterizer
-            or not isinstance(compiled, CompiledLoss)
-            or options.visible_adam
-        ):
-            return None, adam
-        return FusedStep(rasterizer, compiled, background), adam
+        if type(rasterizer) is CpuRasterizer and isinstance(compiled, CompiledLoss):
+            fused = FusedStep(rasterizer, compiled, background)
+            return None if options.visible_adam else fused, adam
+        return None, adam
     if device != "cuda" or find_executor("triton").obstacle(device) is not None:
         return None, None
     # They import Triton.
@@ -531,14 +528,10 @@ def fast_steps(
     from gsbench.train.loss_triton import TritonLoss
 
     kernels = loss.implementation(device)
-    if (
-        type(rasterizer) is not TritonRasterizer
-        or not rasterizer.direct_steps
-        or not isinstance(kernels, TritonLoss)
-    ):
-        return None, TritonAdam()
-    visible_only = options.visible_adam
-    direct = DirectStep(rasterizer, kernels, background, graphs=True, visible_only=visible_only)
+    direct = None
+    ours = rasterizer if type(rasterizer) is TritonRasterizer else None
+    if ours and ours.direct_steps and isinstance(kernels, TritonLoss):
+        direct = DirectStep(ours, kernels, background, True, options.visible_adam)
     return direct, TritonAdam()
 
 

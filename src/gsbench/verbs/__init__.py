@@ -12,7 +12,7 @@ VERBS = {  # their modules, with their purposes as `gsbench --help` lists them
     ),
     "tables": ("results", "Markdown, CSV, LaTeX or HTML tables of an experiment"),
     "report": ("results", "one HTML file with the evidence of an experiment"),
-    "declare": ("declare", "write a sweep's questions and train nothing, for loops and arrays"),
+    "declare": ("trials", "write a sweep's questions and train nothing, for loops and arrays"),
     "judge": ("judge", "is a method better? the verdict on a table of results of any trainer"),
     "gate": ("gate", "for continuous integration: is this version worse than a trusted one?"),
     "ledger": ("ledger", "try many ideas under one false discovery rate, and confirm those kept"),

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gsbench.errors import InputError
-from gsbench.launch.states import STATES, states_now
+from gsbench.launch.states import STATES, states_of_experiment
 from gsbench.runs.cleaning import Stored, free, stored
 from gsbench.runs.experiments import experiment_home, list_experiments, trial_folders
 from gsbench.runs.trial_folder import TrialFolder
@@ -37,7 +37,7 @@ def clean(argv: Sequence[str], runs: Path) -> int:
     ]
     let_go = set[Path]()
     if options.experiment is not None:
-        states = states_now(experiment_home(runs, options.experiment))
+        states = states_of_experiment(experiment_home(runs, options.experiment))
         let_go = {trial.folder for trial in states if STATES[trial.state].freed}
     if running := [place for place in trials if is_held(TrialFolder(place).lock)]:
         raise InputError(

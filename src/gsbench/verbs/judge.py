@@ -11,25 +11,24 @@ from typing import TYPE_CHECKING
 from gsbench.analysis.frames import (
     COLUMNS,
     DIRECTIONS,
-    METHOD,
     Declared,
     compare_methods,
-    read_declared,
 )
 from gsbench.errors import InputError
 from gsbench.files import require_regular, writable_output, write_text
-from gsbench.verbs.arguments import ArgumentParser, Rows, comma_separated, names, path, whole_number
+from gsbench.parsing import Count, one_line, read_typed
+from gsbench.runs.experiments import DEFAULT_METRIC
+from gsbench.verbs.arguments import ArgumentParser, Rows, comma_separated, names, number, path
 from gsbench.words import counted, listed, printable
 
 if TYPE_CHECKING:
     import pandas as pd
 
-MOST_SEED = 10**9
 ROWS: Rows = {
     "results? RESULTS": ("a table or a folder", path),
     "settings* KEY=VALUE": "eval.… for a folder of renders",
     "--baseline NAME": "the method to compare with",
-    "--metric NAME": ("a column that decides (psnr)", str, "psnr"),
+    "--metric NAME": f"a column that decides ({DEFAULT_METRIC})",
     "--better WHAT": (
         "which values are better, for a metric that gsbench does not know",
         [name for name in DIRECTIONS if name],
@@ -44,7 +43,7 @@ ROWS: Rows = {
     "--scenes A,B": ("with --declare", names),
     "--seeds 0,1": (
         "with --declare",
-        comma_separated(lambda text: whole_number(MOST_SEED)(text) if text != "0" else 0),
+        comma_separated(number(Count)),
     ),
 }
 
@@ -64,7 +63,9 @@ def judge(argv: Sequence[str], runs: Path) -> int:
     if options.results is None:
         raise InputError("judge needs RESULTS: a table (.csv) or a folder {arm}/{scene}/{seed}")
     if options.declared is not None:
-        asked = read_declared(options.declared)
+        if not options.declared.is_file():
+            raise InputError(f"{options.declared}: no such file: judge --declare writes it")
+        asked = read_typed(options.declared, Declared)
         _require_as_declared(options, asked)
     elif options.baseline is None:
         raise InputError("judge needs --baseline NAME, one of the methods")
@@ -78,7 +79,7 @@ def judge(argv: Sequence[str], runs: Path) -> int:
         from gsbench.analysis.tables import build_table
 
         table = build_table(comparison.experiment, rows=("scene", "densify"), comparison=comparison)
-        print(to_markdown(replace(table, row_headings=("scene", METHOD))), end="")
+        print(to_markdown(replace(table, row_headings=("scene", "method"))), end="")
     if options.out is not None:
         from gsbench.analysis.report.build import build_report
 
@@ -101,7 +102,9 @@ def _declare(options: argparse.Namespace) -> int:
         scenes=options.scenes,
         seeds=tuple(options.seeds),
     )
-    asked.write(options.declare)
+    if options.declare.exists():
+        raise InputError(f"{options.declare} is there already: a question is not changed")
+    write_text(options.declare, json.dumps(asked.to_json(), indent=1) + "\n")
     trials = (1 + len(asked.methods)) * len(asked.scenes) * len(asked.seeds)
     print(f"{options.declare}: {counted(len(asked.methods), 'question')}, {trials} trainings")
     return 0
@@ -110,7 +113,7 @@ def _declare(options: argparse.Namespace) -> int:
 def _asked(options: argparse.Namespace) -> Declared:
     return Declared(
         baseline=options.baseline,
-        metric=options.metric,
+        metric=options.metric or DEFAULT_METRIC,
         better=options.better or "",
         least=options.least,
     )
@@ -118,14 +121,10 @@ def _asked(options: argparse.Namespace) -> Declared:
 
 def _require_as_declared(options: argparse.Namespace, declared: Declared) -> None:
     """Raise InputError for an option that says something else than what was declared."""
-    given = {"baseline": options.baseline, "least": options.least, "better": options.better}
-    if options.metric != "psnr":
-        given["metric"] = options.metric
-    for name, value in given.items():
-        if value is not None and value != getattr(declared, name):
-            raise InputError(
-                f"--{name} {value}: {getattr(declared, name)} was declared: leave the option out"
-            )
+    for name in ("baseline", "metric", "least", "better"):
+        value, known = getattr(options, name), getattr(declared, name)
+        if value not in (None, known):
+            raise InputError(f"--{name} {value}: {known} was declared: leave the option out")
 
 
 def _frame(options: argparse.Namespace) -> "pd.DataFrame":
@@ -147,7 +146,10 @@ def _frame(options: argparse.Namespace) -> "pd.DataFrame":
     except FileNotFoundError:
         raise InputError(f"{place}: no such file") from None
     except (ValueError, UnicodeDecodeError, pd.errors.ParserError) as error:
-        raise InputError(f"{place} is no table of comma-separated values ({error})") from None
+        raise InputError(
+            f"{place} is no table of comma-separated values ({one_line(str(error))}); "
+            "`gsbench site` shows archives"
+        ) from None
     for name in COLUMNS[:2]:
         if name in frame:
             frame[name] = [printable(" ".join(str(value).split())) for value in frame[name]]

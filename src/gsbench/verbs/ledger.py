@@ -1,43 +1,30 @@
 """``gsbench ledger``: many ideas under one false discovery rate (docs/night.md)."""
 
-import argparse
 import json
 import re
+from argparse import Namespace
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from gsbench.analysis.questions import FIRST_LOOK
+from gsbench.analysis.quantities import COSTS, relative_change
 from gsbench.analysis.results import read_experiment
 from gsbench.analysis.sentences import sentence
 from gsbench.analysis.verdicts import judge
 from gsbench.app.command import compose_trials, require_waiting, run_trials
-from gsbench.claims.gate import asked_difference
-from gsbench.claims.ledger import (
-    DROPPED,
-    FAILED,
-    IDEAS,
-    KEPT,
-    RATE,
-    Book,
-    read_ledger,
-    result_of,
-)
-from gsbench.claims.stopping import Needed, SequentialTest, finished_trials
+from gsbench.claims.ledger import SCREEN, Book, read_ledger, result_of
+from gsbench.claims.stopping import Needed, SequentialTest, asked_difference, finished_trials
 from gsbench.config.command_words import typed_permissions
 from gsbench.config.compose import Trial
-from gsbench.config.overrides import key_of
+from gsbench.config.overrides import changed_words, key_of
 from gsbench.errors import GsbenchError, InputError
 from gsbench.eval.options import EvalConfig
 from gsbench.files import checked_runs_folder, make_runs_folder
 from gsbench.launch.record import planned_rows
 from gsbench.runs.commands import (
     BASELINE,
-    CONFIRMATION,
     ERROR_RATE,
-    LOND,
-    SCREENING,
     Command,
     History,
     Idea,
@@ -52,9 +39,7 @@ from gsbench.settings import OpenFraction, is_folder_name
 from gsbench.verbs.arguments import ArgumentParser, number, whole_number
 from gsbench.words import listed
 
-EXIT_CODES = {KEPT: 0, DROPPED: 1, FAILED: 1}
-UNDECIDED_CODE = 3
-MOST_IDEAS = 10_000
+EXIT_CODES = {"kept": 0, "dropped": 1, "failed": 1}
 GIVEN = ("name", "runs", "eval.primary")  # settings that the ledger sets itself
 # An idea may change how a model is made, not what it is measured on.
 OF_IDEAS = ("densify", "init", "train", "raster")
@@ -85,21 +70,13 @@ def ledger(argv: Sequence[str], runs: Path) -> int:
     return ACTIONS[action](options, runs / options.name)
 
 
-def new(options: argparse.Namespace, home: Path) -> int:
+def new(options: Namespace, home: Path) -> int:
     """Declare a ledger; the same command again changes nothing."""
     baseline, trials = _compose(home, options.settings, options.settings, BASELINE)
-    values, metric = next(iter(trials.values())).values, options.metric
-    sign, least = asked_difference(metric, options.least, values)
-    EvalConfig(**values["eval"] | {"primary": metric})  # raises if it is not computed
-    opened = Ledger(
-        metric=metric,
-        sign=sign,
-        least=least[0],
-        relative=least[1],
-        ideas=options.ideas,
-        rate=options.fdr,
-        seeds=_seeds(trials),
-    )
+    values = next(iter(trials.values())).values
+    terms = asked_difference(options.metric, options.least, values)
+    EvalConfig(**values["eval"] | {"primary": options.metric})  # raises if it is not computed
+    opened = Ledger(**terms, ideas=options.ideas, rate=options.fdr, seeds=_seeds(trials))
 
     def make(history: History) -> Command | None:
         if (history.ledger, history.ideas.get(BASELINE)) == (opened, baseline):
@@ -116,7 +93,7 @@ def new(options: argparse.Namespace, home: Path) -> int:
     return 0
 
 
-def try_idea(options: argparse.Namespace, home: Path) -> int:
+def try_idea(options: Namespace, home: Path) -> int:
     """Run one idea until it is decided; an idea that was decided before is only shown."""
     book, typed, against = read_ledger(home), options.settings, options.against
     if against not in (allowed := [BASELINE, *book.kept]):
@@ -125,7 +102,7 @@ def try_idea(options: argparse.Namespace, home: Path) -> int:
         if re.split("[./]", key)[0] not in OF_IDEAS + OF_RUNS:
             raise InputError(f"{key}: an idea may change {listed(OF_IDEAS)}, not what decides")
     start = _permitted_words(book.ideas[against], typed)
-    words = (start, _merged(start, typed))
+    words = (start, changed_words(start, typed))
     # The idea's new seeds need new trials of the baseline, so it must be what it was.
     if _compose(home, start, typed)[0].digests != book.ideas[against].digests:
         raise InputError(
@@ -134,44 +111,47 @@ def try_idea(options: argparse.Namespace, home: Path) -> int:
         )
     asked = _compose(home, words[1], typed, options.idea, against)[0]
     idea, fails = _begin(home, asked), ""
-    for rule in (SCREENING, LOND):
+
+    def promotion(_: History) -> Command | None:
+        test = read_ledger(home).next_test(idea)
+        return command_now(questions=(test,)) if test else None
+
+    for rule in ("screening", "lond"):
         book = read_ledger(home)
         question = book.questions[idea]
-        if question.rule == rule and not book.is_decided(idea):
+        if question.rule == rule and book.result(idea) in ("begun", "failed"):
             seeds = f"seed={','.join(map(str, next(iter(question.seeds.values()))))}"
-            sides = [_compose(home, _merged(own, [seeds]), typed)[1] for own in words]
+            sides = [_compose(home, changed_words(own, [seeds]), typed)[1] for own in words]
             fails = _train(question, {**sides[0], **sides[1]})
-            append(home, lambda history: _promotion(history, home, idea))
+            append(home, promotion)
     book = read_ledger(home)
+    facts, line = _facts(book, idea), book.line(idea)
     if fails:
-        fails = book.failure(idea) or f"{fails}; to go on, give the same command again"
-    if options.json:
-        failed = {"result": FAILED, "reason": fails} if fails else {}
-        print(json.dumps(_facts(book, idea) | failed | _left(book)))
-    else:
-        print(f"{idea}: {FAILED}: {fails}" if fails else book.line(idea))
-        print(book.describe()[1])
-    return EXIT_CODES.get(FAILED if fails else book.result(idea), UNDECIDED_CODE)
+        why = book.failure(idea) or f"{fails}; to go on, give the same command again"
+        facts |= {"result": "failed", "reason": why}
+        line = f"{idea}: failed: {why}"
+    print(json.dumps(facts | _left(book)) if options.json else f"{line}\n{book.describe()[1]}")
+    return EXIT_CODES.get(facts["result"], 3)
 
 
-def confirm(options: argparse.Namespace, home: Path) -> int:
+def confirm(options: Namespace, home: Path) -> int:
     """Train the baseline and the kept ideas on captures that no idea has seen."""
     book, typed = read_ledger(home), options.settings
     if not book.kept:
         raise InputError("no idea was kept, so there is nothing to confirm")
     sides = [
-        _compose(home, _merged(_permitted_words(book.ideas[one], typed), typed), typed, one)
+        _compose(home, changed_words(_permitted_words(book.ideas[one], typed), typed), typed, one)
         for one in (BASELINE, *book.kept)
     ]
     (old, trials), *ideas = sides
     seeds, level = _seeds(trials), ERROR_RATE / len(ideas)
-    asked = [book.ask(one, old, CONFIRMATION, seeds, level) for one, _ in ideas]
+    asked = [book.ask(one, old, "confirmation", seeds, level) for one, _ in ideas]
 
     def make(history: History) -> Command | None:
         read_ledger(home).check_untouched(asked)
-        known = [one for one in history.questions if any(map(one.covers, asked))]
-        own = tuple(one.with_id(history.head) for one in asked)
-        return None if known else command_now(questions=own)
+        if any(one.covers(new) for one in history.questions for new in asked):
+            return None
+        return command_now(questions=tuple(one.with_id(history.head) for one in asked))
 
     append(home, make)
     for _, trials in sides:
@@ -186,7 +166,7 @@ def confirm(options: argparse.Namespace, home: Path) -> int:
     return 0
 
 
-def show(options: argparse.Namespace, home: Path) -> int:
+def show(options: Namespace, home: Path) -> int:
     """Print the ledger."""
     book = read_ledger(home)
     if options.json:
@@ -204,8 +184,8 @@ OPTIONS: dict[str, tuple[Any, ...]] = {  # their actions, and rows of `ArgumentP
     "settings* KEY=VALUE": ("new, try, confirm", "as of a sweep"),
     "--metric NAME": ("new", "decides, such as lpips_squeeze (psnr)", str, "psnr"),
     "--least SIZE": ("new", "the least difference that matters, as 0.1 or 10%% (the metric's)"),
-    "--ideas N": ("new", f"the most that are tried ({IDEAS})", whole_number(MOST_IDEAS), IDEAS),
-    "--fdr RATE": ("new", f"false discovery rate, 0 to 1 ({RATE})", number(OpenFraction), RATE),
+    "--ideas N": ("new", "the most that are tried (40)", whole_number(10_000), 40),
+    "--fdr RATE": ("new", "false discovery rate, 0 to 1 (0.1)", number(OpenFraction), 0.1),
     "--against IDEA": ("try", "a kept idea to start from (the baseline)", str, BASELINE),
     "--as=idea NAME": ("try", "the idea's name (default: densify.name)", str, ""),
     "--json": ("try, show", "print JSON"),
@@ -224,36 +204,27 @@ def _begin(home: Path, idea: Idea) -> str:
         book = read_ledger(home)
         if idea.digests in (book.ideas[BASELINE].digests, book.ideas[idea.against].digests):
             raise InputError(f"the idea is {idea.against} itself: give it other settings or code")
-        same = [
-            one.name
-            for one in book.ideas.values()
-            if (one.identity, one.against) == (idea.identity, idea.against)
-        ]
+        same = ""
+        for one in book.ideas.values():
+            if (one.identity, one.against) == (idea.identity, idea.against):
+                same = one.name
         # other ideas may have taken the place of one that failed
-        if (not same or book.failure(same[0])) and book.tried >= book.opened.ideas:
+        if (not same or book.failure(same)) and book.tried >= book.opened.ideas:
             raise InputError(
                 f"all {book.opened.ideas} planned ideas were tried, so the error rate is spent: "
                 "begin another ledger, with another baseline or other captures"
             )
         if same:
-            name = same[0]
+            name = same
             return None
         if name in book.ideas:
             name = f"{name}-{len(book.ideas)}"
         own = replace(idea, name=name)
-        return command_now(idea=own, questions=(book.screening(own).with_id(history.head),))
+        asked = book.ask(own, book.ideas[own.against], "screening", book.opened.seeds, 2 * SCREEN)
+        return command_now(idea=own, questions=(asked.with_id(history.head),))
 
     append(home, make)
     return name
-
-
-def _promotion(history: History, home: Path, idea: str) -> Command | None:
-    """The test of an idea that looks better, unless it has one."""
-    book = read_ledger(home)
-    verdict = book.verdicts[idea]
-    if idea in book.tests or not verdict.final or result_of(verdict) != KEPT:
-        return None
-    return command_now(questions=(book.test(idea).with_id(history.head),))
 
 
 # ---- trials of the ledger's words
@@ -290,8 +261,8 @@ def _compose(
 
 def _seeds(trials: Trials) -> tuple[int, ...]:
     seeds = tuple(dict.fromkeys(seed for _, _, seed in trials))
-    if len(seeds) < FIRST_LOOK:
-        raise InputError(f"a ledger needs at least {FIRST_LOOK} seeds, such as seed=0,1,2,3,4,5")
+    if len(seeds) < 2:
+        raise InputError("a ledger needs at least 2 seeds, such as seed=0,1,2,3,4,5")
     return seeds
 
 
@@ -306,19 +277,7 @@ def _permitted_words(idea: Idea, typed: Sequence[str]) -> list[str]:
         names = ",".join(sorted(needed | allowed))
         raise InputError(f"{idea.name} runs code of yours: add allow_targets=[{names}]")
     tracking = [word for word in typed if key_of(word).startswith("tracking")]
-    chosen = "tracking" in map(key_of, tracking)  # recorded settings are of another tracker
-    kept = [one for one in idea.words if not (chosen and key_of(one).startswith("tracking"))]
-    return _merged(kept, tracking)
-
-
-def _merged(words: Sequence[str], changes: Sequence[str]) -> list[str]:
-    """The words with ``changes``: each replaces the word of the same key, ``~KEY`` removes it."""
-    own = {key_of(word): word for word in words}
-    for word in changes:
-        known = own.pop(key_of(word), None)
-        if known is None or not word.startswith("~"):
-            own[key_of(word)] = word
-    return list(own.values())
+    return changed_words(idea.words, tracking)
 
 
 def _train(question: Question, trials: Trials) -> str:
@@ -345,6 +304,7 @@ def _facts(book: Book, idea: str) -> dict[str, Any]:
     """The known facts of an idea, for programs."""
     verdict, test = book.verdicts[idea], book.tests.get(idea)
     interval = verdict.interval
+    change = relative_change(*verdict.pairs.sides, COSTS["gaussians"][1])
     known = {
         "idea": idea,
         "against": book.ideas[idea].against,
@@ -355,7 +315,7 @@ def _facts(book: Book, idea: str) -> dict[str, Any]:
         "seeds": verdict.pairs.seeds,
         "difference": interval
         and {"mean": verdict.mean, "low": interval.low, "high": interval.high},
-        "gaussians": book.ratio(idea),
+        "gaussians": change and 1 + change.of_totals,
     }
     return {name: fact for name, fact in known.items() if fact is not None}
 

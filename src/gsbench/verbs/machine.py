@@ -2,17 +2,16 @@
 ``bench`` (how fast it is)."""
 
 import argparse
-import itertools
 import json
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 from gsbench.errors import InputError
-from gsbench.raster.executors import AUTO, EXECUTORS, names, resolve
+from gsbench.raster.executors import AUTO, EXECUTORS, missing_tools, names, resolve
 from gsbench.runs.trial_record import RasterProof
 from gsbench.scene.rules import MIN_SIZE
 from gsbench.system.install import install_command, version_of
@@ -43,12 +42,8 @@ MAX_COUNT = 1_000_000_000
 Verdict = Literal["ok", "note", "bad"]
 
 
-class Finding(NamedTuple):
-    """The result of one check: ``ok``, worth a ``note``, or ``bad`` (gsbench will not work)."""
-
-    verdict: Verdict
-    topic: str
-    text: str
+# The result of one check: it is ok, worth a note, or bad (gsbench will not work); topic, and text
+Finding = tuple[Verdict, str, str]
 
 
 def doctor(argv: Sequence[str], runs: Path) -> int:
@@ -67,17 +62,8 @@ def doctor(argv: Sequence[str], runs: Path) -> int:
     if options.json or options.raster != AUTO or options.device != "auto":
         raise InputError("doctor: --raster, --device and --json belong to --prove")
     code = 0
-    if options.words:
-        checks: tuple[Iterable[Finding], ...] = (check_scene(options.words),)
-    else:
-        checks = (
-            check_packages(),
-            check_devices(),
-            check_proofs(),
-            check_weights(),
-            check_runs(runs),
-        )
-    for verdict, topic, text in itertools.chain(*checks):
+    findings = check_scene(options.words) if options.words else check_machine(runs)
+    for verdict, topic, text in findings:
         print(f"{verdict:<5} {topic:<12} {text}")
         if verdict == "bad":
             code = 1
@@ -122,7 +108,7 @@ def check_scene(words: Sequence[str]) -> Iterator[Finding]:
     Their lines are logged; what is not usable raises InputError. Photographs without cameras get
     none here, so rules about cameras and views are left to their trial.
     """
-    from gsbench.renders.truth import scene_trial
+    from gsbench.renders.sources import scene_trial
     from gsbench.runs.keys import INIT, TRAIN
 
     trial, views = scene_trial(words), False
@@ -134,12 +120,21 @@ def check_scene(words: Sequence[str]) -> Iterator[Finding]:
         trial.store.get(step)
     capture = trial.capture
     odd = [*capture.oddities, *(trial.views.scene.oddities if views else ())]
-    yield Finding(
+    yield (
         "note" if odd else "ok",
         str(capture.name),
         f"{counted(len(capture.image_names), 'photograph')}, {len(capture.test_names)} for testing"
         f" ({capture.held_out}); odd: {', '.join(one.rule for one in odd) or 'nothing'}",
     )
+
+
+def check_machine(runs: Path) -> Iterator[Finding]:
+    """Findings about all that gsbench uses on this machine."""
+    yield from check_packages()
+    yield from check_devices()
+    yield from check_proofs()
+    yield from check_weights()
+    yield from check_runs(runs)
 
 
 def check_proofs() -> Iterator[Finding]:
@@ -155,9 +150,9 @@ def check_proofs() -> Iterator[Finding]:
                 continue
             proof = known_proof(executor.name, device)
             if proof is not None:
-                yield Finding("ok" if proof.passed else "bad", "proof", _describe(proof))
+                yield "ok" if proof.passed else "bad", "proof", _describe(proof)
             elif device.type == "cuda" and executor.devices:
-                yield Finding(
+                yield (
                     "note",
                     "proof",
                     f"raster={executor.name} on {place}: none yet; its first use makes it",
@@ -168,8 +163,8 @@ def check_packages() -> Iterator[Finding]:
     """The versions of gsbench, Python and the packages that gsbench imports."""
     from gsbench import __version__
 
-    yield Finding("ok", "gsbench", f"{__version__} in {Path(__file__).resolve().parents[1]}")
-    yield Finding(
+    yield "ok", "gsbench", f"{__version__} in {Path(__file__).resolve().parents[1]}"
+    yield (
         "ok",
         "python",
         f"{sys.version.split()[0]} ({sys.executable}), {available_threads()} cores to use",
@@ -177,11 +172,11 @@ def check_packages() -> Iterator[Finding]:
     for name in REQUIRED:
         installed = version_of(name)
         text = installed or f"missing: {install_command()}"
-        yield Finding("ok" if installed else "bad", name, text)
+        yield "ok" if installed else "bad", name, text
     for name, (purpose, extra) in OPTIONAL.items():
         installed = version_of(name)
         text = installed or f"not installed; needed for {purpose}: {install_command(extra)}"
-        yield Finding("ok" if installed else "note", name, text)
+        yield "ok" if installed else "note", name, text
 
 
 def check_devices() -> Iterator[Finding]:
@@ -190,9 +185,9 @@ def check_devices() -> Iterator[Finding]:
         import torch
     except (ImportError, OSError) as error:
         first_line = str(error).partition("\n")[0]
-        yield Finding("bad", "torch", f"cannot be imported ({first_line}): pip install torch")
+        yield "bad", "torch", f"cannot be imported ({first_line}): pip install torch"
         return
-    yield Finding("ok", "torch", str(torch.__version__))
+    yield "ok", "torch", str(torch.__version__)
     devices = ["cpu"]
     if torch.cuda.is_available():
         devices.append("cuda")
@@ -201,7 +196,7 @@ def check_devices() -> Iterator[Finding]:
         for index in range(torch.cuda.device_count()):
             free, total = map(readable_bytes, torch.cuda.mem_get_info(index))
             name = torch.cuda.get_device_name(index)
-            yield Finding(verdict, "gpu", f"{name}, {free} of {total} free{after}")
+            yield verdict, "gpu", f"{name}, {free} of {total} free{after}"
     else:
         listed = len(installed_gpus())
         cause = "this torch is a build for CPUs"
@@ -209,34 +204,26 @@ def check_devices() -> Iterator[Finding]:
             cause = "torch finds no usable NVIDIA driver; does nvidia-smi run?"
         elif listed:
             cause = f"{counted(listed, 'NVIDIA GPU')} here, but {cause}: see pytorch.org"
-        yield Finding("note", "gpu", f"none ({cause}): raster=auto uses the CPU")
+        yield "note", "gpu", f"none ({cause}): raster=auto uses the CPU"
     for executor in EXECUTORS:
         usable = [device for device in devices if executor.obstacle(device) is None]
         name = f"raster={executor.name}"
         if usable:
-            yield Finding("ok", "rasterizer", f"{name} on {' and '.join(usable)}: {executor.text}")
+            yield "ok", "rasterizer", f"{name} on {' and '.join(usable)}: {executor.text}"
         else:
-            yield Finding("note", "rasterizer", f"{name} {executor.obstacle(devices[-1])}")
+            yield "note", "rasterizer", f"{name} {executor.obstacle(devices[-1])}"
     chosen = " and ".join(f"{resolve('auto', device).name} on {device}" for device in devices)
-    yield Finding("ok", "rasterizer", f"raster=auto is {chosen}")
-    yield from check_triton()
-
-
-def check_triton() -> Iterator[Finding]:
-    """Findings about the compiler that raster=triton needs at its first run on a GPU."""
-    from gsbench.raster.executors import missing_tools
-
+    yield "ok", "rasterizer", f"raster=auto is {chosen}"
     # Triton comes with torch for CUDA: without it there is no GPU to run it on.
-    missing = missing_tools() if version_of("triton") else []
-    if missing:
+    if version_of("triton") and (missing := missing_tools()):
         text = f"at its first run on a GPU it needs {' and '.join(missing)}"
-        yield Finding("note", "triton", text)
+        yield "note", "triton", text
 
 
 def check_weights() -> Iterator[Finding]:
     """Findings about the weights of networks that are here; nothing is downloaded."""
     from gsbench.eval.lpips import BACKBONES
-    from gsbench.init.networks.options import EXTRACTOR_WEIGHTS, LIGHTGLUE_WEIGHTS
+    from gsbench.init.dim import EXTRACTOR_WEIGHTS, LIGHTGLUE_WEIGHTS
     from gsbench.weights import MissingWeightsError, find_weights
 
     wanted = {f"LPIPS {name}": backbone.features for name, backbone in BACKBONES.items()}
@@ -249,7 +236,7 @@ def check_weights() -> Iterator[Finding]:
             verdict: Verdict = "ok"
         except MissingWeightsError as error:
             verdict, text = "note", str(error)
-        yield Finding(verdict, "weights", f"{purpose}: {text}")
+        yield verdict, "weights", f"{purpose}: {text}"
 
 
 def check_runs(runs: Path) -> Iterator[Finding]:
@@ -259,10 +246,10 @@ def check_runs(runs: Path) -> Iterator[Finding]:
         with tempfile.TemporaryFile(dir=place):
             free = shutil.disk_usage(place).free
     except OSError:
-        yield Finding("bad", "runs", f"{runs} cannot be written to: set GSBENCH_RUNS")
+        yield "bad", "runs", f"{runs} cannot be written to: set GSBENCH_RUNS"
     else:
         verdict: Verdict = "note" if free < LITTLE_SPACE else "ok"
-        yield Finding(verdict, "runs", f"{runs}, {readable_bytes(free)} free")
+        yield verdict, "runs", f"{runs}, {readable_bytes(free)} free"
 
 
 def bench(argv: Sequence[str], _runs: Path | None = None) -> int:
@@ -283,15 +270,12 @@ def bench(argv: Sequence[str], _runs: Path | None = None) -> int:
         "--repeats N": ("turns that count (default 5)", count, 5),
         "--threads N": ("CPU threads (default: as many as torch takes)", count),
         "--json": "print JSON",
-        "--kernels": "with --json: add the time of each kernel, and of waits for the GPU",
         "--no-memory": "do not measure peak memory, in processes of their own",
     }
     parser = ArgumentParser("bench", "Times are medians of steps that take turns.", rows)
     options = parser.parse_args(argv)
     if options.ply is not None and not options.ply.is_file():
         raise InputError(f"--ply: {options.ply} does not exist")
-    if options.kernels and not options.json:
-        raise InputError("--kernels has no place in the table: add --json")
     rasters = options.raster.split(",")
     if AUTO in rasters:
         raise InputError(f"--raster {AUTO} is a choice among executors: name those to time")
@@ -306,7 +290,7 @@ def bench(argv: Sequence[str], _runs: Path | None = None) -> int:
         for width, height in options.size
         for count in (options.count if ply is None else [0])
     ]
-    found = run_bench(rasters, settings, options.repeats, not options.no_memory, options.kernels)
+    found = run_bench(rasters, settings, options.repeats, not options.no_memory)
     print(json.dumps(found, indent=2) if options.json else table(found))
     return 0
 

@@ -1,10 +1,8 @@
 """``gsbench plan``: how many scenes and seeds show a difference (docs/claims.md)."""
 
-import json
-import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from pydantic import PositiveFloat
 
@@ -12,20 +10,19 @@ from gsbench.analysis.comparison import compare
 from gsbench.analysis.notes import texts
 from gsbench.analysis.pairs import BASELINE
 from gsbench.analysis.planning import (
-    COMMANDS,
     UNSURE,
     Components,
     Design,
-    Plan,
-    Purpose,
+    designs_like_these,
+    deviation_range,
     estimate_components,
-    make_plan,
+    sweep_designs,
+    sweep_power,
 )
 from gsbench.analysis.quantities import Quantity, quantity
 from gsbench.analysis.results import Arm, TrialResult, load_experiment
 from gsbench.analysis.statistics import MIN_SCENES
-from gsbench.analysis.verdicts import GIVE_UP, interval_of
-from gsbench.claims.ledger import IDEAS, RATE, SCREEN, level_of_test
+from gsbench.analysis.verdicts import interval_of
 from gsbench.errors import InputError
 from gsbench.runs.commands import ERROR_RATE
 from gsbench.runs.experiments import DEFAULT_METRIC
@@ -34,14 +31,7 @@ from gsbench.words import counted
 
 MAX_DESIGNS = 5  # combinations of scenes and seeds that `plan` shows
 MOST_QUESTIONS = 10_000
-# the answers of `plan` for each command
-PLANNED = {
-    "sweep": "Planned for a sweep: each question errs in {:.3g} %; all seeds are judged at once.",
-    "looks": "Planned for a sweep that stops when decided: each question errs in {:.3g} %.",
-    "gate": "Planned for a gate: it calls a version worse that is worse by the difference.",
-    "ledger": "Planned for a ledger: an idea is kept, at {:.3g} % with both sides, after a quarter "
-    "of the ideas were tested and none was kept.",
-}
+PLANNED = "Planned for a sweep: each question errs in {:.3g} %; all seeds are judged at once."
 NEW_TRIALS = (
     "Train all of them with seeds that the pilot does not have (it has {}), under another name: "
     "what was seen is not declared beforehand."
@@ -57,15 +47,10 @@ def plan(argv: Sequence[str], runs: Path) -> int:
         "(docs/verdict.md). How many ideas will be found, it cannot say.",
         {
             "experiment": "of the pilot trials",
-            "--for=command WHAT": (
-                "what is planned: a sweep (the default), a sweep that stops when decided (looks), "
-                "a gate, or a ledger of ideas",
-                COMMANDS,
-                COMMANDS[0],
-            ),
             "--questions N": (
-                "pairs of arms, claims, or planned ideas that share the error rate (1; ledger: 40)",
+                "pairs of arms that share the error rate (1)",
                 whole_number(MOST_QUESTIONS),
+                1,
             ),
             "--metric NAME": "such as ssim; default: that of the experiment's question, or psnr",
             "--difference SIZE": (
@@ -73,7 +58,6 @@ def plan(argv: Sequence[str], runs: Path) -> int:
                 number(PositiveFloat),
             ),
             "--baseline NAME": (f"the densifier to compare with ({BASELINE})", str, BASELINE),
-            "--json": "print JSON",
         },
     ).parse_args(argv)
     experiment = load_experiment(runs, options.experiment)
@@ -95,31 +79,21 @@ def plan(argv: Sequence[str], runs: Path) -> int:
         raise InputError(
             f"{options.experiment} has one arm, and planning needs pairs of trials of two"
         )
-    purpose, plans = purpose_of(options.command, options.questions), list[dict[str, Any]]()
+    level = ERROR_RATE / options.questions
     lines = [*comparison.sentences, *texts(comparison.remarks), *experiment.warnings]
     for baseline, arm in comparison.pairs:
-        plans.append({"arm": str(arm), "baseline": str(baseline)})
         try:
             components = _components(trials, baseline, arm, metric)
         except InputError as error:
             if len(comparison.pairs) == 1:  # with several, the others may be planned for
                 raise
             lines.append(str(error))
-            plans[-1]["no_plan"] = str(error)
             continue
-        planned = make_plan(components, difference, purpose, MAX_DESIGNS)
-        lines += [f"{arm} against {baseline}", *_lines(planned, metric, difference)]
-        if purpose.screen:
-            lines.append("  an idea that looks better takes as many new seeds, its baseline too")
-        plans[-1] |= planned.to_json()
+        planned = _lines(components, metric, difference, level)
+        lines += [f"{arm} against {baseline}", *planned]
     seeds = sorted({trial.seed for trial in trials})
-    lines.append(PLANNED[options.command].format(100 * purpose.rate))
+    lines.append(PLANNED.format(100 * level))
     lines.append(NEW_TRIALS.format(", ".join(map(str, seeds))))
-    if options.json:
-        asked = {"metric": metric.key, "difference": difference, "for": options.command}
-        asked |= {"error_rate": purpose.rate, "pilot_seeds": seeds}
-        found = asked | comparison.to_json() | {"plans": plans}
-        lines = [json.dumps(found, indent=1)]
     print("\n".join(lines))
     return 0
 
@@ -145,45 +119,36 @@ def _components(
     return components
 
 
-def purpose_of(command: str, questions: int | None) -> Purpose:
-    """The purpose of a command's trials; each idea takes one side of its level.
-
-    A ledger is planned for the test after a quarter of the ideas were tested and none kept: no more
-    pass on where few are good (findings/simulations.md).
-    """
-    if command == "ledger":
-        ideas = questions or IDEAS
-        level = level_of_test(RATE, ideas, math.ceil(ideas / 4), 0)
-        return Purpose(2 * level, looks=True, give_up=GIVE_UP, screen=2 * SCREEN)
-    return Purpose(ERROR_RATE / (questions or 1), looks=command != "sweep")
-
-
-def _lines(planned: Plan, metric: Quantity, difference: float) -> list[str]:
-    components, digits = planned.components, f".{metric.decimals + 1}f"
-    between = ""
+def _lines(components: Components, metric: Quantity, difference: float, level: float) -> list[str]:
+    digits, between = f".{metric.decimals + 1}f", ""
     if components.between is not None:
         between = f", between scenes by {components.between:{digits}}"
+    these = sweep_designs(difference, components, level)
     lines = [
         f"  differences in {metric.name} vary between seeds by "
         f"{components.within:{digits}}{between} (from {counted(components.trials, 'pair')} on "
         f"{counted(components.scenes, 'scene')})",
-        _designs_line("these scenes", planned.these, difference),
+        _designs_line("these scenes", these, difference),
     ]
-    if planned.powers is not None:
-        (low, high), first = planned.factors, planned.these[0]
-        least, most = (100 * power for power in planned.powers)
+    for first in these[:1]:
+        low, high = deviation_range(components)
+        least, most = (
+            100 * sweep_power(first, difference, replace(components, within=end), level)
+            for end in (high, low)
+        )
         lines.append(
-            f"  the pilot knows the variation between seeds only within {low:.2f} to {high:.2f} "
-            f"times ({100 * UNSURE:.0f} % of pilots): so {first.scenes} × {first.seeds} sees it in "
+            "  the pilot knows the variation between seeds only within "
+            f"{low / components.within:.2f} to {high / components.within:.2f} times "
+            f"({100 * UNSURE:.0f} % of pilots): so {first.scenes} × {first.seeds} sees it in "
             f"{least:.0f} to {most:.0f} of 100 cases"
         )
     group = f"scenes like these (from {MIN_SCENES} scenes on)"
-    if planned.like_these is None:
+    if components.between is None:
         return [*lines, f"  for {group}: run pilot trials on a second scene"]
-    return [*lines, _designs_line(group, planned.like_these, difference)]
+    return [*lines, _designs_line(group, designs_like_these(difference, components), difference)]
 
 
 def _designs_line(group: str, designs: Sequence[Design], difference: float) -> str:
-    shown = [f"{design.scenes} × {design.seeds} ({design.trials} trials)" for design in designs]
+    shown = [f"{one.scenes} × {one.seeds} ({one.trials} trials)" for one in designs[:MAX_DESIGNS]]
     what = f"  to see {difference:g} on {group}, scenes × seeds"
     return f"{what}: {', '.join(shown) or 'none that can be run'}"

@@ -7,7 +7,6 @@ import sys
 from collections.abc import Mapping, Sequence
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from gsbench.analysis.addresses import CELL, trials_of_arm
 from gsbench.analysis.cells import (
@@ -19,6 +18,7 @@ from gsbench.analysis.cells import (
     where_words,
     with_variants,
 )
+from gsbench.analysis.comparison import Comparison, chosen, compare, joined
 from gsbench.analysis.fairness import fairness_table
 from gsbench.analysis.pairs import BASELINE
 from gsbench.analysis.paper import (
@@ -30,8 +30,6 @@ from gsbench.analysis.paper import (
 )
 from gsbench.analysis.quantities import Quantity, quantity
 from gsbench.analysis.results import (
-    Arm,
-    Experiment,
     TrialResult,
     load_experiment,
 )
@@ -43,9 +41,6 @@ from gsbench.runs.experiments import list_experiments
 from gsbench.runs.package_code import edited
 from gsbench.verbs.arguments import WHERE, ArgumentParser, Rows, names, path
 from gsbench.words import some_of, split_outside_brackets
-
-if TYPE_CHECKING:
-    from gsbench.analysis.comparison import Comparison
 
 TRIALS, JSON = "trials", "json"
 FAIRNESS = "fairness"
@@ -101,7 +96,9 @@ def tables(argv: Sequence[str], runs: Path) -> int:
     if options.format == TRIALS:
         texts = {"-trials.csv": csv_of(to_frame(trials))}
     else:
-        comparison = _comparison(experiments, trials, where)
+        comparison = joined([compare(experiment) for experiment in experiments])
+        if where:
+            comparison = chosen(comparison, trials, where_words(where))
         if options.format == JSON:
             texts = {f".{JSON}": json.dumps(comparison.to_json(), indent=1) + "\n"}
         else:
@@ -119,19 +116,8 @@ def _format_of(out: Path | None) -> str:
     return "md"
 
 
-def _comparison(
-    experiments: Sequence[Experiment], trials: Sequence[TrialResult], where: Mapping[str, str]
-) -> "Comparison":
-    """The verdicts of one experiment or two, about the chosen trials."""
-    # here, since SciPy is slow to import
-    from gsbench.analysis.comparison import chosen, compare, joined
-
-    comparison = joined([compare(experiment) for experiment in experiments])
-    return chosen(comparison, trials, where_words(where)) if where else comparison
-
-
 def _tables(
-    comparison: "Comparison", trials: Sequence[TrialResult], options: argparse.Namespace
+    comparison: Comparison, trials: Sequence[TrialResult], options: argparse.Namespace
 ) -> dict[str, str]:
     """The texts of the tables, by the ending of their file's name."""
     experiment, layout, metrics = comparison.experiment, options.layout, options.metrics
@@ -153,7 +139,7 @@ def _tables(
     return {f"{end}.{suffix}": writer(table) for end, table in named.items()}
 
 
-def _fairness_sheets(comparison: "Comparison", format_name: str) -> dict[str, str]:
+def _fairness_sheets(comparison: Comparison, format_name: str) -> dict[str, str]:
     """The fairness sheets of all compared pairs of arms."""
     experiment = comparison.experiment
     if not comparison.pairs:
@@ -163,14 +149,10 @@ def _fairness_sheets(comparison: "Comparison", format_name: str) -> dict[str, st
     suffix, writer = FORMATS[format_name]
     sheets = {}
     for first, second in comparison.pairs:
-        end = f"-{FAIRNESS}-{_as_file(second)}-{_as_file(first)}.{suffix}"
+        arms = (re.sub(r"[^\w.=-]+", "_", str(arm)) for arm in (second, first))
+        end = f"-{FAIRNESS}-{'-'.join(arms)}.{suffix}"
         sheets[end] = writer(fairness_table(comparison.trials, first, second))
     return sheets
-
-
-def _as_file(arm: Arm) -> str:
-    """An arm, with its variant, as part of a file's name."""
-    return re.sub(r"[^\w.=-]+", "_", str(arm))
 
 
 def _write(texts: Mapping[str, str], out: Path | None, name: str) -> None:
@@ -233,7 +215,11 @@ def explain_cell(address: str, runs: Path) -> str:
         raise InputError(f"{address!r} is not {CELL}")
     name, scene, metric, arm = parts
     experiment = load_experiment(runs, name)
-    trials = _trials_at(experiment, scene, arm)
+    of_scene = [trial for trial in with_variants(experiment.trials) if trial.scene == scene]
+    if not of_scene:
+        scenes = ", ".join(sorted({trial.scene for trial in experiment.trials}))
+        raise InputError(f"experiment {name!r} has no scene {scene!r}; it has {scenes}")
+    trials = trials_of_arm(of_scene, arm, f" of {scene}")
     shown = quantity(metric, trials)
     check_averageable(trials, f"scene={scene} {arm}")
     expected = len(experiment.seeds)
@@ -245,7 +231,10 @@ def explain_cell(address: str, runs: Path) -> str:
     ]
     if cell.reason:
         lines.append(f"  not available: {cell.reason}")
-    lines += ["", "Verdicts", *(f"  {line}" for line in _verdicts_on(experiment, trials[0].arm))]
+    answers = compare(experiment).answers
+    about = [one.line for one in answers if trials[0].arm in (one.arm, one.baseline)]
+    about = about or ["none: it is compared with no other arm"]
+    lines += ["", "Verdicts", *(f"  {line}" for line in about)]
     conditions = trials[0].conditions.items()
     lines += ["", "Conditions", *(f"  {key}: {value}" for key, value in conditions)]
     lines += _trials_lines(trials, shown)
@@ -256,23 +245,6 @@ def explain_cell(address: str, runs: Path) -> str:
     if left_out := [*(line for line in experiment.faults if line.startswith(start)), *versions]:
         lines += ["", "Left out", *(f"  {line}" for line in left_out)]
     return "\n".join(lines)
-
-
-def _verdicts_on(experiment: Experiment, arm: Arm) -> list[str]:
-    """The badges and sentences of the questions about an arm, on either side."""
-    from gsbench.analysis.comparison import compare  # here, since SciPy is slow to import
-
-    answers = [one for one in compare(experiment).answers if arm in (one.arm, one.baseline)]
-    return [answer.line for answer in answers] or ["none: it is compared with no other arm"]
-
-
-def _trials_at(experiment: Experiment, scene: str, word: str) -> list[TrialResult]:
-    """The trials of a scene and of the one arm that ``word`` names."""
-    of_scene = [trial for trial in with_variants(experiment.trials) if trial.scene == scene]
-    if not of_scene:
-        scenes = ", ".join(sorted({trial.scene for trial in experiment.trials}))
-        raise InputError(f"experiment {experiment.name!r} has no scene {scene!r}; it has {scenes}")
-    return trials_of_arm(of_scene, word, f" of {scene}")
 
 
 def _trials_lines(trials: Sequence[TrialResult], shown: Quantity) -> list[str]:

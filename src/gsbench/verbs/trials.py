@@ -1,4 +1,4 @@
-"""Verbs about the trials of an experiment: ``gsbench status``, ``retry`` and ``sync``."""
+"""Verbs about trials of an experiment: ``gsbench status``, ``retry``, ``declare`` and ``sync``."""
 
 from __future__ import annotations
 
@@ -15,19 +15,18 @@ from pathlib import Path
 from rich.live import Live
 from rich.text import Text
 
-from gsbench.config.command_words import makes_other_trials, typed_permissions
+from gsbench.config.command_words import makes_other_trials, parse, typed_permissions
 from gsbench.config.compose import Trial, compose_one
-from gsbench.config.overrides import key_of
+from gsbench.config.overrides import changed_words, key_of
 from gsbench.errors import GsbenchError, InputError
+from gsbench.files import checked_runs_folder, make_runs_folder
 from gsbench.launch.dry_run import describe_plan
 from gsbench.launch.progress import SPEED, progress_frame
-from gsbench.launch.record import remove
+from gsbench.launch.record import check_looks, check_questions, planned_rows, record, remove
 from gsbench.launch.states import (
     STATES,
     TrialState,
-    label_of,
-    names_of,
-    states_now,
+    labels_of,
     states_of_experiment,
     summary_of,
 )
@@ -37,7 +36,7 @@ from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS
 from gsbench.runs.user_code import PERMISSIONS
 from gsbench.system.programs import allow_modules
-from gsbench.tracking.beside import end_with
+from gsbench.tracking.beside import send_beside
 from gsbench.tracking.sync import MirrorError
 from gsbench.tracking.sync import sync as send_missing
 from gsbench.verbs.arguments import ArgumentParser, Rows
@@ -71,9 +70,13 @@ def status(argv: Sequence[str], runs: Path) -> int:
     if options.watch:
         _watch(runs, options.experiment)
     _say_what_is_lost(home)
-    trials = states_now(home)
+    trials = states_of_experiment(home)
     if options.verify:
-        trials = [_verified(trial) for trial in trials]
+        for number, trial in enumerate(trials):
+            if trial.state in ("done", "superseded"):
+                fault = TrialFolder(trial.folder).fault_when_read()
+                if fault is not None:
+                    trials[number] = replace(trial, state="damaged", note=str(fault))
     if options.forget_superseded:
         superseded = [trial for trial in trials if trial.state == "superseded"]
         remove(home, [trial.folder for trial in superseded])
@@ -101,14 +104,6 @@ def _say_what_is_lost(home: Path) -> None:
         print(f"left out: {fault}", file=sys.stderr)
 
 
-def _verified(trial: TrialState) -> TrialState:
-    """The state after all files of a finished trial were read; damaged if one has changed."""
-    if trial.state not in ("done", "superseded"):
-        return trial
-    fault = TrialFolder(trial.folder).fault_when_read()
-    return trial if fault is None else replace(trial, state="damaged", note=str(fault))
-
-
 def _watch(runs: Path, experiment: str) -> None:
     """Show the progress of an experiment until its trials have ended, or Ctrl-C."""
     with suppress(KeyboardInterrupt), Live(auto_refresh=False) as live:
@@ -125,11 +120,11 @@ def _watch(runs: Path, experiment: str) -> None:
 
 def lines_of(trials: list[TrialState], with_done: bool) -> list[str]:
     """A line for each trial not done or in doubt (``with_done``: for each), and a summary."""
-    lines, names = [], names_of(trials)
+    lines, labels = [], labels_of(trials)
     order = [*STATES]
     for trial in sorted(trials, key=lambda trial: order.index(trial.state)):
         if trial.state != "done" or trial.note or with_done:
-            label = label_of(trial.folder, names)
+            label = labels[trial.folder]
             lines.append(f"{trial.state:<8} {label:<50} {_age(trial):>12}  {trial.note}".rstrip())
     return [*lines, summary_of(trial.state for trial in trials)]
 
@@ -140,7 +135,7 @@ def _overview(runs: Path) -> int:
         print(f"no experiment in {runs} yet")
     for name in names:
         _say_what_is_lost(runs / name)
-        states = states_now(runs / name)
+        states = states_of_experiment(runs / name)
         print(f"{name:<20} {summary_of(trial.state for trial in states)}")
     return 0
 
@@ -211,15 +206,10 @@ def recompose(
         if Path(planned.cwd).is_dir():
             # relative paths were meant from there, and the trials are run from there
             os.chdir(planned.cwd)
-        replaced = {PERMISSIONS, *map(key_of, changes)}
-        kept = [word for word in planned.words if key_of(word) not in replaced]
-        added = set(changes) - set(planned.words)
-        if any(change.startswith("launch=") for change in added):
-            # Planned settings of a launcher were meant for the other one.
-            kept = [word for word in kept if not word.startswith("launch.")]
+        kept = [word for word in planned.words if key_of(word) != PERMISSIONS]
         # Modules are not taken from planned.cwd: somebody else's plan would name a folder of
         # theirs.
-        trial = compose_one([*kept, *changes], typed=changes, modules=modules)
+        trial = compose_one(changed_words(kept, changes), typed=changes, modules=modules)
         return Trial(trial.values | {"runs": str(runs)}, trial.overrides)
     files, allowed = TrialFolder(folder), typed_permissions(changes)
     if any(key_of(change) != PERMISSIONS for change in changes):
@@ -236,6 +226,32 @@ def recompose(
     return Trial(values, ())
 
 
+def declare(argv: Sequence[str], runs: Path) -> int:
+    """Run the verb; raises InputError for a wrong sweep."""
+    parser = ArgumentParser(
+        "declare",
+        "It writes the questions of a sweep and trains nothing: for loops and arrays of jobs that "
+        "train its trials one by one. Each of these commands then asks nothing more.",
+        {"settings* KEY=VALUE": "as of a sweep", "--config-dir FOLDER": "as of a sweep"},
+    )
+    parser.add_argument("-m", "--multirun", action="store_true", help="is understood")
+    parser.parse_args(argv)
+    from gsbench.app.command import compose_trials  # here, since it loads Hydra
+
+    words, _, _ = parse(argv)  # the words of a command
+    trials = compose_trials(words, multirun=True)
+    if any(trial.values["launch"]["stop_when_decided"] for trial in trials):
+        check_looks(trials, planned_rows(trials))
+    check_questions(trials)
+    make_runs_folder(checked_runs_folder(trials[0].values["runs"]))
+    questions = record(trials)  # which says them
+    print(
+        f"{trials[0].values['name']}: {counted(len(trials), 'trial')} and "
+        f"{counted(len(questions), 'question')}"
+    )
+    return 0
+
+
 def sync(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 1 if the tracker cannot be reached."""
     rows: Rows = {
@@ -243,8 +259,7 @@ def sync(argv: Sequence[str], runs: Path) -> int:
         "permissions* allow_targets=[mine]": "for trials that a tracker of your own shows",
         "--uri ADDRESS": "such as http://127.0.0.1:5000; default: $MLFLOW_TRACKING_URI, or the "
         "runs folder's",
-        "--trial* SCENE/ARM/FOLDER": "only this trial of the experiment (repeatable)",
-        "--beside PID": ("end soon after this process has ended", int),
+        "--beside SECONDS": ("send the trials that the standard input names, to its end", float),
     }
     options = ArgumentParser("sync", rows=rows).parse_args(argv)
     words = [options.experiment or "", *options.permissions]
@@ -252,16 +267,14 @@ def sync(argv: Sequence[str], runs: Path) -> int:
     if unread := [word for word in words if key_of(word) != PERMISSIONS]:
         raise InputError(f"sync reads only {PERMISSIONS}, not {unread[0]}")
     allow_modules(allowed := typed_permissions(words))
-    if options.beside:
-        end_with(options.beside)
     names = [experiment] if experiment else list_experiments(runs)
     homes = [experiment_home(runs, name) for name in names]
     try:
-        folders: list[TrialFolder] = []
-        for home in homes:
-            places = [TrialFolder(Path(place)) for place in sorted(trial_folders(home))]
-            wanted = {str(home / trial) for trial in options.trial}
-            folders += [one for one in places if not wanted or str(one.path) in wanted]
+        if options.beside is not None:
+            send_beside(sys.stdin, options.beside)
+            return 0
+        places = [place for home in homes for place in sorted(trial_folders(home))]
+        folders = [TrialFolder(Path(place)) for place in places]
         for line in send_missing(folders, options.uri, allowed):
             print(line, flush=True)
     except (MirrorError, OSError) as error:

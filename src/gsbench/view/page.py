@@ -19,6 +19,7 @@ from gsbench.analysis.results import TrialResult
 from gsbench.errors import GsbenchError
 from gsbench.files import atomic, write_json
 from gsbench.normalization import Normalization
+from gsbench.parsing import read_json
 from gsbench.scene.colmap import model_points, read_model
 from gsbench.scene.types import View
 from gsbench.system.programs import find_program, own_folder, safe_environment
@@ -92,16 +93,12 @@ def page_settings(trial: TrialResult) -> dict[str, Any]:
         _annotation(view.name, _camera(view, points, trial.record.to_training))
         for view in read_test_views(trial, folder)
     ]
-    return {
-        "version": 2,
-        "tonemapping": "none",
-        "highPrecisionRendering": False,
-        "background": {"color": list(background_of(trial))},
-        "postEffectSettings": {name: {"enabled": False, **EFFECTS[name]} for name in EFFECTS},
-        "animTracks": [],
+    settings: dict[str, Any] = read_json(Path(__file__).with_name("page_settings.json"))
+    background = {"color": list(background_of(trial))}
+    return settings | {
+        "background": background,
         "cameras": [views[0]["camera"]],
         "annotations": views,
-        "startMode": "default",
     }
 
 
@@ -110,15 +107,6 @@ def _annotation(name: str, camera: dict[str, Any]) -> dict[str, Any]:
     # stranger's photograph must not end the script.
     text = {"title": re.sub(r"[<>&]", "_", name), "text": "a test view", "extras": None}
     return {"position": camera["target"], **text, "camera": {"initial": camera}}
-
-
-EFFECTS: dict[str, dict[str, Any]] = {  # all are off; the viewer wants their values
-    "sharpness": {"amount": 0},
-    "bloom": {"intensity": 1, "blurLevel": 2},
-    "grading": {"brightness": 0, "contrast": 1, "saturation": 1, "tint": [1, 1, 1]},
-    "vignette": {"intensity": 0.5, "inner": 0.3, "outer": 0.75, "curvature": 1},
-    "fringing": {"intensity": 0.5},
-}
 
 
 def _camera(

@@ -1,6 +1,5 @@
 """COLMAP's database as pycolmap reads it back: shared cameras, strongest features, counts."""
 
-import itertools
 from dataclasses import replace
 from pathlib import Path
 
@@ -262,29 +261,3 @@ def test_reference_cameras_are_marked_as_known_and_grouped_with_their_images():
     assert known == [(60.0, 80), (50.0, 40)]
     assert all(camera.has_prior_focal_length for camera, _ in groups)
     assert not any(camera.has_prior_focal_length for camera in model.cameras.values())  # copies
-
-
-def test_matching_is_divided_over_processes_and_reports_one_sum(database, monkeypatch):
-    jobs, told = [], []
-
-    def match(function, job, progress, what):
-        """Act as a process that finds one match in its first pair."""
-        jobs.append(job)
-        assert made.image_ids(job.result) == {str(number): number for number in range(1, 6)}
-        with pycolmap.Database.open(job.result) as opened:
-            opened.write_matches(*job.parts[0][0], np.array([[3, 4]], dtype=np.uint32))
-        progress("match", sum(map(len, job.parts)), None)
-
-    monkeypatch.setattr(matches, "run_with_progress", match)
-    pairs = list(itertools.combinations(SIZES, 2))
-    matches.match_sift(database, pairs, Sfm(threads=3), lambda *state: told.append(state))
-    assert (told[0], max(told)) == (("match", 0, 10), ("match", 10, 10))
-    assert len({job.result for job in jobs}) == len(jobs) == 3
-    divided = [pair for job in jobs for part in job.parts for pair in part]
-    assert sorted(divided) == list(itertools.combinations(range(1, 6), 2))
-    with pycolmap.Database.open(database) as opened:
-        found, _ = opened.read_all_matches()
-    assert {pycolmap.pair_id_to_image_pair(pair) for pair in found} == {
-        job.parts[0][0] for job in jobs
-    }
-    assert sorted(path.name for path in database.parent.iterdir()) == ["database.db", "images"]

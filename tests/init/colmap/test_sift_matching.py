@@ -68,8 +68,7 @@ def read_matches(database):
     }
 
 
-@pytest.mark.parametrize("processes", [1, 3])
-@pytest.mark.slow
+@pytest.mark.parametrize("processes", [pytest.param(1, marks=pytest.mark.slow), 3])
 def test_matches_equal_those_of_colmap_on_one_thread(features, tmp_path, processes):
     database, pairs = features
     shutil.copy(database, tmp_path / "colmap.db")
@@ -135,7 +134,7 @@ def test_auto_matches_only_the_pairs_that_a_preview_proposes(
     monkeypatch.setattr("gsbench.init.colmap.matches.extract_sift", lambda *_: None)
     options = Sfm(threads=1, pairs="auto")
     job = Job(options, bare_photos, tmp_path, tmp_path, None)
-    counts = options.fill(job, task, no_progress, Timer())
+    counts = options.fill(job, task, no_progress, Timer())["counts"]
     assert counts["pairs_selected"] + counts["pairs_left_out"] == len(pairs)
     assert counts["pairs_left_out"] > 10
     matched = read_matches(task.database)

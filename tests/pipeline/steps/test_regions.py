@@ -80,7 +80,9 @@ def test_depth_maps_of_a_sensor_come_before_the_model(case):
     ramp = np.arange(1, SIZE[0] * SIZE[1] + 1, dtype=np.uint16).reshape(SIZE[::-1])
     folder = Path(parts.scene.path) / "depths"
     pictures(folder, dict.fromkeys(NAMES, ramp))
-    views.capture = replace(views.capture, depths={name: folder / name for name in NAMES})
+    views.capture = replace(
+        views.capture, beside={"depth": {name: folder / name for name in NAMES}}
+    )
     found = regions_of(views, parts)
     for name in NAMES[:2]:
         assert_array_equal(found[name]["near"], ramp <= ramp.size / 3)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from gsbench.runs.store import Store
 from gsbench.scene.colmap import read_model
 from gsbench.scene.courtyard.layout import build_layout
 from gsbench.scene.courtyard.render import (
@@ -16,10 +15,10 @@ from gsbench.scene.courtyard.render import (
     render_view,
     ring_camera,
 )
-from gsbench.scene.load import load_scene
 from tests.scene.cameras import cameras_of
-from tests.scene.captures import read_colmap
+from tests.scene.captures import loaded, read_colmap
 from tests.scene.courtyard.surfaces import fingerprint, surface_distance
+from tests.scene.tables import TABLES
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +51,7 @@ def test_the_colmap_model_has_the_exact_cameras(capture_dir, tmp_path):
         assert_allclose(written[name].translation, camera.translation, atol=1e-12)
         assert (written[name].fx, written[name].cx, written[name].cy) == (camera.fx, 80, 60)
     capture = replace(read_colmap("courtyard", capture_dir), exact_poses=True)
-    assert len(load_scene(capture, capture.model, Store(tmp_path)).train) == 3
+    assert len(loaded(capture, tmp_path).train) == 3
 
 
 @pytest.mark.parametrize("views", [12, 48, 60])
@@ -65,22 +64,10 @@ def test_neighbouring_views_are_close(views):
     assert surface_distance(centers).min() > 0.5  # no camera is in or near an object
 
 
-PICTURES = [  # for each view: `fingerprint` of red, green and blue, about four times their means
-    [485.889, 471.442, 398.571],
-    [503.88, 484.926, 420.694],
-    [525.847, 486.092, 373.444],
-    [594.197, 543.535, 447.332],
-    [681.529, 655.972, 519.084],
-    [682.639, 660.308, 501.558],
-    [639.138, 588.323, 468.105],
-    [580.38, 526.467, 411.01],
-]
-
-
 def test_the_images_change_only_with_the_version():
     """Eight views around the centre; if this test fails, raise the courtyard's VERSION."""
     made = []
     for angle in np.arange(8) * np.pi / 4:
         picture = render_view(build_layout(1), ring_camera(angle, 80, 60), 1)
         made.append([fingerprint(picture[..., channel]) for channel in range(3)])
-    assert_allclose(made, PICTURES, atol=0.02, err_msg=str(np.round(made, 3).tolist()))
+    assert_allclose(made, TABLES["courtyard"], atol=0.02, err_msg=str(np.round(made, 3).tolist()))

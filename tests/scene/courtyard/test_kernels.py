@@ -79,7 +79,7 @@ def test_a_ray_hits_a_solid_where_samples_along_it_enter_the_solid(name):
 
 
 def test_the_first_hit_equals_that_of_a_search_over_all_primitives():
-    """The boxes of groups and the bounding spheres exclude only what a ray misses."""
+    """The boxes of groups exclude only what a ray misses."""
     found = set()
     for origin, direction in rays(4, 60, 4.0):
         origin = origin * [1, 1, 0.2] + [0, 0, 1.5]

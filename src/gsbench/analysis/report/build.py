@@ -13,7 +13,7 @@ from gsbench.analysis.cells import select_trials, where_words
 from gsbench.analysis.comparison import Answer, chosen, compare
 from gsbench.analysis.differences import between_scenes_notes
 from gsbench.analysis.fairness import caveats, counts_notes, fairness_table
-from gsbench.analysis.images import choose_views, png_uri
+from gsbench.analysis.images import choose_views, jpeg_uri
 from gsbench.analysis.notes import texts
 from gsbench.analysis.pairs import pair_trials
 from gsbench.analysis.paper import layout_of, load_published, paper_tables
@@ -36,7 +36,7 @@ from gsbench.analysis.verdicts import Verdict
 from gsbench.eval.facts import find_metric
 from gsbench.parsing import read_if_sound
 from gsbench.runs import layout
-from gsbench.runs.experiments import Arm, TuningRecord
+from gsbench.runs.experiments import TuningRecord
 from gsbench.scene.images import read_image
 from gsbench.words import command, counted, signed
 
@@ -116,7 +116,7 @@ def trial_figures(trials: Sequence[TrialResult]) -> list[tuple[str, str]]:
     for group in group_by(trials, "scene", "arm").values():
         trial = group[0]
         for path in sorted((trial.path / layout.FIGURES).glob("*.png")):
-            key = path.stem.replace("_", " "), trial.scene, png_uri(read_image(path))
+            key = path.stem.replace("_", " "), trial.scene, jpeg_uri(read_image(path))
             sources.setdefault(key, []).append(f"{trial.init}-{trial.densify}, seed {trial.seed}")
     return [
         (f"{name}: {scene}, {'; '.join(arms)}", uri) for (name, scene, uri), arms in sources.items()
@@ -128,34 +128,23 @@ def compare_arms(trials: Sequence[TrialResult], judged: Answer) -> dict[str, Any
     first, second = judged.baseline, judged.arm
     verdicts = [judged.verdict, *judged.metrics]
     views, faults = choose_views(pair_trials(trials, first, second))
-    return {
+    baseline, other = trials_of(trials, first), trials_of(trials, second)
+    both: dict[str, Any] = {"caveats": "", "fairness": None, "facts": []}
+    if baseline and other:  # neither is awaited
+        unlike = [*counts_notes(trials, [(first, second)]), *caveats(trials, first, second)]
+        both = {
+            "caveats": " ".join(texts(unlike)),
+            "fairness": fairness_table(trials, first, second),
+            "facts": [*_costs(baseline, other), *between_scenes_notes(baseline, other)],
+        }
+    return both | {
         "judged": judged,
         "title": f"{second} against {first}",
         "verdicts": verdicts,
         "has_like_these": judged.verdict.like_these is not None,
-        **_settings_of_both(trials, first, second),
         "forests": [_forest(verdict) for verdict in verdicts],
         "views": views,
         "notes": texts([*judged.verdict.notes, *faults]),
-    }
-
-
-def _settings_of_both(trials: Sequence[TrialResult], first: Arm, second: Arm) -> dict[str, Any]:
-    """Differences between the settings and the costs of two arms; none while one is awaited."""
-    baseline, other = trials_of(trials, first), trials_of(trials, second)
-    if not (baseline and other):
-        return {"caveats": "", "fairness": None, "facts": []}
-    return {
-        "caveats": " ".join(
-            texts(
-                [
-                    *counts_notes(trials, [(first, second)]),
-                    *caveats(trials, first, second),
-                ]
-            )
-        ),
-        "fairness": fairness_table(trials, first, second),
-        "facts": [*_costs(baseline, other), *between_scenes_notes(baseline, other)],
     }
 
 
@@ -205,7 +194,19 @@ def _forest(verdict: Verdict) -> str:
 
 def provenance(trials: Sequence[TrialResult]) -> Table:
     """One row per trial: its folder, conditions, hashes, code, machine and versions."""
-    facts_by_trial = {trial.label: _facts_of(trial) for trial in trials}
+    facts_by_trial = {}
+    for trial in trials:
+        record = trial.record
+        versions = (f"{name} {version}" for name, version in record.versions.items())
+        facts_by_trial[trial.label] = {
+            "raster": record.raster,
+            "protocol": record.protocol,
+            "iterations": str(record.iterations),
+            **{f"{key} hash": value[:12] for key, value in record.hashes.items()},
+            "code": ", ".join(trial.code_texts),
+            "machine": trial.machine or "",
+            "versions": ", ".join(versions),
+        }
     names = dict.fromkeys(itertools.chain(*facts_by_trial.values()))
     columns = tuple(Column("", name, ("provenance", name)) for name in names)
     rows = []
@@ -213,19 +214,6 @@ def provenance(trials: Sequence[TrialResult]) -> Table:
         entries = tuple(TableEntry(facts.get(name, "")) for name in names)
         rows.append(Row((label,), entries))
     return Table("Trials", ("trial",), columns, tuple(rows), wrapped=True)
-
-
-def _facts_of(trial: TrialResult) -> dict[str, str]:
-    record = trial.record
-    return {
-        "raster": record.raster,
-        "protocol": record.protocol,
-        "iterations": str(record.iterations),
-        **{f"{key} hash": value[:12] for key, value in record.hashes.items()},
-        "code": ", ".join(trial.code_texts),
-        "machine": trial.machine or "",
-        "versions": ", ".join(f"{name} {version}" for name, version in record.versions.items()),
-    }
 
 
 def search_summary(home: Path) -> tuple[str, str] | None:

@@ -4,21 +4,24 @@ import itertools
 import math
 from collections import defaultdict
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from statistics import fmean
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbench.analysis.comparison import Answer, Comparison
+from gsbench.analysis.comparison import Comparison
+from gsbench.analysis.quantities import Quantity
 from gsbench.analysis.report.charts import line_chart
 from gsbench.analysis.results import Arm, TrialResult, group_by, trials_of
 from gsbench.analysis.statistics import Interval
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
+from gsbench.analysis.verdicts import Verdict
 from gsbench.errors import InputError
 from gsbench.events import RefineEvent
 from gsbench.runs import layout
-from gsbench.runs.rows import Histogram
+from gsbench.runs.trial_files import Histogram
 
 EVENT_CAUSES = (*RefineEvent.GROWN, "relocated", *RefineEvent.PRUNED)
 CURVES = (  # key of metrics.jsonl, title, y axis
@@ -102,7 +105,12 @@ def volume_charts(
     notes = []
     for arm in arms:
         try:
-            volumes = np.concatenate([*map(_volumes_in_training, trials_of(trials, arm))])
+            volumes = np.concatenate(
+                [
+                    log10_volumes(trial.path / layout.POINT_CLOUD, trial.record.to_training.scale)
+                    for trial in trials_of(trials, arm)
+                ]
+            )
         except InputError as error:
             notes.append(f"{arm}: no histogram, {error}")
             continue
@@ -124,15 +132,10 @@ def volume_charts(
     return list(filter(None, charts)), notes
 
 
-def _volumes_in_training(trial: TrialResult) -> NDArray[np.float64]:
-    """log10 of the volumes [N] of a trial's Gaussians, in its training's cubed units."""
-    return log10_volumes(trial.path / layout.POINT_CLOUD) + 3 * math.log10(
-        trial.record.to_training.scale
-    )
-
-
-def log10_volumes(path: Path) -> NDArray[np.float64]:
+def log10_volumes(path: Path, scale: float = 1.0) -> NDArray[np.float64]:
     """log10 of the volumes ``4/3 π s1 s2 s3`` [N] of a 3DGS PLY, whose scales are logs.
+
+    ``scale`` is that of the training, in whose cubed units the volumes are.
 
     Raises `InputError` for a file that cannot be read as a 3DGS PLY.
     """
@@ -145,7 +148,7 @@ def log10_volumes(path: Path) -> NDArray[np.float64]:
         )
     except (OSError, ValueError, KeyError, PlyParseError) as error:
         raise InputError(f"{path} is not a readable 3DGS PLY ({error})") from None
-    return np.asarray(LOG10_SPHERE + logs / math.log(10))
+    return np.asarray(LOG10_SPHERE + logs / math.log(10) + 3 * math.log10(scale))
 
 
 def histogram(volumes: NDArray[np.float64]) -> Curve:
@@ -192,23 +195,19 @@ WIDE = 20.0  # ratio of values from which their axis is logarithmic
 
 def sweep_charts(comparison: Comparison) -> list[str]:
     """A chart for each idea of which one setting with numbers was swept."""
+    swept: dict[tuple[Arm, str, str, Quantity], dict[float, Verdict]] = {}
+    for answer in comparison.answers:
+        arm, verdict = answer.arm, answer.verdict
+        if len(arm.variant) == 1 and verdict.mean is not None and not verdict.question.relative:
+            ((key, value),) = arm.variant
+            with suppress(ValueError):  # it is no number
+                own = swept.setdefault((answer.baseline, arm.name, key, verdict.quantity), {})
+                own[float(value)] = verdict
     charts = []
-    swept = [answer for answer in comparison.answers if _value(answer) is not None]
-    for (baseline, name, key, metric), own in group_by(
-        swept,
-        lambda one: (one.baseline, one.arm.name, one.arm.variant[0][0], one.verdict.quantity),
-    ).items():
-        points = {
-            value: one.verdict
-            for one in own
-            if (value := _value(one)) is not None
-            and one.verdict.mean is not None
-            and not one.verdict.question.relative
-        }
+    for (baseline, name, key, metric), points in swept.items():
         if len(points) < FEWEST:
             continue
-        level = [verdict.pairs.baseline for verdict in points.values()]
-        middle = sum(level) / len(level)
+        middle = fmean(verdict.pairs.baseline for verdict in points.values())
         line = [(value, middle + (points[value].mean or 0.0)) for value in sorted(points)]
         bars = {
             value: Interval(middle + interval.low, middle + interval.high)
@@ -228,13 +227,3 @@ def sweep_charts(comparison: Comparison) -> list[str]:
             )
         )
     return charts
-
-
-def _value(answer: Answer) -> float | None:
-    """The value of the one setting that was swept; None if there are others, or it is no number."""
-    if len(answer.arm.variant) != 1:
-        return None
-    try:
-        return float(answer.arm.variant[0][1])
-    except ValueError:
-        return None

@@ -9,6 +9,7 @@ question that was asked before.
 """
 
 from collections.abc import Iterable, Sequence
+from dataclasses import astuple
 from statistics import fmean
 
 import numpy as np
@@ -19,6 +20,7 @@ from gsbench.analysis.report.charts import line_chart
 from gsbench.analysis.results import TrialResult, group_by
 from gsbench.analysis.statistics import t_test
 from gsbench.errors import InputError
+from gsbench.words import signed
 
 LIMIT = "densify.max_gaussians"
 LEAST_COMMON = 0.5  # the smallest common part of the larger range of quality that is averaged over
@@ -101,7 +103,7 @@ def log_ratio(arm: Points, baseline: Points, direction: int) -> float:
 
 
 def saving_words(ratios: Sequence[float]) -> str:
-    """A phrase such as "27 % fewer Gaussians (12 to 38 %)", from the log ratios of pairs.
+    """A phrase such as "27 % fewer Gaussians (−38 to −12 %)", from the log ratios of pairs.
 
     The interval is Student's over pairs of trainings.
     """
@@ -109,8 +111,5 @@ def saving_words(ratios: Sequence[float]) -> str:
     text = f"{100 * abs(change):.0f} % {'fewer' if change < 0 else 'more'} Gaussians"
     if test is None:
         return f"{text} (one pair: no interval)"
-    low, high = 100 * np.expm1([test.interval().low, test.interval().high])
-    if low < 0 < high:
-        return f"{text} ({-low:.0f} % fewer to {high:.0f} % more)"
-    near, far = sorted((abs(low), abs(high)))
-    return f"{text} ({near:.0f} to {far:.0f} %)"
+    low, high = (signed(100 * float(np.expm1(end)), ".0f") for end in astuple(test.interval()))
+    return f"{text} ({low} to {high} %)"

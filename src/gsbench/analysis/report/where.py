@@ -7,13 +7,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbench.analysis.comparison import Answer
-from gsbench.analysis.images import png_uri, regions_of, truth_uri
+from gsbench.analysis.images import jpeg_uri, read_truth, regions_of
 from gsbench.analysis.pairs import pair_trials
-from gsbench.analysis.regions import FEWEST_SEEDS, SceneRegions, compare_regions, discoveries
+from gsbench.analysis.regions import (
+    FEWEST_SEEDS,
+    SIDE,
+    SceneRegions,
+    compare_regions,
+    discoveries,
+)
 from gsbench.analysis.results import Arm, TrialPair, TrialResult, group_by
 from gsbench.errors import InputError
 
-MAP_SIDE = 12  # px of a region on a map
 NOISY = 3.0  # dB: the deviation over seeds that is drawn black
 BETTER, WORSE, NOTHING = (33, 102, 172), (178, 24, 43), (235, 235, 235)
 
@@ -49,7 +54,8 @@ def region_maps(
 def _map(own: Sequence[TrialPair], scene: SceneRegions, lit: dict[str, Flags]) -> dict[str, Any]:
     """The test view of a scene with most lit regions, and the counts of all its views.
 
-    Pictures are data URIs; that of the photograph is empty where there is none.
+    Pictures are data URIs, in the photograph's size. Lit regions are drawn over the photograph if
+    it is there.
     """
     better = {view: flags & (scene.change[view] > 0) for view, flags in lit.items()}
     view = max(lit, key=lambda name: int(lit[name].sum()))
@@ -57,19 +63,27 @@ def _map(own: Sequence[TrialPair], scene: SceneRegions, lit: dict[str, Flags]) -
     colours[lit[view]] = WORSE
     colours[better[view]] = BETTER
     grey = 255 * (1 - np.clip(scene.spread[view] / NOISY, 0, 1))
-    trial = own[0][0]
+    truth = read_truth(own[0][0], view)
+    size = tuple(SIDE * count for count in grey.shape) if truth is None else truth.shape[:2]
+    shown = _spread(colours, size)
+    if truth is not None:
+        shown = np.where(_spread(lit[view], size)[..., None], truth // 2 + shown // 2, truth)
     return {
-        "scene": trial.scene,
+        "scene": own[0][0].scene,
         "view": view,
         "seeds": len(own),
         "better": sum(int(flags.sum()) for flags in better.values()),
         "worse": sum(int((lit[name] & ~flags).sum()) for name, flags in better.items()),
         "regions": sum(flags.size for flags in lit.values()),
-        "truth": truth_uri(trial, view),
-        "lit": png_uri(_enlarged(colours)),
-        "noise": png_uri(_enlarged(np.repeat(grey[..., None], 3, axis=2).astype(np.uint8))),
+        "lit": jpeg_uri(shown),
+        "noise": jpeg_uri(_spread(grey.astype(np.uint8), size)),
     }
 
 
-def _enlarged(colours: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    return colours.repeat(MAP_SIDE, axis=0).repeat(MAP_SIDE, axis=1)
+def _spread(values: NDArray[Any], size: tuple[int, ...]) -> NDArray[Any]:
+    """The values of regions [R, C, …] at each pixel [H, W, …] of a view of this size."""
+    rows, columns = (
+        np.minimum(np.arange(pixels) // SIDE, count - 1)
+        for pixels, count in zip(size, values.shape, strict=False)
+    )
+    return values[np.ix_(rows, columns)]

@@ -3,6 +3,6 @@
     pairs, features, matches, geometry, mapping, alignment
 
 Each station imports only earlier ones. They exchange results in COLMAP's database (``database``),
-then as a model (``reconstruct``). ``init.sfm`` and ``init.dim`` differ in features and matches;
+then as a model (``models``). ``init.sfm`` and ``init.dim`` differ in features and matches;
 ``init.placed`` makes only new points, so it skips these stations.
 """

@@ -1,25 +1,33 @@
-"""Alignment of a model to the reference, pose errors, and the volume threshold in its units.
+"""Alignment of a model to the reference, and the errors of its poses.
 
-pycolmap's robust estimate of a similarity wants a tolerance in units of the model, and with a
-quarter of wrong cameras it was off by a quarter in scale, and other in each run.
+pycolmap's own estimates equal these to rounding, but have no result for cameras in a plane through
+the origin (such as a ring at height 0), and the robust one wants a tolerance in units of the model.
 """
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from gsbench.gaussians.paper_values import VOLUME_THRESHOLD
-from gsbench.init.base import Gauge, PoseErrors
-from gsbench.init.colmap.reconstruct import common_poses, poses_by_name
+from gsbench.init.base import PoseErrors
+from gsbench.init.colmap.models import posed_images, training_extent
+from gsbench.init.report import measure_gauge
 from gsbench.scene.colmap import save_model
-from gsbench.scene.types import Array, Capture, extent_of_centers
+from gsbench.scene.types import Array, Capture
+
+TRIALS = 500  # random triples of cameras
+# 2.5 sigma, as in least median of squares; the median absolute deviation times 1.4826 estimates
+# sigma.
+INLIER_FACTOR = 2.5 * 1.4826
+# second over first singular value of the centres: below it they count as collinear
+COLLINEAR_RATIO = 1e-2
+
+# centres [N, 3] and rotations [N, 3, 3] (world to camera) of a model's cameras, and the reference's
+CommonPoses = tuple[Array, Array, Array, Array]
 
 
 def align(
@@ -37,62 +45,105 @@ def align(
     """
     if reference is None:
         return {}
-    similarity = align_poses(*common_poses(model, reference))
+    poses = common_poses(model, reference)
+    similarity = align_poses(*poses)
     if similarity is None:
         few = "too few common cameras with the reference: poses are neither aligned nor compared"
-        return {"warnings": (few,)}
-    extent = training_extent(reference, capture)
-    errors = compare_poses(model, reference, similarity, extent, exact)
+        return {"warnings": [few]}
+    errors = compare_poses(poses, similarity, training_extent(reference, capture), exact)
+    scale = float(similarity.scale)
     if own_gauge is None:
-        return {"scale_to_reference": similarity.scale, "pose_errors": errors}
-    gauge = measure_gauge(training_extent(model, capture), similarity.scale)
+        return {"scale_to_reference": scale, "pose_errors": errors}
+    gauge = measure_gauge(training_extent(model, capture), scale)
     save_model(model, own_gauge)
-    rotation = pycolmap.Rotation3d(similarity.rotation)
-    model.transform(pycolmap.Sim3d(similarity.scale, rotation, similarity.translation))
+    model.transform(similarity)
     return {"scale_to_reference": 1.0, "own_gauge": gauge, "pose_errors": errors}
 
 
-def training_extent(model: pycolmap.Reconstruction, capture: Capture) -> float:
-    """3DGS's ``cameras_extent`` of the training images with a pose in the model, else 0."""
-    centers = training_centers(model, capture)
-    return extent_of_centers(centers) if len(centers) else 0.0
-
-
-def training_centers(model: pycolmap.Reconstruction, capture: Capture) -> Array:
-    """The centres [V, 3] of the training images with a pose in the model."""
-    poses = poses_by_name(model)
-    return np.array([poses[name][0] for name in capture.train_names if name in poses])
-
-
-def measure_gauge(extent: float, scale_to_reference: float | None) -> Gauge:
-    """Express the paper's V_th in the units of a model with the scene extent ``extent``."""
-    in_reference = None
-    if scale_to_reference is not None:
-        in_reference = VOLUME_THRESHOLD * scale_to_reference**3
-    # a sphere of volume V_th: 4/3 pi r^3 = V_th
-    radius = (3 * VOLUME_THRESHOLD / (4 * math.pi)) ** (1 / 3)
-    return Gauge(
-        scene_extent=extent,
-        scale_to_reference=scale_to_reference,
-        volume_threshold=VOLUME_THRESHOLD,
-        threshold_over_extent_cubed=VOLUME_THRESHOLD / extent**3 if extent > 0 else None,
-        threshold_radius=radius,
-        threshold_radius_over_extent=radius / extent if extent > 0 else None,
-        threshold_in_reference=in_reference,
+def common_poses(model: pycolmap.Reconstruction, reference: pycolmap.Reconstruction) -> CommonPoses:
+    """The poses of the images that have one in both models, by their names."""
+    own, others = posed_images(model), posed_images(reference)
+    names = sorted(own.keys() & others.keys())
+    centers, rotations, other_centers, other_rotations = (
+        np.array([read(images[name]) for name in names])
+        for images in (own, others)
+        for read in (
+            pycolmap.Image.projection_center,
+            lambda image: image.cam_from_world().rotation.matrix(),
+        )
     )
+    return centers, rotations, other_centers, other_rotations
+
+
+def align_poses(
+    source: Array, source_rotations: Array, target: Array, target_rotations: Array
+) -> pycolmap.Sim3d | None:
+    """The similarity from one model's cameras to another's, robust to wrong cameras.
+
+    It is fitted to the centres, by the least median of squared residuals over random triples, then
+    by least squares over the inliers. Collinear centres leave the rotation about their line open;
+    then the rotation comes from the cameras' orientations. None for less than three cameras, and if
+    the centres of one model coincide.
+    """
+    if len(source) < 3:
+        return None
+    spreads = np.array([_spread(source), _spread(target)])  # [2, 3]
+    if spreads[:, 0].min() <= 1e-12:
+        return None
+    if (spreads[:, 1] / spreads[:, 0]).min() < COLLINEAR_RATIO:
+        turns = Rotation.from_matrix(target_rotations).inv() * Rotation.from_matrix(
+            source_rotations
+        )
+        scale = float(np.divide(*np.linalg.norm(spreads[::-1], axis=1)))
+        return _with_means(scale, turns.mean(), source, target)  # the chordal mean
+    generator = np.random.default_rng(0)  # a fixed seed: the triples only guide the search
+    best = _misses(fit_similarity(source, target), source, target)  # [N]
+    for _ in range(TRIALS):
+        triple = generator.choice(len(source), 3, replace=False)
+        spread = _spread(source[triple])
+        if spread[1] > COLLINEAR_RATIO * spread[0]:
+            fitted = fit_similarity(source[triple], target[triple])
+            best = min(best, _misses(fitted, source, target), key=np.median)
+    # At least three cameras are inliers: residuals up to the median and, of three cameras, the
+    # third one's too, since a least-squares fit leaves residuals that add up to 0.
+    inliers = best <= max(INLIER_FACTOR * float(np.median(best)), 1e-9 * spreads[1, 0])
+    return fit_similarity(source[inliers], target[inliers])
+
+
+def fit_similarity(source: Array, target: Array) -> pycolmap.Sim3d:
+    """The least-squares similarity of ``source`` to ``target`` [N, 3] (Umeyama 1991, eq. 40-42)."""
+    offsets, target_offsets = source - source.mean(axis=0), target - target.mean(axis=0)
+    turn, _ = Rotation.align_vectors(target_offsets, offsets)
+    scale = float(np.sum(target_offsets * turn.apply(offsets)) / np.sum(offsets**2))
+    return _with_means(scale, turn, source, target)
+
+
+def _with_means(scale: float, turn: Rotation, source: Array, target: Array) -> pycolmap.Sim3d:
+    """The similarity that moves the mean of ``source`` to that of ``target``."""
+    shift = target.mean(axis=0) - scale * turn.apply(source.mean(axis=0))
+    return pycolmap.Sim3d(scale, pycolmap.Rotation3d(turn.as_matrix()), shift)
+
+
+def _misses(similarity: pycolmap.Sim3d, source: Array, target: Array) -> Array:
+    """Distances [N] of the transformed ``source`` from ``target`` [N, 3]."""
+    misses: Array = np.linalg.norm(similarity * source - target, axis=1)
+    return misses
+
+
+def _spread(centers: Array) -> Array:
+    """The singular values [3] of centres around their mean, largest first."""
+    spread: Array = np.linalg.svd(centers - centers.mean(axis=0), compute_uv=False)
+    return spread
 
 
 def compare_poses(
-    model: pycolmap.Reconstruction,
-    reference: pycolmap.Reconstruction,
-    similarity: Similarity,
-    reference_extent: float,
-    exact: bool,
+    poses: CommonPoses, similarity: pycolmap.Sim3d, reference_extent: float, exact: bool
 ) -> PoseErrors:
-    """Pose errors of ``model`` after ``similarity``, over the images with a pose in both models."""
-    centers, rotations, reference_centers, reference_rotations = common_poses(model, reference)
-    distances = similarity.misses(centers, reference_centers)  # [N]
-    angles = rotation_angles(rotations @ similarity.rotation.T, reference_rotations)  # [N]
+    """Errors of a model's poses after ``similarity``; the reference's extent is in its units."""
+    centers, rotations, true_centers, true_rotations = poses
+    distances = _misses(similarity, centers, true_centers)  # [N]
+    turned = Rotation.from_matrix(rotations @ similarity.rotation.matrix().T)
+    angles = np.degrees((turned * Rotation.from_matrix(true_rotations).inv()).magnitude())  # [N]
     rmse = float(np.sqrt(np.mean(distances**2)))
     return PoseErrors(
         num_images=len(distances),
@@ -104,112 +155,3 @@ def compare_poses(
         rotation_mean_deg=float(angles.mean()),
         rotation_max_deg=float(angles.max()),
     )
-
-
-RANSAC_TRIALS = 500
-# 2.5 sigma, as in least median of squares; the median absolute deviation times 1.4826 estimates
-# sigma.
-INLIER_FACTOR = 2.5 * 1.4826
-# second over first singular value of the centres: below it they count as collinear
-COLLINEAR_RATIO = 1e-2
-
-
-@dataclass(frozen=True, eq=False)
-class Similarity:
-    """``x_target = scale * rotation @ x_source + translation``."""
-
-    scale: float
-    rotation: Array  # [3, 3]
-    translation: Array  # [3]
-
-    def __call__(self, points: Array) -> Array:
-        """Transform ``points`` [N, 3]."""
-        return self.scale * points @ self.rotation.T + self.translation
-
-    def misses(self, source: Array, target: Array) -> Array:
-        """Distances [N] of the transformed ``source`` from ``target`` [N, 3]."""
-        distances: Array = np.linalg.norm(self(source) - target, axis=1)
-        return distances
-
-
-def fit_similarity(source: Array, target: Array) -> Similarity:
-    """The least-squares similarity of ``source`` to ``target`` [N, 3] (Umeyama 1991, eq. 40-42)."""
-    offsets, target_offsets = _centered(source), _centered(target)
-    u, singular_values, vt = np.linalg.svd(target_offsets.T @ offsets / len(source))
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
-    scale = float(singular_values @ signs / np.mean(np.sum(offsets**2, axis=1)))
-    return _with_means(scale, u @ np.diag(signs) @ vt, source, target)
-
-
-def _with_means(scale: float, rotation: Array, source: Array, target: Array) -> Similarity:
-    """The similarity that moves the mean of ``source`` to that of ``target``."""
-    return Similarity(scale, rotation, target.mean(axis=0) - scale * rotation @ source.mean(axis=0))
-
-
-def _centered(points: Array) -> Array:
-    return points - points.mean(axis=0)
-
-
-def _spread(centers: Array) -> NDArray[np.floating]:
-    """The singular values [3] of centres around their mean, largest first."""
-    return np.linalg.svd(_centered(centers), compute_uv=False)
-
-
-def align_poses(
-    source: Array, source_rotations: Array, target: Array, target_rotations: Array
-) -> Similarity | None:
-    """The similarity from one model's cameras to another's, robust to wrong cameras.
-
-    Centres are [N, 3] and rotations (world to camera) [N, 3, 3], in the same order of cameras. The
-    similarity is fitted to the centres, by the least median of squared residuals over random
-    triples, then by least squares over the inliers. Collinear centres leave the rotation about
-    their line open; then the rotation comes from the cameras' orientations. None for less than
-    three cameras, and if the centres of one model coincide.
-    """
-    if len(source) < 3:
-        return None
-    spreads = np.array([_spread(source), _spread(target)])
-    if spreads[:, 0].min() <= 1e-12:
-        return None
-    if (spreads[:, 1] / spreads[:, 0]).min() < COLLINEAR_RATIO:
-        return _fit_with_orientations(source, source_rotations, target, target_rotations)
-    misses = _least_median_fit(source, target).misses(source, target)
-    inliers = misses <= max(INLIER_FACTOR * float(np.median(misses)), 1e-9 * spreads[1, 0])
-    # At least three cameras are inliers: residuals up to the median and, of three cameras, the
-    # third one's too, since a least-squares fit leaves residuals that add up to 0.
-    return fit_similarity(source[inliers], target[inliers])
-
-
-def rotation_angles(first: Array, second: Array) -> Array:
-    """Angles [N] in degrees between rotations [N, 3, 3]."""
-    # The chord |A - B| = 2 sqrt(2) sin(angle / 2) is accurate near an angle of 0, the trace formula
-    # is not.
-    chords = np.linalg.norm(first - second, axis=(1, 2))  # Frobenius norm
-    return np.degrees(2 * np.arcsin(np.clip(chords / (2 * np.sqrt(2)), 0.0, 1.0)))
-
-
-def _least_median_fit(source: Array, target: Array) -> Similarity:
-    generator = np.random.default_rng(0)  # a fixed seed: the triples only guide the search
-    best = fit_similarity(source, target)
-    best_median = np.median(best.misses(source, target))
-    for _ in range(RANSAC_TRIALS):
-        triple = generator.choice(len(source), 3, replace=False)
-        spread = _spread(source[triple])
-        if spread[1] <= COLLINEAR_RATIO * spread[0]:
-            continue
-        candidate = fit_similarity(source[triple], target[triple])
-        median = np.median(candidate.misses(source, target))
-        if median < best_median:
-            best, best_median = candidate, median
-    return best
-
-
-def _fit_with_orientations(
-    source: Array, source_rotations: Array, target: Array, target_rotations: Array
-) -> Similarity:
-    """Fit the rotation to orientations (chordal mean), the rest to the centres."""
-    u, _, vt = np.linalg.svd((np.swapaxes(target_rotations, 1, 2) @ source_rotations).sum(axis=0))
-    rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-    rotated = _centered(source) @ rotation.T
-    scale = float(np.linalg.norm(_centered(target)) / np.linalg.norm(rotated))
-    return _with_means(scale, rotation, source, target)

@@ -12,6 +12,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from gsbench.init.base import FIELD_OF_VIEW_DEG
+from gsbench.init.colmap.models import posed_images
 from gsbench.init.colmap.pairs import select_pairs
 from gsbench.init.options import ColmapOptions
 from gsbench.scene.colmap import rescaled_camera
@@ -87,9 +88,8 @@ def linked(files: Mapping[str, Path], folder: Path) -> Path:
 def reference_camera_groups(reference: pycolmap.Reconstruction) -> list[CameraGroup]:
     """The reference's cameras, marked as known, each with the sorted names of its posed images."""
     groups: dict[int, list[str]] = {}
-    for image in sorted(reference.images.values(), key=lambda image: image.name):
-        if image.has_pose:
-            groups.setdefault(image.camera_id, []).append(image.name)
+    for name, image in sorted(posed_images(reference).items()):
+        groups.setdefault(image.camera_id, []).append(name)
     result = []
     for camera_id, names in groups.items():
         original = reference.cameras[camera_id]

@@ -24,10 +24,10 @@ from gsbench.init.base import REGISTERED_SHARE, UnplacedError
 from gsbench.init.colmap import database as colmap_database
 from gsbench.init.colmap import matches
 from gsbench.init.colmap.database import DatabaseTask
+from gsbench.init.colmap.models import posed_images
 from gsbench.init.options import ColmapOptions
 from gsbench.logs import Progress
 from gsbench.scene.rules import MIN_IMAGES
-from gsbench.scene.types import Array
 
 SMALL_ANGLE_DEG = 2.0  # triangulation angle of the initial pair; COLMAP's default is 16
 # focal length over the longest side: lenses of 27, 36 and 50 mm on 35 mm film
@@ -97,19 +97,18 @@ def map_images(
     best, best_size = None, (0, 0)
     tried: list[str] = []  # each strategy with the images of its largest model, and its fault
     faulty: list[str] = []
-    for strategy, run in _Mapper(task, output, options, progress, total).strategies():
-        models = [(measure_geometry(model), model) for model in run()]
-        sound = [made for made in models if not made[0].fault]
-        if not models:
-            tried.append(f"{strategy} 0")
-            continue
-        geometry, model = max(sound or models, key=lambda made: made[0].size)
-        tried.append(f"{strategy} {geometry.images}")
-        if not sound:
-            tried[-1] += f" ({geometry.fault})"
-            faulty.append(tried[-1])
-        elif best is None or geometry.size > best_size:
-            best, best_size = Mapped(model, len(sound), strategy, []), geometry.size
+    for strategy, models in _Mapper(task, output, options, progress, total).strategies():
+        made = [(measure_geometry(model), model) for model in models]
+        sound = [one for one in made if not one[0].fault]
+        tried.append(f"{strategy} 0")
+        if made:
+            geometry, model = max(sound or made, key=lambda one: one[0].size)
+            tried[-1] = f"{strategy} {geometry.images}"
+            if not sound:
+                tried[-1] += f" ({geometry.fault})"
+                faulty.append(tried[-1])
+            elif geometry.size > best_size:
+                best, best_size = Mapped(model, len(sound), strategy, []), geometry.size
         if best_size[0] >= REGISTERED_SHARE * total:
             break
     if best is None and faulty:
@@ -145,19 +144,19 @@ class _Mapper:
     progress: Progress
     total: int
 
-    def strategies(self) -> Iterator[tuple[str, Callable[[], Models]]]:
-        """The strategies of ``init.mapper`` in the order of trying: names and functions."""
+    def strategies(self) -> Iterator[tuple[str, Models]]:
+        """The strategies of ``init.mapper`` with their models; each runs when it is reached."""
         mapper, database = self.options.mapper, self.task.database
         if mapper != "global":
-            yield "incremental", partial(self.incremental, database)
+            yield "incremental", self.incremental(database)
         if mapper == "auto":
-            small = partial(self.incremental, database, SMALL_ANGLE_DEG)
-            yield f"incremental from {SMALL_ANGLE_DEG:g} degrees", small
+            small = SMALL_ANGLE_DEG
+            yield f"incremental from {small:g} degrees", self.incremental(database, small)
         if mapper != "incremental":
-            yield "global", self.global_mapping
+            yield "global", self.global_mapping()
         if mapper == "auto" and colmap_database.cameras_without_prior(database):
             for factor in FOCAL_FACTORS:
-                assumed = partial(self.with_assumed_focal_lengths, factor)
+                assumed = self.with_assumed_focal_lengths(factor)
                 yield f"focal length {factor:g} x the longest side", assumed
 
     def incremental(self, database: Path, initial_angle: float | None = None) -> Models:
@@ -215,33 +214,26 @@ class _Mapper:
 
 def measure_geometry(model: pycolmap.Reconstruction) -> Geometry:
     """Measure the rays and depths of a model."""
-    poses = {image.image_id: image for image in model.images.values() if image.has_pose}
-    centers = {image_id: image.projection_center() for image_id, image in poses.items()}
-    axes = {image_id: image.viewing_direction() for image_id, image in poses.items()}
-    depths: dict[int, list[float]] = {}  # of the points that each image sees
-    angles = []
+    centers, depths, angles = {}, [], []
+    for image in posed_images(model).values():
+        centers[image.image_id] = image.projection_center()
+        seen = [model.points3D[at.point3D_id].xyz for at in image.get_observation_points2D()]
+        if seen:
+            depths.append(float(np.median((image.cam_from_world() * np.array(seen))[:, 2])))
     for point in model.points3D.values():
-        seen_by = [element.image_id for element in point.track.elements]
-        rays = point.xyz - np.array([centers[image_id] for image_id in seen_by]).reshape(-1, 3)
-        for image_id, ray in zip(seen_by, rays, strict=True):  # [3]
-            depths.setdefault(image_id, []).append(float(ray @ axes[image_id]))
-        if len(seen_by) > 1:
-            angles.append(_widest_angle(rays))
-    # no depth is 0 or less in a sound model, so such a median makes the spread infinite
-    medians = [float(np.median(own)) for own in depths.values()]
-    low, high = np.percentile(medians, [5, 95]) if medians else (math.nan, math.nan)
+        seen_from = [centers[element.image_id] for element in point.track.elements]
+        if len(seen_from) > 1:
+            rays = point.xyz - np.array(seen_from)
+            rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+            angles.append(np.degrees(np.arccos(np.clip(rays @ rays.T, -1, 1)).max()))  # widest
+    low, high = np.percentile(depths, [5, 95]) if depths else (math.nan, math.nan)
     return Geometry(
         images=len(depths),
         points=model.num_points3D(),
         angle=float(np.median(angles)) if angles else math.nan,
+        # no depth is 0 or less in a sound model
         depth_spread=float(high / low) if low > 0 else math.inf,
     )
-
-
-def _widest_angle(rays: Array) -> float:
-    """The widest angle between two rays [T, 3], in degrees."""
-    rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-    return float(np.degrees(np.arccos(np.clip(rays @ rays.T, -1, 1)).max()))
 
 
 def triangulate(

@@ -6,9 +6,10 @@ Matching uses several cores by processes instead of threads, since COLMAP's matc
 two threads in one process. Its nearest-neighbour search (faiss) calls a BLAS that pycolmap's wheels
 build for one thread and without locks. Two simultaneous calls can corrupt each other's numbers:
 rarely, and mostly on a busy machine, a pair loses some or most of its matches. With one thread for
-each process, matches are repeatable to the bit; COLMAP's brute force took 24 times as long. Each
-call builds a search index for each of its images, which costs more than matching a pair, so the
-pairs are divided into parts with few images.
+each process, matches are repeatable to the bit. (COLMAP's brute force, which is repeatable on
+threads, takes 21 times as long, and 3 % of its matches are others.) Each call builds a search index
+for each of its images, which costs more than matching a pair, so the pairs are divided into parts
+with few images.
 """
 
 from __future__ import annotations
@@ -16,39 +17,27 @@ from __future__ import annotations
 import math
 import shutil
 import sqlite3
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from itertools import chain
 from pathlib import Path
-from typing import NamedTuple
 
 import pycolmap
 
 from gsbench.init.colmap.database import DatabaseTask, image_ids, writable
 from gsbench.init.options import ColmapOptions, SiftOptions
 from gsbench.logs import Progress
-from gsbench.system.isolate import run_with_progress
+from gsbench.system.isolate import run_isolated
 
 MAX_BLOCK = 16  # images on each side of a part; with more, progress would be reported too rarely
 PARTS_PER_PROCESS = 6  # enough that processes end at about the same time
 FEATURE_TABLES = ("keypoints", "descriptors")
-DROP_FEATURES = ";".join(f"DELETE FROM {table}" for table in FEATURE_TABLES)
-MATCH_TABLES = ("matches", "two_view_geometries")
+DROP_FEATURES = [f"DELETE FROM {table}" for table in FEATURE_TABLES]
+COPY = "INSERT INTO main.{0} SELECT * FROM source.{0}"
+MATCHES = [COPY.format(table) for table in ("matches", "two_view_geometries")]
 
 IdPair = tuple[int, int]
-
-
-class MatchingJob(NamedTuple):
-    """Inputs of a matching process: ``parts``, lists of pairs of ids, to match into ``result``.
-
-    ``features`` is the database with keypoints and descriptors. ``result`` is a copy without them.
-    """
-
-    features: Path
-    result: Path
-    parts: list[list[IdPair]]
-    sift: SiftOptions
 
 
 def match_sift(
@@ -71,52 +60,74 @@ def match_sift(
     )
     empty = folder / "empty.db"
     shutil.copyfile(database, empty)
-    _run_sql(empty, DROP_FEATURES, "VACUUM")
+    _run_sql(empty, *DROP_FEATURES)
+    _run_sql(empty, "VACUUM")
     with writable(empty) as opened:
         for image in opened.read_all_images():
             # COLMAP splits the lines of its pair lists at spaces, which names often contain
             image.name = str(image.image_id)
             opened.update_image(image)
-    jobs = []
-    for index, share in enumerate(distribute_parts(parts, processes)):
-        jobs.append(MatchingJob(database, folder / f"matches-{index}.db", share, sift))
-        shutil.copyfile(empty, jobs[-1].result)
+    shares = distribute_parts(parts, processes)
+    results = [Path(shutil.copyfile(empty, folder / f"{k}.db")) for k in range(len(shares))]
+    matched = [0] * len(shares)
+
+    def run(index: int) -> None:
+        def report_sum(phase: str, done: int, total: int | None, note: str = "") -> None:
+            matched[index] = done
+            progress(phase, sum(matched), len(pairs))
+
+        given = database, results[index], shares[index], sift
+        run_isolated(match_parts, *given, what="matching", progress=report_sum)
+
     progress("match", 0, len(pairs))
-    if len(jobs) == 1:
-        match_parts(jobs[0], progress)
+    if len(shares) == 1:
+        match_parts(database, results[0], shares[0], sift, progress)
     else:
-        _match_in_processes(jobs, len(pairs), progress)
-    for job in jobs:
-        _insert(database, job.result, MATCH_TABLES)
+        with ThreadPoolExecutor(len(shares)) as pool:
+            list(pool.map(run, range(len(shares))))
+    for result in results:
+        _run_sql(database, *MATCHES, source=result)
     shutil.rmtree(folder)
 
 
-def match_parts(job: MatchingJob, progress: Progress) -> None:
-    """Match and verify the parts in turn. Calls native code that can abort: run it isolated."""
+def match_parts(
+    features: Path,
+    result: Path,
+    parts: Sequence[Sequence[IdPair]],
+    sift: SiftOptions,
+    progress: Progress,
+) -> None:
+    """Match and verify ``parts``, lists of pairs of ids, in turn, into the database ``result``.
+
+    It is a copy, without features, of the database ``features``. Calls native code that can abort:
+    run it isolated.
+    """
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.WARNING)
     options = pycolmap.FeatureMatchingOptions(
         {
             "use_gpu": False,
             "num_threads": 1,  # see the module's docstring
-            "guided_matching": job.sift.guided_matching,
-            "sift": {"max_ratio": job.sift.max_ratio, "cross_check": job.sift.cross_check},
+            "guided_matching": sift.guided_matching,
+            "sift": {"max_ratio": sift.max_ratio, "cross_check": sift.cross_check},
         }
     )
     pairing = pycolmap.ImportedPairingOptions()
-    pairing.match_list_path = job.result.with_suffix(".pairs.txt")
-    done, total = 0, sum(map(len, job.parts))
-    for part in job.parts:
-        _insert(job.result, job.features, FEATURE_TABLES, {*chain.from_iterable(part)})
+    pairing.match_list_path = result.with_suffix(".pairs.txt")
+    done, total = 0, sum(map(len, parts))
+    for part in parts:
+        images = ", ".join(map(str, {*chain.from_iterable(part)}))
+        copies = [f"{COPY.format(table)} WHERE image_id IN ({images})" for table in FEATURE_TABLES]
+        _run_sql(result, *copies, source=features)
         lines = [f"{first} {second}\n" for first, second in part]
         pairing.match_list_path.write_text("".join(lines))
         pycolmap.match_image_pairs(
-            job.result,
+            result,
             matching_options=options,
             pairing_options=pairing,
-            verification_options=verification_options(job.sift),
+            verification_options=verification_options(sift),
             device=pycolmap.Device.cpu,
         )
-        _run_sql(job.result, DROP_FEATURES)
+        _run_sql(result, *DROP_FEATURES)
         done += len(part)
         progress("match", done, total)
 
@@ -144,10 +155,8 @@ def divide_pairs(pairs: Sequence[IdPair], block: int) -> list[list[IdPair]]:
 
 def distribute_parts(parts: Sequence[list[IdPair]], processes: int) -> list[list[list[IdPair]]]:
     """Distribute parts over at most ``processes`` shares with about equally many pairs."""
-    shares: list[list[list[IdPair]]] = [[] for _ in range(max(1, min(processes, len(parts))))]
-    for part in sorted(parts, key=len, reverse=True):
-        min(shares, key=lambda share: sum(map(len, share))).append(part)
-    return shares
+    ordered = sorted(parts, key=len, reverse=True)
+    return [ordered[start::processes] for start in range(max(1, min(processes, len(parts))))]
 
 
 def _block_size(images: int, processes: int) -> int:
@@ -157,38 +166,14 @@ def _block_size(images: int, processes: int) -> int:
     return min(max(math.ceil(images / blocks), 2), MAX_BLOCK)
 
 
-def _match_in_processes(jobs: Sequence[MatchingJob], count: int, progress: Progress) -> None:
-    matched = [0] * len(jobs)
-
-    def run(index: int) -> None:
-        def report_sum(phase: str, done: int, total: int | None, note: str = "") -> None:
-            matched[index] = done
-            progress(phase, sum(matched), count)
-
-        run_with_progress(match_parts, jobs[index], report_sum, what="matching")
-
-    with ThreadPoolExecutor(len(jobs)) as pool:
-        list(pool.map(run, range(len(jobs))))
-
-
-def _run_sql(path: Path, *scripts: str) -> None:
+def _run_sql(path: Path, *statements: str, source: Path | None = None) -> None:
+    """Run SQL on a database, in one transaction, with another attached as ``source``."""
     with closing(sqlite3.connect(path)) as connection:
-        for script in scripts:
-            connection.executescript(script)
-
-
-def _insert(
-    target: Path, source: Path, tables: Sequence[str], images: Collection[int] | None = None
-) -> None:
-    """Copy the rows of ``tables`` from ``source`` to ``target``, of all images or of some ids."""
-    condition = "" if images is None else f" WHERE image_id IN ({', '.join(map(str, images))})"
-    with closing(sqlite3.connect(target)) as connection:
-        connection.execute("ATTACH DATABASE ? AS source", (str(source),))
+        if source:
+            connection.execute("ATTACH DATABASE ? AS source", (str(source),))
         with connection:
-            for table in tables:
-                connection.execute(
-                    f"INSERT INTO main.{table} SELECT * FROM source.{table}{condition}"
-                )
+            for statement in statements:
+                connection.execute(statement)
 
 
 def verification_options(options: ColmapOptions) -> pycolmap.TwoViewGeometryOptions:

@@ -77,31 +77,26 @@ def count_agreements(descriptors: Sequence[NDArray[np.generic]]) -> NDArray[np.i
     Descriptors are whole numbers here, and their products stay below 2^24. They are exact in
     float32, so the counts are the same on every machine and with any number of threads.
     """
-    count = len(descriptors)
-    width = max(part.shape[1] for part in descriptors)
-    table = np.zeros((count, STRONGEST, width), dtype=np.float32)
-    # infinite for empty rows, which are then never the nearest
-    squares = np.full((count, STRONGEST), np.inf, dtype=np.float32)
-    for index, part in enumerate(descriptors):
-        strongest = part[:STRONGEST].astype(np.float32)
+    tables = [part[:STRONGEST].astype(np.float32) for part in descriptors]
+    for k, part in enumerate(descriptors):
         if part.dtype.kind == "f":
-            strongest = (QUANTUM * strongest).round()
-        table[index, : len(strongest)] = strongest
-        squares[index, : len(strongest)] = (strongest**2).sum(axis=1)
-    agreements = np.zeros((count, count), dtype=np.int64)
-    rows = np.arange(STRONGEST)
-    for i in range(count - 1):
+            tables[k] = (QUANTUM * tables[k]).round()
+    squares = [(table**2).sum(axis=1) for table in tables]
+    agreements = np.zeros((len(tables), len(tables)), dtype=np.int64)
+    for i, table in enumerate(tables[:-1]):
+        rows, ends = np.arange(len(table)), np.cumsum([len(other) for other in tables[i + 1 : -1]])
         # one large product is faster than many small ones
-        products = table[i] @ table[i + 1 :].reshape(-1, width).T
-        distances = squares[i][:, None] + squares[i + 1 :].reshape(-1) - 2 * products
-        distances = distances.reshape(STRONGEST, -1, STRONGEST)  # [S, J, S]
-        nearest = distances.argmin(axis=2)  # [S, J]
-        nearest_back = distances.argmin(axis=0)  # [J, S]
-        mutual = np.take_along_axis(nearest_back, nearest.T, axis=1) == rows  # [J, S]
-        best = np.take_along_axis(distances, nearest[..., None], axis=2)[..., 0]
-        np.put_along_axis(distances, nearest[..., None], np.inf, axis=2)
-        distinct = best < SQUARED_RATIO * distances.min(axis=2)  # [S, J]
-        agreements[i, i + 1 :] = np.count_nonzero(mutual & distinct.T, axis=1)
+        products = np.split(table @ np.concatenate(tables[i + 1 :]).T, ends, axis=1)
+        for j, product in enumerate(products, i + 1):
+            if not product.size:
+                continue
+            distances = squares[i][:, None] + squares[j] - 2 * product  # [S, S]
+            nearest = distances.argmin(axis=1)
+            mutual = distances.argmin(axis=0)[nearest] == rows
+            best = distances[rows, nearest]
+            distances[rows, nearest] = np.inf
+            distinct = best < SQUARED_RATIO * distances.min(axis=1)
+            agreements[i, j] = np.count_nonzero(mutual & distinct)
     return agreements
 
 

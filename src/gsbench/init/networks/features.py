@@ -9,21 +9,17 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
-from typing import BinaryIO, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbench.errors import GsbenchError
 from gsbench.files import DAMAGE, atomic, file_sha256
 from gsbench.scene.types import Capture
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,15 +51,12 @@ class Features:
         height, width = mask.shape
         columns, rows = np.floor(self.colmap_keypoints).astype(np.int64).T  # [K] each
         kept = mask[rows.clip(0, height - 1), columns.clip(0, width - 1)]
-        return self[kept]
-
-    def __getitem__(self, chosen: slice | NDArray[np.bool_]) -> Features:
-        """The features with the ``chosen`` indices."""
-        arrays = self.keypoints[chosen], self.descriptors[chosen], self.scores[chosen]
+        arrays = self.keypoints[kept], self.descriptors[kept], self.scores[kept]
         return Features(*arrays, self.network_size, self.file_size)
 
 
 KEY_DIGITS = 24
+ARRAYS = ("keypoints", "descriptors", "scores")
 FORMAT_VERSION = 1  # to be raised when the same settings give different features
 Matches = NDArray[np.uint32]  # indices [M, 2] of keypoints in the first and the second image
 
@@ -72,17 +65,27 @@ class FeatureStore:
     """Store of features and matches in ``folder``: ``features/<key>.npz``, ``matches/<key>.npy``.
 
     ``extraction`` and ``matching`` are the settings (plain values) that features and matches of the
-    ``capture`` depend on.
+    ``capture`` depend on. What is missing or damaged is computed by ``extract`` and ``match``;
+    features of up to ``room`` images are kept in memory.
     """
 
     def __init__(
-        self, folder: Path, capture: Capture, extraction: object, matching: object
+        self,
+        folder: Path,
+        capture: Capture,
+        extraction: object,
+        matching: object,
+        extract: Callable[[str], Features],
+        match: Callable[[Features, Features], Matches],
+        room: int,
     ) -> None:
         self.folder, self.capture = folder, capture
         self._extraction, self._matching = extraction, matching
+        self._extract, self._match = extract, match
         for part in ("features", "matches"):
             (folder / part).mkdir(parents=True, exist_ok=True)
         self._image_key = cache(self._hash_image)
+        self.features = lru_cache(room)(self._features)
 
     def features_path(self, name: str) -> Path:
         """The features file of the image ``name``."""
@@ -93,53 +96,31 @@ class FeatureStore:
         key = _key([*map(self._image_key, (first, second)), self._matching])
         return self.folder / "matches" / f"{key}.npy"
 
-    def read_features(self, name: str) -> Features | None:
-        """The stored features, or None if the file is missing or damaged."""
-        try:
-            with np.load(self.features_path(name), allow_pickle=False) as data:
-                width, height, file_width, file_height = (int(side) for side in data["sizes"])
-                arrays = data["keypoints"], data["descriptors"], data["scores"]
-                return Features(*arrays, (width, height), (file_width, file_height))
-        except DAMAGE:
-            return None  # the file is made again
-
-    def read_matches(self, first: str, second: str) -> Matches | None:
-        """The stored matches of a pair, or None if the file is missing or damaged."""
-        try:
-            matches = np.load(self.matches_path(first, second), allow_pickle=False)
-        except DAMAGE:
-            return None
-        return matches if matches.ndim == 2 and matches.shape[1] == 2 else None
-
-    def write_features(self, name: str, features: Features) -> None:
-        """Store the features of the image ``name``."""
-        sizes = np.array([*features.network_size, *features.file_size])
-        arrays = {key: getattr(features, key) for key in ("keypoints", "descriptors", "scores")}
-        with self._written(self.features_path(name)) as file:
-            np.savez(file, sizes=sizes, **arrays)
-
-    def write_matches(self, first: str, second: str, matches: Matches) -> None:
-        """Store the matches of a pair."""
-        with self._written(self.matches_path(first, second)) as file:
-            np.save(file, matches)
-
-    def features(self, name: str) -> Features:
-        """The stored features; raises ``GsbenchError`` if they are missing."""
-        return self._found(self.read_features(name), f"features of {name}")
+    def _features(self, name: str) -> Features:
+        """The features of an image."""
+        path = self.features_path(name)
+        with suppress(*DAMAGE), np.load(path, allow_pickle=False) as data:
+            width, height, own_width, own_height = (int(side) for side in data["sizes"])
+            arrays = {name: data[name] for name in ARRAYS}
+            own = own_width, own_height
+            return Features(**arrays, network_size=(width, height), file_size=own)
+        found = self._extract(name)
+        both = np.array([*found.network_size, *found.file_size])
+        with atomic(path, sync=False) as temporary, temporary.open("wb") as file:
+            np.savez(file, sizes=both, **{name: getattr(found, name) for name in ARRAYS})
+        return found
 
     def matches(self, first: str, second: str) -> Matches:
-        """The stored matches of a pair; raises ``GsbenchError`` if they are missing."""
-        return self._found(self.read_matches(first, second), f"matches of {first} and {second}")
-
-    def _found(self, stored: T | None, what: str) -> T:
-        if stored is None:
-            raise GsbenchError(f"the stored {what} are gone from {self.folder}: run again")
-        return stored
-
-    @contextmanager
-    def _written(self, path: Path) -> Iterator[BinaryIO]:
+        """The matches of a pair of images."""
+        path = self.matches_path(first, second)
+        with suppress(*DAMAGE):
+            stored: Matches = np.load(path, allow_pickle=False)
+            if stored.ndim == 2 and stored.shape[1] == 2:
+                return stored
+        found = self._match(self.features(first), self.features(second))
         with atomic(path, sync=False) as temporary, temporary.open("wb") as file:
-            yield file
+            np.save(file, found)
+        return found
 
     def _hash_image(self, name: str) -> str:
         masks = self.capture.masks

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,6 @@ from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.init.networks.features import Features, Matches
-from gsbench.init.networks.options import NetworkOptions
 from gsbench.scene.images import read_image, resize_image
 from gsbench.scene.options import downscaled_size
 from gsbench.system.install import install_command
@@ -26,7 +25,7 @@ LIGHTGLUE_DETECTOR_PREFIX = "keypoint_detector."
 # Finds features in an image [1, 3, H, W], RGB in [0, 1]: keypoints [K, 2] in px with the centre of
 # the first pixel at (0, 0), descriptors [K, D] and scores [K].
 Found = tuple[Tensor, Tensor, Tensor]
-Settings = Mapping[str, Any]  # `NetworkOptions.extraction`
+Settings = Mapping[str, Any]  # `Dim.extraction`
 Extractor = Callable[[Tensor], Found]
 
 
@@ -208,15 +207,15 @@ def lightglue_matcher(
 
 
 def build_matcher(
-    options: NetworkOptions, weights: Sequence[Path], device: torch.device
+    extraction: Settings, matching: Settings, weights: Path, device: torch.device
 ) -> Matcher:
-    """The matcher of ``options``; the last of the ``weights`` is LightGlue's checked file.
+    """The matcher of `Dim.matching`; ``weights`` is LightGlue's checked file, if it needs one.
 
     Raises ``MissingWeightsError`` if the file does not fit the network.
     """
-    if options.matcher == "mutual_nearest":
-        return mutual_nearest_matcher(options.max_ratio, device)
-    return lightglue_matcher(options.extractor, options.filter_threshold, weights[-1], device)
+    if matching["matcher"] == "mutual_nearest":
+        return mutual_nearest_matcher(matching["max_ratio"], device)
+    return lightglue_matcher(extraction["extractor"], matching["filter_threshold"], weights, device)
 
 
 def match(matcher: Matcher, first: Features, second: Features) -> Matches:

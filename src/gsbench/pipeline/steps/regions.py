@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gsbench.errors import InputError
-from gsbench.eval.regions import DISTANCE, Depth, Regions, depths_of_points, regions_by_distance
+from gsbench.eval.options import DISTANCE
+from gsbench.eval.regions import Depth, Regions, depths_of_points, regions_by_distance
 from gsbench.init.base import MODEL_FOLDER
 from gsbench.pipeline.steps.scene import Views
 from gsbench.scene.beside import DEPTH, digests, files_beside, pixels_of_view, view_of_file
@@ -113,7 +114,8 @@ def region_masks(capture: Capture, parts: Parts) -> dict[str, dict[str, Path]]:
 
 
 def _sensor_depths(capture: Capture) -> dict[str, Path]:
-    return {name: capture.depths[name] for name in capture.test_names if name in capture.depths}
+    depths = capture.beside.get(DEPTH, {})
+    return {name: depths[name] for name in capture.test_names if name in depths}
 
 
 # Read before the training, to refuse a scene, and after it. The fingerprint covers its content.

@@ -64,18 +64,19 @@ def step_rows(values, first, second, gradients, begin, end, own, active, factor,
 
 
 @kernel
-def adam_rows(spare, begin, end, values, first, second, gradients, active, factor, root):
-    """`step_rows` for the rows ``begin`` to before ``end`` of arrays [N, C]."""
-    step_rows(values, first, second, gradients, begin, end, begin, active, factor, root, spare)
+def adam_rows(first, past, spare, values, means, squares, gradients, active, factor, root):
+    """`step_rows` for the shards ``first`` to ``past`` of arrays [N, C]; ``spare`` [shards, 64]."""
+    begin, end = len(values) * first // len(spare), len(values) * past // len(spare)
+    own = spare[first]
+    step_rows(values, means, squares, gradients, begin, end, begin, active, factor, root, own)
 
 
 @inlined
-def step_all(gaussians, adam, gradients, begin, end, spare):
-    """Step the Gaussians ``begin`` to before ``end``; row 0 of ``gradients`` is of ``begin``."""
+def step_all(gaussians, adam, gradients, begin, end, own, spare):
+    """Step the Gaussians ``begin`` to before ``end``; ``gradients`` has these from row ``own``."""
     for k in range(len(gaussians)):
         values = gaussians[k]
         active = adam.active if k == at.SH_REST else values.shape[1]
         a, b = adam.factors[k, 0], adam.factors[k, 1]
-        step_rows(
-            values, adam.first[k], adam.second[k], gradients[k], begin, end, 0, active, a, b, spare
-        )
+        means, squares, own_rows = adam.first[k], adam.second[k], gradients[k]
+        step_rows(values, means, squares, own_rows, begin, end, own, active, a, b, spare)

@@ -166,17 +166,17 @@ def _touched_blocks(records, base, tile_x, tile_y, column, row):
 
 
 @kernel
-def composite_tiles(memory, first, past, frame, image, alpha):
-    """Blend the tiles ``first`` to ``past`` into ``image`` [H * W * 3] and ``alpha`` [H * W].
+def composite_tiles(first, past, memory, frame, image, alpha):
+    """Blend the shards ``first`` to ``past`` into ``image`` [H * W * 3] and ``alpha`` [H * W].
 
     It fills ``masks``, ``processed``, ``transmittance`` and ``last`` of ``frame`` for the backward
     pass. ``last`` is `NEVER_STOPPED` for pixels that no entry stopped, and 0 outside the image.
     """
-    floats, integers = memory
+    floats, integers = memory[0][first], memory[1][first]
     planes, batch = _planes(floats), floats[3 * at.TILE_PIXELS :]  # batch: [BATCH * RECORD]
     # [16] pixels that have not stopped, by block; [BATCH] blocks, by entry
     live, touched = integers[:LANES], integers[LANES:].view(np.uint16)
-    for tile in range(first, past):
+    for tile in range(frame.bounds[first], frame.bounds[past]):
         left, top = _origin(tile, frame.camera.tiles_x)
         state = tile * at.TILE_PIXELS
         alive = _start_blocks(left, top, state, frame, planes, live)
@@ -335,8 +335,8 @@ def place_in_tile(x, y):
 
 
 @kernel
-def composite_backward_tiles(memory, first, past, frame, g_image, g_alpha, all_rows, want_absolute):
-    """Add the gradient sums of the tiles ``first`` to ``past``, back to front, to ``all_rows``.
+def composite_backward_tiles(first, past, memory, frame, g_image, g_alpha, all_rows, want_absolute):
+    """Add the gradient sums of the shards ``first`` to ``past``, back to front, to ``all_rows``.
 
     c is the colour of a record, g the gradient of the pixel, T the transmittance before the record.
     U is the sum over the later records and the background of (c . g) alpha T, divided by the
@@ -350,11 +350,11 @@ def composite_backward_tiles(memory, first, past, frame, g_image, g_alpha, all_r
     compilation.
     """
     entries, masks, records = frame.entries, frame.masks, frame.records
-    floats, _ = memory
+    floats = memory[0][first]
     planes = _planes(floats)  # the gradient of the image
     # U, and T behind the current record
     behind, through = floats[3 * at.TILE_PIXELS :], floats[4 * at.TILE_PIXELS :]
-    for tile in range(first, past):
+    for tile in range(frame.bounds[first], frame.bounds[past]):
         rows = all_rows[frame.tile_shard[tile]]
         left, top = _origin(tile, frame.camera.tiles_x)
         tile_x, tile_y = np.float32(left), np.float32(top)
@@ -482,16 +482,16 @@ def _place_image(image, left, top, width, height, out):
 
 
 @kernel
-def cover_tiles(memory, first, past, frame, values, covered, sums, distances):
-    """Add the footprints of the tiles ``first`` to ``past`` to the sums of their shards.
+def cover_tiles(first, past, memory, frame, values, covered, sums, distances):
+    """Add the footprints of the shards of tiles ``first`` to ``past`` to their sums.
 
     The sums are ``covered`` [shards, N] int32, ``sums`` and ``distances`` [shards, N]. ``values``
     is [H * W]; if it is empty, all values are 0.
     """
     entries, masks, records = frame.entries, frame.masks, frame.records
-    floats, _ = memory
+    floats = memory[0][first]
     own, row = floats[: at.TILE_PIXELS], floats[at.TILE_PIXELS :]
-    for tile in range(first, past):
+    for tile in range(frame.bounds[first], frame.bounds[past]):
         left, top = _origin(tile, frame.camera.tiles_x)
         state = tile * at.TILE_PIXELS
         begin = frame.starts[tile]
@@ -530,7 +530,7 @@ def choose_median_tiles(first, past, frame, chosen):
     """
     width, height = frame.camera.width, frame.camera.height
     records = frame.records
-    for tile in range(first, past):
+    for tile in range(frame.bounds[first], frame.bounds[past]):
         left, top = _origin(tile, frame.camera.tiles_x)
         for y in range(top, min(top + at.TILE, height)):
             for x in range(left, min(left + at.TILE, width)):

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -104,14 +103,10 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         keys = arena.take("keys", (count,), np.uint64)
         flags = np.zeros((GAUSSIAN_SHARDS, 2), np.int64)
         edges, arrays = _edges(count), parameter_arrays(gaussians)
-        projected = (records, record_ints, keys, radii.numpy(), flags)
-
-        def project(first: int, past: int) -> None:
-            project_shards(
-                at.kernel_memory(), first, past, edges, arrays, request.degree, view, *projected
-            )
-
-        self._runner.run(GAUSSIAN_SHARDS, project)
+        inputs = edges, arrays, request.degree, view
+        outputs = records, record_ints, keys, radii.numpy(), flags
+        memory = at.kernel_memory(GAUSSIAN_SHARDS)
+        self._runner.run(GAUSSIAN_SHARDS, project_shards, memory, *inputs, *outputs)
         # The kernels only notice that some value is bad; this search names it.
         if flags[:, BAD_VALUE].any():
             raise_for_values(gaussians)
@@ -119,14 +114,8 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         visible = flags[:, VISIBLE].copy()
         order = arena.take("order", (int(visible.sum()),), np.uint64)
         spare = arena.take("spare", order.shape, np.uint64)
-        sort_by_depth(
-            edges[:-1],
-            visible,
-            keys,
-            order,
-            spare,
-            np.empty((PASSES, BUCKETS), np.int64),
-        )
+        digits = np.empty((PASSES, BUCKETS), np.int64)
+        sort_by_depth(edges[:-1], visible, keys, order, spare, digits)
         starts, entries = self._list_tiles(arena, view, order, records)
         tiles, total = view.tiles_x * view.tiles_y, len(entries)
         frame = at.CpuFrame(
@@ -145,11 +134,8 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         )
         balance_tiles(starts, TILE_SHARDS, frame.bounds, frame.tile_shard)
         pixels = image.numpy().reshape(-1), alpha.numpy().reshape(-1)
-
-        def composite(first: int, past: int) -> None:
-            composite_tiles(*_tiles(frame, first, past), *pixels)
-
-        self._runner.run(TILE_SHARDS, composite)
+        memory = at.kernel_memory(TILE_SHARDS)
+        self._runner.run(TILE_SHARDS, composite_tiles, memory, frame, *pixels)
         return image, alpha, radii, ForwardPass(frame, visible)
 
     def _list_tiles(
@@ -164,27 +150,23 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         counts = arena.take("counts", (GAUSSIAN_SHARDS, tiles), np.int64)
         starts = arena.take("starts", (tiles + 1,), np.int64)
         made = np.zeros(GAUSSIAN_SHARDS, np.int64)  # number of pairs of tile and record
-        in_order = (_edges(len(order)), order, records, records.view(np.int32))
+        in_order = _edges(len(order)), order, records, records.view(np.int32), view.tiles_x
 
-        def pair(first: int, past: int) -> None:
-            pair_shards(first, past, *in_order, view.tiles_x, LOG2_ALPHA_MIN, counts, pairs, made)
+        def pair(room: int) -> NDArray[np.uint64]:
+            pairs = arena.take("pairs", (GAUSSIAN_SHARDS, room), np.uint64)
+            outputs = counts, pairs, made
+            self._runner.run(GAUSSIAN_SHARDS, pair_shards, *in_order, LOG2_ALPHA_MIN, *outputs)
+            return pairs
 
         # The number of pairs is known only when all are made. So they are made with the room
         # that has sufficed so far; a second pass is needed only if the scene has grown.
-        room = self._pairs_of_shard
-        pairs = arena.take("pairs", (GAUSSIAN_SHARDS, room), np.uint64)
-        self._runner.run(GAUSSIAN_SHARDS, pair)
-        if made.max() > room:  # rare: as the scene grows
-            room = self._pairs_of_shard = int(made.max() * HEADROOM)
-            pairs = arena.take("pairs", (GAUSSIAN_SHARDS, room), np.uint64)
-            self._runner.run(GAUSSIAN_SHARDS, pair)
+        pairs = pair(self._pairs_of_shard)
+        if made.max() > self._pairs_of_shard:  # rare: as the scene grows
+            self._pairs_of_shard = int(made.max() * HEADROOM)
+            pairs = pair(self._pairs_of_shard)
         start_tiles(counts, starts)
         entries = arena.take("entries", (int(starts[tiles]),), np.int32)
-
-        def fill(first: int, past: int) -> None:
-            fill_shards(first, past, made, pairs, counts, entries)
-
-        self._runner.run(GAUSSIAN_SHARDS, fill)
+        self._runner.run(GAUSSIAN_SHARDS, fill_shards, made, pairs, counts, entries)
         return starts, entries
 
     def backward(
@@ -239,12 +221,7 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
             for given in g_pixels
         )
         want_absolute = None if request.absolute is None else True
-
-        def composite_backward(first: int, past: int) -> None:
-            composite_backward_tiles(
-                *_tiles(passed.frame, first, past), g_image, g_alpha, rows, want_absolute
-            )
-
+        composited = passed.frame, g_image, g_alpha, rows, want_absolute
         g_screen = take((count, 2))
         shape = self.extras[request.extra] if request.extra else ()
         g_extra = take((count, *shape)) if shape else None
@@ -260,20 +237,17 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
             request.degree,
             passed.frame,
         )
-
-        def backproject(first: int, past: int) -> None:
-            own = (
-                parameter_arrays(gradients)
-                if gradients is not None
-                else at.new_parameters(at.CHUNK)
-            )
-            backproject_shards(
-                at.kernel_memory(), first, past, *inputs, rows.reshape(-1), (own, *of_pixels), adam
-            )
-
+        own = (
+            at.new_parameters(GAUSSIAN_SHARDS * at.CHUNK)
+            if gradients is None
+            else parameter_arrays(gradients)
+        )
+        outputs = rows.reshape(-1), (own, *of_pixels), adam
         try:
-            self._runner.run(TILE_SHARDS, composite_backward)
-            self._runner.run(GAUSSIAN_SHARDS, backproject)
+            memory = at.kernel_memory(TILE_SHARDS)
+            self._runner.run(TILE_SHARDS, composite_backward_tiles, memory, *composited)
+            memory = at.kernel_memory(GAUSSIAN_SHARDS)
+            self._runner.run(GAUSSIAN_SHARDS, backproject_shards, memory, *inputs, *outputs)
         except BaseException:
             # The kernels need rows of zeros and clear them after use; an interrupt may have left
             # sums in them.
@@ -297,16 +271,11 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
             if values is None
             else values.detach().float().contiguous().numpy().reshape(-1)
         )
-
-        def cover(first: int, past: int) -> None:
-            cover_tiles(*_tiles(passed.frame, first, past), given, covered, sums, distances)
-
-        self._runner.run(TILE_SHARDS, cover)
+        outputs = covered, sums, distances
+        memory = at.kernel_memory(TILE_SHARDS)
+        self._runner.run(TILE_SHARDS, cover_tiles, memory, passed.frame, given, *outputs)
         # The shards are added in one order, whatever the number of threads.
-        totals = (
-            torch.from_numpy(shards.sum(0, dtype=shards.dtype))
-            for shards in (covered, sums, distances)
-        )
+        totals = (torch.from_numpy(shards.sum(0, dtype=shards.dtype)) for shards in outputs)
         return Footprint(next(totals), view_depths(gaussians, request.camera), *totals)
 
     def median_gaussians(self, gaussians: Gaussians, camera: Camera) -> Tensor:
@@ -315,12 +284,7 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         request = RenderRequest(camera, 0, black, None, None, Lifetime())
         frame = self.forward(gaussians.detach(), request)[3].frame
         chosen = np.empty(camera.height * camera.width, np.int64)
-
-        def choose(first: int, past: int) -> None:
-            _, begin, end, _ = _tiles(frame, first, past)
-            choose_median_tiles(begin, end, frame, chosen)
-
-        self._runner.run(TILE_SHARDS, choose)
+        self._runner.run(TILE_SHARDS, choose_median_tiles, frame, chosen)
         return torch.from_numpy(chosen.reshape(camera.height, camera.width))
 
 
@@ -329,17 +293,10 @@ def _edges(count: int) -> NDArray[np.int64]:
     return np.arange(GAUSSIAN_SHARDS + 1) * count // GAUSSIAN_SHARDS
 
 
-def _tiles(frame: at.CpuFrame, first: int, past: int) -> tuple[Any, ...]:
-    """The first arguments of the kernels that process tiles, for a range of shards."""
-    return at.kernel_memory(), int(frame.bounds[first]), int(frame.bounds[past]), frame
-
-
 def _rows_or_none(tensor: Tensor | None, columns: int) -> NDArray[np.float32]:
     """``tensor`` as rows of ``columns`` numbers; for None, which kernels cannot take, no rows."""
-    return np.empty((0, columns), np.float32) if tensor is None else _flat(tensor, columns)
-
-
-def _flat(tensor: Tensor, columns: int) -> NDArray[np.float32]:
+    if tensor is None:
+        return np.empty((0, columns), np.float32)
     return tensor.numpy().reshape(-1, columns)
 
 

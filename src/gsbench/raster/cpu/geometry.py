@@ -4,7 +4,7 @@ The harmonics of 16 Gaussians are a 16x16 matrix with one row per basis function
 kernels transpose it into one row per Gaussian and multiply that by the coefficients.
 """
 
-import math
+from typing import Any
 
 import numpy as np
 
@@ -13,12 +13,13 @@ from gsbench.raster import formulas
 from gsbench.raster.cpu.shuffle import transpose
 from gsbench.raster.cpu.simd import (
     LANES,
+    ceil,
     exp2,
-    gather,
+    floor,
+    gather_fours,
     load,
     maximum,
     minimum,
-    scatter,
     select,
     splat,
     square_root,
@@ -26,7 +27,7 @@ from gsbench.raster.cpu.simd import (
 )
 from gsbench.system.jit import inlined
 
-LOG2_E = 1.0 / math.log(2.0)
+LOG2_E = formulas.LOG2_E
 # Beyond this, exp2 is undefined. The variance of a scale of 2^126 is not finite, so such a Gaussian
 # is culled.
 MAX_LOG2 = 126.0
@@ -39,9 +40,20 @@ MATRIX = LANES * LANES
 
 
 OF_VECTORS = formulas.compiled(
-    inlined, select=select, minimum=minimum, maximum=maximum, square_root=square_root
+    inlined,
+    select=select,
+    minimum=minimum,
+    maximum=maximum,
+    square_root=square_root,
+    floor=floor,
+    ceil=ceil,
 )
 dot, stretched = OF_VECTORS.dot, OF_VECTORS.stretched
+
+
+def __getattr__(name: str) -> Any:
+    """The other formulas, so that kernels import them from here."""
+    return getattr(OF_VECTORS, name)
 
 
 @inlined
@@ -55,22 +67,9 @@ def exponentials(row):
 
 
 @inlined
-def gather_vectors(array, indices):
-    return gather(array, indices, 3, 0), gather(array, indices, 3, 1), gather(array, indices, 3, 2)
-
-
-@inlined
-def scatter_vectors(array, indices, values):
-    scatter(array, indices, 3, 0, values[0])
-    scatter(array, indices, 3, 1, values[1])
-    scatter(array, indices, 3, 2, values[2])
-
-
-@inlined
 def gather_quaternions(quaternions, indices):
     """The unit quaternions, and the inverse norm and the squared norm of the stored ones."""
-    w, x = gather(quaternions, indices, 4, 0), gather(quaternions, indices, 4, 1)
-    y, z = gather(quaternions, indices, 4, 2), gather(quaternions, indices, 4, 3)
+    w, x, y, z = gather_fours(quaternions, indices)
     squared = w * w + x * x + y * y + z * z
     inverse = 1 / square_root(squared)
     return (w * inverse, x * inverse, y * inverse, z * inverse), inverse, squared

@@ -40,12 +40,12 @@ SUM_RED, SUM_GREEN, SUM_BLUE = SUM_LANES[6:9]
 SUM_ABS_T, SUM_ABS_Y = SUM_LANES[9:11]  # |h t|, |h (d power / d dy)|
 
 
-def kernel_memory() -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Scratch memory for one call of a kernel.
+def kernel_memory(shards: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Scratch memory for ``shards``: a call of a kernel uses the row of its first one.
 
     Kernels cannot allocate memory (see `gsbench.system.jit.kernel`).
     """
-    return np.empty(8 * TILE_PIXELS, np.float32), np.empty(2 * LANES, np.int64)
+    return np.empty((shards, 8 * TILE_PIXELS), np.float32), np.empty((shards, 2 * LANES), np.int64)
 
 
 class Parameters(NamedTuple):

@@ -15,15 +15,30 @@ from gsbench.raster.cpu.geometry import (
     F0,
     LOG2_E,
     MATRIX,
-    OF_VECTORS,
+    contour_range,
+    covariance_gradients,
     direction_gradient,
+    dot,
     exponential,
     exponentials,
     fill_basis,
+    from_camera,
     gather_quaternions,
-    gather_vectors,
+    image_axes,
+    image_rows,
     normalized,
-    scatter_vectors,
+    plus,
+    position_gradient,
+    quaternion_gradient,
+    radius_of,
+    record_entries,
+    scaled,
+    splitting_entries,
+    spread,
+    stretched,
+    through,
+    tile_range,
+    view_axes,
 )
 from gsbench.raster.cpu.shuffle import (
     REST,
@@ -40,9 +55,8 @@ from gsbench.raster.cpu.shuffle import (
 from gsbench.raster.cpu.simd import (
     LANES,
     absolute,
-    ceil,
-    floor,
-    gather,
+    gather_numbers,
+    gather_vectors,
     load,
     log2,
     lowest_bit,
@@ -57,61 +71,24 @@ from gsbench.raster.cpu.simd import (
     square_root,
     store,
 )
-from gsbench.raster.cpu.splitting import scatter_splitting
 from gsbench.raster.staged import MIN_QUATERNION_NORM
 from gsbench.system.jit import inlined, kernel
 
-clamped_slopes, image_rows, view_axes = (
-    OF_VECTORS.clamped_slopes,
-    OF_VECTORS.image_rows,
-    OF_VECTORS.view_axes,
-)
-dot, plus, scaled, stretched = (
-    OF_VECTORS.dot,
-    OF_VECTORS.plus,
-    OF_VECTORS.scaled,
-    OF_VECTORS.stretched,
-)
-from_camera, through, times = OF_VECTORS.from_camera, OF_VECTORS.through, OF_VECTORS.times
-rotation_matrix, spread = OF_VECTORS.rotation_matrix, OF_VECTORS.spread
-covariance_gradients = OF_VECTORS.covariance_gradients
-position_gradient = OF_VECTORS.position_gradient
-quaternion_gradient = OF_VECTORS.quaternion_gradient
-
-NEAR, SIGMA_EXTENT = CONSTANTS.near, CONSTANTS.sigma_extent
+NEAR = CONSTANTS.near
 ALPHA_MIN, LOG2_ALPHA_MIN = CONSTANTS.alpha_min, math.log2(CONSTANTS.alpha_min)
-MAX_RADIUS, MAX_CENTER = CONSTANTS.max_radius, CONSTANTS.max_center
-MAX_VARIANCE, CONTOUR_MARGIN = CONSTANTS.max_variance, CONSTANTS.contour_margin
+MAX_CENTER, MAX_VARIANCE = CONSTANTS.max_center, CONSTANTS.max_variance
 ZERO, HALF, ONE, TWO, FOUR = (np.float32(value) for value in (0, 0.5, 1, 2, 4))
 
 AHEAD = 16  # records ahead that the backward pass prefetches
 FAR = 64  # Gaussians ahead whose harmonics are prefetched
 ALL_LANES = np.uint64((1 << LANES) - 1)
-EIGENVALUE_FLOOR = CONSTANTS.eigenvalue_floor
 # entries of a shard's flags: number of visible Gaussians; 1 if a value is bad
 VISIBLE, BAD_VALUE = 0, 1
 
 
-@inlined
-def _tile_range(low, high, tiles):
-    """First and past-the-last tile for the pixels ``low`` to ``high`` - 1, within the grid."""
-    first = floor(minimum(maximum(low * (1.0 / at.TILE), ZERO), np.float32(tiles)))
-    past = floor(
-        minimum(maximum((high + (at.TILE - 1)) * (1.0 / at.TILE), ZERO), np.float32(tiles))
-    )
-    return first, past
-
-
-@inlined
-def _contour_range(center, half, tiles):
-    """The tiles of the pixels within ``half`` px of ``center``, with a margin for rounding."""
-    half = half * (1 + CONTOUR_MARGIN) + CONTOUR_MARGIN
-    return _tile_range(ceil(center - half), floor(center + half) + ONE, tiles)
-
-
 @kernel
 def project_shards(
-    memory, first, past, edges, gaussians, degree, v, records, record_ints, keys, radii, flags
+    first, past, memory, edges, gaussians, degree, v, records, record_ints, keys, radii, flags
 ):
     """Project the shards ``first`` to ``past``.
 
@@ -122,13 +99,12 @@ def project_shards(
     for shard in range(first, past):
         begin, end = edges[shard], edges[shard + 1]
         outputs = records, record_ints, keys, radii, flags[shard]
-        _project(memory, begin, end, gaussians, degree, v, outputs)
+        _project(memory[0][first], memory[1][first], begin, end, gaussians, degree, v, outputs)
 
 
 @inlined
-def _project(memory, begin, end, gaussians, degree, v, outputs):
+def _project(floats, indices, begin, end, gaussians, degree, v, outputs):
     records, record_ints, keys, radii, flags = outputs
-    floats, indices = memory
     rows, scratch = floats[MATRIX : 2 * MATRIX], floats[2 * MATRIX :]
     out = begin
     bad = splat(ZERO)  # sum of 0 * value: 0 if every value is finite, else NaN
@@ -144,7 +120,7 @@ def _project(memory, begin, end, gaussians, degree, v, outputs):
         log_scale = gather_vectors(gaussians.log_scales, indices)
         dc = gather_vectors(gaussians.sh_dc, indices)
         quaternion, _, squared_norm = gather_quaternions(gaussians.quaternions, indices)
-        logit = gather(gaussians.logits, indices, 1, 0)
+        (logit,) = gather_numbers(gaussians.logits, indices)
         finite = _zero_if_finite(mean)
         finite += _zero_if_finite(log_scale)
         finite += _zero_if_finite(dc)
@@ -155,24 +131,22 @@ def _project(memory, begin, end, gaussians, degree, v, outputs):
         offset = from_camera(mean, v)
         x, y, z = through(view_axes(v), offset)
         inverse_z = ONE / z
-        column = x * inverse_z * v.fx + v.pixel_cx
-        row = y * inverse_z * v.fy + v.pixel_cy
+        free_x, free_y = x * inverse_z, y * inverse_z
+        column, row = free_x * v.fx + v.pixel_cx, free_y * v.fy + v.pixel_cy
         visible = (z > NEAR) & (absolute(column) < MAX_CENTER) & (absolute(row) < MAX_CENTER)
         if mask_bits(visible) == 0:
             for i in range(start, start + count):
                 radii[i] = 0
             continue
 
-        # The covariance on the image is M M^T + blur I with M = J W R S (3DGS eq. 5 and 6).
-        slope_x, slope_y = clamped_slopes(x * inverse_z, y * inverse_z, v)
-        axis_x, axis_y = image_rows(slope_x, slope_y, inverse_z, v)
-        scales, matrix = exponentials(log_scale), rotation_matrix(quaternion)
-        m0, m1 = scaled(times(axis_x, matrix), scales), scaled(times(axis_y, matrix), scales)
+        _, n0, n1 = image_axes(free_x, free_y, inverse_z, quaternion, v)
+        scales = exponentials(log_scale)
+        m0, m1 = scaled(n0, scales), scaled(n1, scales)
         visible = visible & (dot(m0, m0) + dot(m1, m1) < MAX_VARIANCE)
         xx, xy, yy, a = spread(m0, m1)
-        radius = _radius(xx, xy, yy)
-        first_x, past_x = _tile_range(column - radius, column + radius, v.tiles_x)
-        first_y, past_y = _tile_range(row - radius, row + radius, v.tiles_y)
+        radius = radius_of(xx, xy, yy)
+        first_x, past_x = tile_range(column - radius, column + radius, v.tiles_x, at.TILE)
+        first_y, past_y = tile_range(row - radius, row + radius, v.tiles_y, at.TILE)
         visible = visible & (first_x < past_x) & (first_y < past_y)
         store(scratch, 0, select(visible, radius, ZERO))
         for lane in range(count):
@@ -183,8 +157,8 @@ def _project(memory, begin, end, gaussians, degree, v, outputs):
         opacity = ONE / (exponential(-logit) + ONE)
         log2_opacity = log2(maximum(opacity, ALPHA_MIN))
         reach = maximum((log2_opacity - LOG2_ALPHA_MIN) * (2 / LOG2_E), ZERO)
-        inner_x, outer_x = _contour_range(column, square_root(reach * xx), v.tiles_x)
-        inner_y, outer_y = _contour_range(row, square_root(reach * yy), v.tiles_y)
+        inner_x, outer_x = contour_range(column, square_root(reach * xx), v.tiles_x, at.TILE)
+        inner_y, outer_y = contour_range(row, square_root(reach * yy), v.tiles_y, at.TILE)
         first_x, past_x = maximum(first_x, inner_x), minimum(past_x, outer_x)
         first_y, past_y = maximum(first_y, inner_y), minimum(past_y, outer_y)
         seen = visible & (opacity > ALPHA_MIN) & (first_x < past_x) & (first_y < past_y)
@@ -192,22 +166,16 @@ def _project(memory, begin, end, gaussians, degree, v, outputs):
         if todo == 0:
             continue
 
-        red, green, blue = _color(degree, dc, offset, todo, start, gaussians.sh_rest, floats)
+        rgb = _color(degree, dc, offset, todo, start, gaussians.sh_rest, floats)
+        red, green, blue = rgb
         bad += select(seen, (red + green + blue) * ZERO, ZERO)
         clamped = select(red < ZERO, splat(ONE), ZERO)
         clamped += select(green < ZERO, splat(TWO), ZERO) + select(blue < ZERO, splat(FOUR), ZERO)
 
+        curve_y = (-0.5 * LOG2_E) / yy
         # One vector per entry of a record, in the order of `layout`; one row per Gaussian of them.
         entries = (
-            column,
-            row,
-            -xy / yy,
-            a * (-0.5 * LOG2_E),
-            (-0.5 * LOG2_E) / yy,
-            log2_opacity,
-            maximum(ZERO, red),  # NaN stays
-            maximum(ZERO, green),
-            maximum(ZERO, blue),
+            *record_entries(column, row, -xy / yy, a, curve_y, log2_opacity, rgb),
             xy / xx,
             xy * square_root(reach / xx),
             z,
@@ -233,17 +201,6 @@ def _prefetch_harmonics(sh_rest, begin, end):
 @inlined
 def _zero_if_finite(vector):
     return vector[0] * ZERO + vector[1] * ZERO + vector[2] * ZERO
-
-
-@inlined
-def _radius(xx, xy, yy):
-    """ceil(3 sqrt(largest eigenvalue)), px, as preprocessCUDA of 3DGS computes it.
-
-    The discriminant (trace / 2)^2 - det is written as a sum of squares, so it is never negative.
-    """
-    half = (xx - yy) * HALF
-    largest = (xx + yy) * HALF + square_root(maximum(half * half + xy * xy, EIGENVALUE_FLOOR))
-    return minimum(ceil(square_root(largest) * SIGMA_EXTENT), MAX_RADIUS)
 
 
 @inlined
@@ -345,7 +302,7 @@ def _take_rows(record, count, past, v, record_ints, tile_shard, rows, indices, s
 
 @kernel
 def backproject_shards(
-    memory, first, past, edges, visible, gaussians, degree, frame, rows, outputs, adam
+    first, past, memory, edges, visible, gaussians, degree, frame, rows, outputs, adam
 ):
     """Write the gradients of the shards ``first`` to ``past`` and clear their ``rows``.
 
@@ -355,14 +312,16 @@ def backproject_shards(
     [N, C]; the last two are empty if not requested.
 
     If ``adam`` has factors, the parameters are stepped, too, `layout.CHUNK` Gaussians at a time.
-    The gradients by the parameters then have the rows of one chunk only, which stay in the cache.
+    The gradients by the parameters then have one chunk of rows for each shard, of which a call uses
+    that of its first one; it stays in the cache.
     """
-    steps = len(adam.factors) > 0
+    steps, own_chunk = len(adam.factors) > 0, first * at.CHUNK
+    scratch = memory[0][first], memory[1][first]
     for shard in range(first, past):
         begin, end = edges[shard], edges[shard + 1]
         record, last = begin, begin + visible[shard]
         for start in range(begin, end, at.CHUNK):
-            stop, origin = min(start + at.CHUNK, end), start if steps else 0
+            stop, origin = min(start + at.CHUNK, end), start - own_chunk if steps else 0
             past_record = record
             while past_record < last and _gaussian(frame.record_ints, past_record) < stop:
                 past_record += 1
@@ -376,11 +335,19 @@ def backproject_shards(
                         _gaussian(frame.record_ints, last_own) + 1,
                     )
                 _backproject(
-                    memory, sixteen, past_record, origin, gaussians, degree, frame, rows, outputs
+                    scratch,
+                    sixteen,
+                    past_record,
+                    origin,
+                    gaussians,
+                    degree,
+                    frame,
+                    rows,
+                    outputs,
                 )
             record = past_record
             if steps:
-                step_all(gaussians, adam, outputs[0], start, stop, memory[0])
+                step_all(gaussians, adam, outputs[0], start, stop, own_chunk, scratch[0])
 
 
 @inlined
@@ -432,21 +399,18 @@ def _backproject(memory, record, past, origin, gaussians, degree, frame, rows, o
     # Colour. A channel below 0 was clamped and has no gradient.
     to, inverse_distance = normalized(offset)
     rgb = _unclamped(record, count, record_ints, sums, colors)
-    scatter_vectors(gradients.sh_dc, own, stretched(rgb, F0))
+    scatter(gradients.sh_dc, own, stretched(rgb, F0))
     turned = _backproject_harmonics(
         degree, to, indices, own, gaussians.sh_rest, gradients.sh_rest, floats[MATRIX:]
     )
 
     # Repeat the geometry of the forward pass.
     quaternion, inverse_norm, _ = gather_quaternions(gaussians.quaternions, indices)
-    matrix = rotation_matrix(quaternion)
     x, y, z = through(view_axes(v), offset)
     inverse_z = ONE / z
     free_x, free_y = x * inverse_z, y * inverse_z
-    slope_x, slope_y = clamped_slopes(free_x, free_y, v)
-    axis_x, axis_y = image_rows(slope_x, slope_y, inverse_z, v)
+    matrix, n0, n1 = image_axes(free_x, free_y, inverse_z, quaternion, v)
     scales = exponentials(log_scale)
-    n0, n1 = times(axis_x, matrix), times(axis_y, matrix)
     _, xy, yy, a = spread(scaled(n0, scales), scaled(n1, scales))
     e, shear = ONE / yy, -xy / yy  # power = -(a t^2 + e dy^2) / 2, t = dx + shear dy
 
@@ -454,12 +418,10 @@ def _backproject(memory, record, past, origin, gaussians, degree, frame, rows, o
     g_column = a * load(sums, at.SUM_H_T * LANES)
     g_row = shear * g_column + e * load(sums, at.SUM_H_Y * LANES)
     half_width, half_height = 0.5 * v.width, 0.5 * v.height  # from px to NDC
-    scatter(g_screen, indices, 2, 0, g_column * half_width)
-    scatter(g_screen, indices, 2, 1, g_row * half_height)
+    scatter(g_screen, indices, (g_column * half_width, g_row * half_height))
     if len(g_absolute) > 0:
-        absolute_t = a * load(sums, at.SUM_ABS_T * LANES)
-        scatter(g_absolute, indices, 2, 0, absolute_t * half_width)
-        scatter(g_absolute, indices, 2, 1, load(sums, at.SUM_ABS_Y * LANES) * half_height)
+        across, down = a * load(sums, at.SUM_ABS_T * LANES), load(sums, at.SUM_ABS_Y * LANES)
+        scatter(g_absolute, indices, (across * half_width, down * half_height))
 
     q00 = a * a * load(sums, at.SUM_H_TT * LANES)
     q01 = a * e * load(sums, at.SUM_H_TY * LANES)
@@ -467,25 +429,23 @@ def _backproject(memory, record, past, origin, gaussians, degree, frame, rows, o
     h = load(sums, at.SUM_H * LANES)
     if len(g_extra) > 0:
         free = image_rows(free_x, free_y, inverse_z, v)
-        scatter_splitting(g_extra, indices, q00 - a * h, q01, q11 - e * h, shear, free)
+        entries = splitting_entries(q00 - a * h, q01, q11 - e * h, shear, free)
+        scatter(g_extra, indices, entries)
     g_scales, turn, s0, s1 = covariance_gradients(q00, q01, q11, n0, n1, shear, scales)
-    scatter_vectors(gradients.log_scales, own, g_scales)
+    scatter(gradients.log_scales, own, g_scales)
     g_quaternion = quaternion_gradient(quaternion, turn, inverse_norm + inverse_norm)
-    scatter(gradients.quaternions, own, 4, 0, g_quaternion[0])
-    scatter(gradients.quaternions, own, 4, 1, g_quaternion[1])
-    scatter(gradients.quaternions, own, 4, 2, g_quaternion[2])
-    scatter(gradients.quaternions, own, 4, 3, g_quaternion[3])
+    scatter(gradients.quaternions, own, g_quaternion)
 
     # Mean: through A = J W and the position on the image, and through the view direction of the
     # colour, whose gradient is projected to the tangent of the sphere.
     a0, a1 = through(matrix, s0), through(matrix, s1)
     position = position_gradient(a0, a1, g_column, g_row, free_x, free_y, inverse_z, v)
     tangent = stretched(plus(turned, -dot(turned, to), to), inverse_distance)
-    scatter_vectors(gradients.means, own, plus(position, ONE, tangent))
+    scatter(gradients.means, own, plus(position, ONE, tangent))
 
     # d log(alpha) / d logit = 1 - opacity
-    growth = exponential(gather(gaussians.logits, indices, 1, 0)) + ONE
-    scatter(gradients.logits, own, 1, 0, h / growth)
+    (logit,) = gather_numbers(gaussians.logits, indices)
+    scatter(gradients.logits, own, (h / (exponential(logit) + ONE),))
 
 
 @inlined

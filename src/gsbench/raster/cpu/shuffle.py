@@ -8,7 +8,15 @@ from llvmlite import ir
 from numba.core import types
 
 from gsbench.gaussians.model import NUM_SH_REST
-from gsbench.raster.cpu.simd import LANES, VECTOR, address, broadcast, lane_indices, lowering
+from gsbench.raster.cpu.simd import (
+    LANES,
+    VECTOR,
+    address,
+    broadcast,
+    lane_indices,
+    lowering,
+    whole,
+)
 
 CHANNELS = 3
 BLOCK = 4  # px, the sides of the 16 pixels of a vector
@@ -21,12 +29,12 @@ THREE_VECTORS = types.UniTuple(VECTOR, CHANNELS)
 
 
 def _load(builder, pointer, place):
-    at = builder.gep(pointer, [ir.Constant(ir.IntType(64), place)])
+    at = builder.gep(pointer, [whole(place, 64)])
     return builder.load(builder.bitcast(at, VECTOR.ir.as_pointer()), align=4)
 
 
 def _store(builder, value, pointer, place):
-    at = builder.gep(pointer, [ir.Constant(ir.IntType(64), place)])
+    at = builder.gep(pointer, [whole(place, 64)])
     builder.store(value, builder.bitcast(at, VECTOR.ir.as_pointer()), align=4)
 
 
@@ -71,9 +79,7 @@ def _row_pointers(context, builder, sig, args, numbers):
     first = address(context, builder, sig, args)
     stride = context.cast(builder, args[2], sig.args[2], types.intp)
     kind = ir.VectorType(ir.FloatType(), numbers).as_pointer()
-    places = [
-        builder.mul(stride, ir.Constant(ir.IntType(64), row)) for row in range(LANES // BLOCK)
-    ]
+    places = [builder.mul(stride, whole(row, 64)) for row in range(LANES // BLOCK)]
     return [builder.bitcast(builder.gep(first, [place]), kind) for place in places]
 
 
@@ -189,7 +195,7 @@ def outer_rest(context, builder, sig, args):
     color = undefined
     for channel, value in enumerate(colors):
         scalar = context.cast(builder, value, sig.args[channel + 1], types.float32)
-        color = builder.insert_element(color, scalar, ir.Constant(ir.IntType(32), channel))
+        color = builder.insert_element(color, scalar, whole(channel))
 
     def spread(vector, lanes):
         return builder.shuffle_vector(vector, undefined, lane_indices(lanes))

@@ -60,18 +60,20 @@ class _Model(models.PrimitiveModel):
         super().__init__(manager, frontend_type, frontend_type.ir)
 
 
+def whole(number, bits=32):
+    """An integer as a constant of LLVM."""
+    return ir.Constant(ir.IntType(bits), number)
+
+
 def lane_indices(lanes):
     """The numbers of lanes as a constant for LLVM's shuffles."""
-    return ir.Constant(
-        ir.VectorType(ir.IntType(32), len(lanes)),
-        [ir.Constant(ir.IntType(32), lane) for lane in lanes],
-    )
+    return ir.Constant(ir.VectorType(ir.IntType(32), len(lanes)), [*map(whole, lanes)])
 
 
 def broadcast(builder, scalar, kind):
     """The LLVM value ``scalar`` in all lanes of a vector of the LLVM type ``kind``."""
     undefined = ir.Constant(kind, ir.Undefined)
-    first = builder.insert_element(undefined, scalar, ir.Constant(ir.IntType(32), 0))
+    first = builder.insert_element(undefined, scalar, whole(0))
     return builder.shuffle_vector(first, undefined, lane_indices([0] * kind.count))
 
 
@@ -192,24 +194,18 @@ def _check_numbers(array, index):
         _check_array(array)
 
 
-@lowering(VECTOR, "array index", _check_array)
+@lowering(VECTOR, "array index", _check_numbers)
 def load(context, builder, sig, args):
-    """The vector ``array.flat[index : index + 16]``."""
+    """The vector ``array.flat[index : index + 16]`` of a float32 or uint8 array."""
     # LLVM aligns the stack to 16 bytes only. Vectors that it spills to the stack could then cross
     # cache lines, in some processes and threads but not in others, which would cost a quarter of a
     # kernel's time.
     builder.function.attributes.alignstack = 4 * LANES
     builder.function.attributes.add("nounwind")
-    return builder.load(pointer_to(context, builder, sig, args), align=4)
-
-
-@lowering(VECTOR, "array index", _check_numbers)
-def load_numbers(context, builder, sig, args):
-    """Like ``load``, but the array may also be uint8."""
-    is_bytes = sig.args[0].dtype == types.uint8
-    kind = ir.VectorType(ir.IntType(8), LANES) if is_bytes else VECTOR.ir
-    value = builder.load(pointer_to(context, builder, sig, args, kind), align=1)
-    return builder.uitofp(value, VECTOR.ir) if is_bytes else value
+    if sig.args[0].dtype == types.float32:
+        return builder.load(pointer_to(context, builder, sig, args), align=4)
+    numbers = pointer_to(context, builder, sig, args, ir.VectorType(ir.IntType(8), LANES))
+    return builder.uitofp(builder.load(numbers, align=1), VECTOR.ir)
 
 
 @lowering(types.void, "array index value", _check_array)
@@ -220,65 +216,72 @@ def store(context, builder, sig, args):
     return context.get_dummy_value()
 
 
-def _places(context, builder, sig, args):
-    """The address of ``array.flat[indices[k] * stride + offset]`` for each lane k.
+def _rows(context, builder, sig, args, width):
+    """The addresses of the rows ``indices[k]`` of an array [N, ``width``], one for each lane k.
 
-    ``args`` starts with ``array``, ``indices``, ``stride`` and ``offset``.
+    ``args`` starts with the array and ``indices``.
     """
-    data = context.make_array(sig.args[0])(context, builder, args[0]).data
-    indices = context.make_array(sig.args[1])(context, builder, args[1]).data
-    stride, offset = (context.cast(builder, args[k], sig.args[k], types.intp) for k in (2, 3))
-    for lane in range(LANES):
-        index = builder.load(builder.gep(indices, [ir.Constant(ir.IntType(64), lane)]))
-        yield builder.gep(data, [builder.add(builder.mul(index, stride), offset)])
+    data, indices = (
+        context.make_array(sig.args[k])(context, builder, args[k]).data for k in range(2)
+    )
+    numbers = [builder.load(builder.gep(indices, [whole(lane, 64)])) for lane in range(LANES)]
+    return [builder.gep(data, [builder.mul(number, whole(width, 64))]) for number in numbers]
 
 
-@lowering(VECTOR, "array indices stride offset", _check_array)
-def gather(context, builder, sig, args):
-    """Load ``array.flat[indices[k] * stride + offset]`` into lane k; ``indices`` is int64 [16]."""
-    vector = ir.Constant(VECTOR.ir, ir.Undefined)
-    for lane, place in enumerate(_places(context, builder, sig, args)):
-        number = ir.Constant(ir.IntType(32), lane)
-        vector = builder.insert_element(vector, builder.load(place), number)
-    return vector
+def _gathering(width):
+    @lowering(types.UniTuple(VECTOR, width), "array indices", _check_array)
+    def gather(context, builder, sig, args):
+        """Load the rows ``indices`` [16] of an array: a vector for each column."""
+        rows, columns = _rows(context, builder, sig, args, width), []
+        for column in range(width):
+            vector = ir.Constant(VECTOR.ir, ir.Undefined)
+            for lane, row in enumerate(rows):
+                value = builder.load(builder.gep(row, [whole(column, 64)]))
+                vector = builder.insert_element(vector, value, whole(lane))
+            columns.append(vector)
+        return context.make_tuple(builder, sig.return_type, columns)
+
+    return gather
 
 
-@lowering(types.void, "array indices stride offset value", _check_array)
+gather_numbers, gather_vectors, gather_fours = map(_gathering, (1, 3, 4))
+
+
+@lowering(types.void, "array indices columns", _check_array)
 def scatter(context, builder, sig, args):
-    """Write lane k of ``value`` to ``array.flat[indices[k] * stride + offset]``.
+    """Write the rows ``indices`` [16] of an array; ``columns`` are a vector each.
 
     If indices are equal, the last lane is kept.
     """
-    for lane, place in enumerate(_places(context, builder, sig, args)):
-        number = ir.Constant(ir.IntType(32), lane)
-        builder.store(builder.extract_element(args[4], number), place)
+    width = sig.args[2].count
+    rows = _rows(context, builder, sig, args, width)
+    for column in range(width):
+        vector = builder.extract_value(args[2], column)
+        for lane, row in enumerate(rows):
+            place = builder.gep(row, [whole(column, 64)])
+            builder.store(builder.extract_element(vector, whole(lane)), place)
     return context.get_dummy_value()
 
 
-def _prefetch(context, builder, sig, args, caches):
-    """Prefetch a cache line into all caches (3), or into all but the first level (2)."""
-    byte_pointer, word = ir.IntType(8).as_pointer(), ir.IntType(32)
-    kind = ir.FunctionType(ir.VoidType(), [byte_pointer, word, word, word])
-    function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
-    pointer = pointer_to(context, builder, sig, args, ir.IntType(8))
-    read, data = 0, 1
-    builder.call(function, [pointer, *(ir.Constant(word, n) for n in (read, caches, data))])
-    return context.get_dummy_value()
+def _prefetching(caches):
+    @lowering(types.void, "array index")
+    def prefetch(context, builder, sig, args):
+        """Prefetch the cache line of ``array.flat[index]``; never faults."""
+        byte_pointer, word = ir.IntType(8).as_pointer(), ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [byte_pointer, word, word, word])
+        function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
+        pointer = pointer_to(context, builder, sig, args, ir.IntType(8))
+        read, data = 0, 1
+        builder.call(function, [pointer, *map(whole, (read, caches, data))])
+        return context.get_dummy_value()
+
+    return prefetch
 
 
-@lowering(types.void, "array index")
-def prefetch(context, builder, sig, args):
-    """Prefetch the cache line of ``array.flat[index]``; never faults."""
-    return _prefetch(context, builder, sig, args, 3)
-
-
-@lowering(types.void, "array index")
-def prefetch_far(context, builder, sig, args):
-    """Like ``prefetch``, but not into the first-level cache: for what streams from memory.
-
-    Few lines can be on their way to the first level at once; to the second, several times as many.
-    """
-    return _prefetch(context, builder, sig, args, 2)
+prefetch = _prefetching(3)  # into all caches
+# Into all but the first level, for what streams from memory: few lines can be on their way to the
+# first level at once; to the second, several times as many.
+prefetch_far = _prefetching(2)
 
 
 # Functions of vectors and masks

@@ -120,17 +120,17 @@ class ShardRunner:
             else None
         )
 
-    def run(self, shards: int, work: Callable[[int, int], None]) -> None:
-        """Call ``work(first, past)`` for ranges of shards until all have run.
+    def run(self, shards: int, work: Callable[..., None], *arguments: Any) -> None:
+        """Call ``work(first, past, *arguments)`` for ranges of shards until all have run.
 
         On an error or an interrupt, wait for the calls that have begun.
         """
         if self._executor is None:
-            work(0, shards)
+            work(0, shards, *arguments)
             return
         parts = min(shards, RANGES_PER_THREAD * self.threads)
         edges = [shards * part // parts for part in range(parts + 1)]
-        futures = [self._executor.submit(work, *span) for span in pairwise(edges)]
+        futures = [self._executor.submit(work, *span, *arguments) for span in pairwise(edges)]
         try:
             for future in futures:
                 future.result()

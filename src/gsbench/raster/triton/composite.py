@@ -30,22 +30,13 @@ from gsbench.raster.triton.layout import (
     BLOCK_HEIGHT,
     BLOCK_PIXELS,
     BLOCK_WIDTH,
-    BLUE,
     BORDER,
-    CURVE_T,
-    CURVE_Y,
-    GREEN,
     LANE_COLUMNS,
     LANES,
     LOG2_ALPHA_MIN,
-    LOG2_OPACITY,
-    MEAN_X,
-    MEAN_Y,
     RECORD,
-    RED,
     ROW,
     SEGMENT,
-    SHEAR,
     STEPS,
     TRANSMITTANCE,
 )
@@ -90,25 +81,18 @@ def block_places(steps):
 
 @triton.jit
 def load_record(records, entry):
-    place = records + entry.to(tl.int64) * RECORD
-    return (
-        tl.load(place + MEAN_X),
-        tl.load(place + MEAN_Y),
-        tl.load(place + SHEAR),
-        tl.load(place + CURVE_T),
-        tl.load(place + CURVE_Y),
-        tl.load(place + LOG2_OPACITY),
-        tl.load(place + RED),
-        tl.load(place + GREEN),
-        tl.load(place + BLUE),
-    )
+    """The `NUMBERS` of the record ``entry``, in the order of `layout`."""
+    place, found = records + entry.to(tl.int64) * RECORD, ()
+    # Triton's tuples grow by ``+``; it knows neither ``*`` nor comprehensions.
+    for n in tl.static_range(NUMBERS):
+        found = found + (tl.load(place + n),)  # type: ignore[assignment]  # noqa: RUF005
+    return found
 
 
 @triton.jit
 def _record_of(batch, lane):
     """The record that ``lane`` of a batch has, in all lanes."""
     index, found = tl.zeros([LANES], tl.int32) + lane, ()
-    # Triton's tuples grow by ``+``; it knows neither ``*`` nor comprehensions.
     for n in tl.static_range(NUMBERS):
         found = found + (tl.gather(batch[n], index, 0),)  # type: ignore[assignment]  # noqa: RUF005
     return found

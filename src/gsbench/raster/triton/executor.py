@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -23,11 +22,9 @@ from gsbench.raster.staged import (
 )
 from gsbench.raster.triton.composite import composite, composite_backward
 from gsbench.raster.triton.footprint import cover, sum_cover
-from gsbench.raster.triton.launch import Workspace, WorkspacePool, launch, launch_grid
+from gsbench.raster.triton.launch import Allocate, Workspace, WorkspacePool, launch, launch_grid
 from gsbench.raster.triton.layout import (
-    BLOCK_HEIGHT,
     BLOCK_PIXELS,
-    BLOCK_WIDTH,
     BORDER,
     COLOR_SLOPES,
     RECORD,
@@ -44,63 +41,19 @@ from gsbench.raster.triton.lists import (
     Pixels,
     Projected,
     Room,
-    Rows,
+    Started,
     Units,
     check_pairs,
-    find_all_units,
     make_lists,
     sort_by_depth,
 )
-from gsbench.raster.triton.projection import backproject, project, sum_units
-from gsbench.raster.triton.splitting import store_splitting
+from gsbench.raster.triton.projection import backproject, project, store_splitting, sum_units
 from gsbench.scene.types import Camera
 
 EXTRA_KERNELS = {"splitting_matrix": store_splitting}  # each writes an extra output
 # Blocks, those with the longest lists, that may have four programs each: on a GPU of about 130
 # multiprocessors so many programs run at once. 0: each block has one program.
 SPLIT_BLOCKS = 1024
-
-# Makes an output: name, shape, dtype.
-Allocate = Callable[[str, tuple[int, ...], torch.dtype], Tensor]
-
-
-@dataclass
-class Started:
-    """A render up to its units. The host does not know yet how many there are."""
-
-    request: RenderRequest
-    view: Tensor  # [24] float32, the numbers of the camera
-    memory: Workspace  # of what the backward pass needs
-    scratch: Workspace
-    allocate: Allocate
-    radii: Tensor  # [N] int32
-    projected: Projected
-    order: Tensor  # [N] int64 Gaussians by depth
-    unit_ends: Tensor  # [N] int64
-    flags: Tensor  # [1] int32
-    units: Units = field(init=False)  # of the last `find_units`
-
-    @property
-    def blocks_x(self) -> int:
-        return -(-self.request.camera.width // BLOCK_WIDTH.value)
-
-    @property
-    def blocks(self) -> int:
-        return self.blocks_x * -(-self.request.camera.height // BLOCK_HEIGHT.value)
-
-    def find_units(self, capacity: int) -> None:
-        """Find the units, with room for ``capacity``."""
-        self.units = find_all_units(
-            self.memory,
-            self.scratch,
-            self.projected,
-            self.order,
-            self.unit_ends,
-            capacity,
-            self.blocks_x,
-            self.flags,
-            self.request.background,
-        )
 
 
 @dataclass
@@ -128,11 +81,6 @@ class TritonFrame:
 
     def of_pixels(self, request: RenderRequest) -> Pixels:
         return Pixels(self.lists.order, request.background, self.transmittance, self.borders)
-
-    @property
-    def of_rows(self) -> Rows:
-        units = self.units
-        return Rows(self.projected.row_counts, units.first, units.pair_ends, units.widths)
 
 
 class TritonRasterizer(StagedRasterizer[TritonFrame]):
@@ -232,7 +180,7 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
         camera, memory, blocks = started.request.camera, started.memory, started.blocks
         image = started.allocate("image", (camera.height, camera.width, 3), torch.float32)
         alpha = started.allocate("alpha", (camera.height, camera.width), torch.float32)
-        lists = make_lists(memory, started.scratch, started.units, room, blocks)
+        lists = make_lists(started, room)
         frame = TritonFrame(
             started.blocks_x,
             blocks,
@@ -328,10 +276,9 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
             gaussians=Parameters(**gaussians.tensors()),
             count=count,
             camera=frame.view,
+            projected=projected,
             record_ints=projected.records.view(torch.int32),
-            color_slopes=projected.color_slopes,
-            where=frame.of_rows,
-            status=frame.units.status,
+            found=frame.units,
             **lists.room._asdict(),
             rows=rows,
             gradients=Parameters(*gradients),
@@ -375,7 +322,8 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
             )
             _sum_units(frame, last_slots, rows)
             launch(sum_cover, count, 128)(
-                where=frame.of_rows,
+                row_counts=frame.projected.row_counts,
+                found=frame.units,
                 count=count,
                 rows=rows,
                 covered=covered,
@@ -434,13 +382,10 @@ def _project(
 
 def _sum_units(frame: TritonFrame, last_slots: Tensor, rows: Tensor) -> None:
     """Sum the ``rows`` of the pairs of each unit, in place."""
-    units, room = frame.units, frame.lists.room
+    room = frame.lists.room
     launch(sum_units, room.units, 32)(
-        pair_ends=units.pair_ends,
-        unit_widths=units.widths,
-        unit_blocks=units.blocks,
+        found=frame.units,
         last_slots=last_slots,
-        status=units.status,
         **room._asdict(),
         rows=rows,
     )

@@ -63,7 +63,8 @@ def cover(
 @triton.jit(do_not_specialize=["count"])
 def sum_cover(
     count,
-    where,
+    row_counts,
+    found,
     rows,
     covered,
     sums,
@@ -73,8 +74,8 @@ def sum_cover(
     """Write ``covered`` [N] int32, ``sums`` and ``distances`` [N] from the rows of units."""
     index = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
     inside = index < count
-    own_rows = tl.load(where.counts + index, mask=inside, other=0)
-    total, value, distance = sum_rows(index, own_rows, where, rows, 3)
+    own_rows = tl.load(row_counts + index, mask=inside, other=0)
+    total, value, distance = sum_rows(index, own_rows, found, rows, 3)
     tl.store(covered + index, total.to(tl.int32), mask=inside)
     tl.store(sums + index, value, mask=inside)
     tl.store(distances + index, distance, mask=inside)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import triton
 import triton.language as tl
 
 from gsbench.gaussians.model import C0, C1, C2, C3, NUM_SH_REST
 from gsbench.raster import formulas
-from gsbench.raster.base import CONSTANTS, CameraNumbers
+from gsbench.raster.base import CameraNumbers
 
 F0, F1 = tl.constexpr(C0), tl.constexpr(C1)
 D0, D1, D2, D3, D4 = (tl.constexpr(value) for value in C2)
@@ -86,17 +88,39 @@ def square_root(a):
     return tl.sqrt(a)
 
 
+@triton.jit
+def floor(a):
+    return tl.floor(a)
+
+
+@triton.jit
+def ceil(a):
+    return tl.ceil(a)
+
+
+@triton.jit
+def exponentials(row):
+    return tl.exp(row[0]), tl.exp(row[1]), tl.exp(row[2])
+
+
 # ``tl`` is among the names because Triton's interpreter takes only functions that can see it.
 OF_LANES = formulas.compiled(
     triton.jit,
+    tl.constexpr,
     tl=tl,
-    BLUR=tl.constexpr(CONSTANTS.blur),
     select=select,
     minimum=minimum,
     maximum=maximum,
     square_root=square_root,
+    floor=floor,
+    ceil=ceil,
 )
 dot, plus, stretched = OF_LANES.dot, OF_LANES.plus, OF_LANES.stretched
+
+
+def __getattr__(name: str) -> Any:
+    """The other formulas, so that kernels import them from here."""
+    return getattr(OF_LANES, name)
 
 
 @triton.jit

@@ -13,6 +13,9 @@ from torch import Tensor
 # Fuse products and sums to fma. It is the default of Triton only before 3.10.
 OPTIONS = {"enable_fp_fusion": True}
 
+# Makes an output: name, shape, dtype.
+Allocate = Callable[[str, tuple[int, ...], torch.dtype], Tensor]
+
 
 def launch(kernel: Any, count: int, group: int) -> Callable[..., None]:
     """Return a launcher of ``kernel`` for ``count`` items, one per lane and ``group`` per program.

@@ -41,7 +41,7 @@ MEAN_X, MEAN_Y = tl.constexpr(0), tl.constexpr(1)  # px, integer pixel centres
 SHEAR = tl.constexpr(2)  # b / a
 CURVE_T, CURVE_Y = tl.constexpr(3), tl.constexpr(4)  # -log2(e)/2 a and -log2(e)/2 (c - b^2/a)
 LOG2_OPACITY = tl.constexpr(5)
-RED, GREEN, BLUE = tl.constexpr(6), tl.constexpr(7), tl.constexpr(8)
+# 6, 7, 8: red, green, blue
 RIGHTMOST_Y = tl.constexpr(9)  # px; dy of the rightmost point of the contour alpha = 1/255
 # The remaining entries are int32.
 COLUMNS = tl.constexpr(10)  # of blocks that the contour can touch: first + 65536 past-the-last

@@ -8,6 +8,7 @@ pairs by block gives the list of each block.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import torch
@@ -16,7 +17,8 @@ import triton.language as tl
 from torch import Tensor
 
 from gsbench.raster.base import CONSTANTS
-from gsbench.raster.triton.launch import Workspace, launch, launch_grid
+from gsbench.raster.staged import RenderRequest
+from gsbench.raster.triton.launch import Allocate, Workspace, launch, launch_grid
 from gsbench.raster.triton.layout import (
     BLOCK_HEIGHT,
     BLOCK_WIDTH,
@@ -85,56 +87,52 @@ def _span(records, place, row, first, past, mask):
 def find_units(
     order,
     count,
-    row_counts,
     unit_ends,
-    records,
+    projected,
     record_ints,
     blocks_x,
     capacity,
-    first_units,
-    unit_owners,
-    unit_blocks,
-    unit_widths,
+    found,
     GROUP: tl.constexpr,
 ):
     """Find the units of all Gaussians, in the ``order`` [N] of depth; one lane per Gaussian.
 
-    In: ``unit_ends`` [N], the running sum of ``row_counts`` in that order. Out: ``first_units``
-    [N], the first unit of each Gaussian; and for each unit its Gaussian, its first block and its
-    number of blocks, which may be 0. Units from ``capacity`` on are not written.
+    In: ``unit_ends`` [N], the running sum of the row counts in that order. Out, in ``found``
+    (`Units`): the first unit of each Gaussian; and for each unit its Gaussian, its first block and
+    its number of blocks, which may be 0. Units from ``capacity`` on are not written.
     """
     rank = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
     inside = rank < count
     index = tl.load(order + rank, mask=inside, other=0)
-    rows = tl.load(row_counts + index, mask=inside, other=0)
+    rows = tl.load(projected.row_counts + index, mask=inside, other=0)
     unit = tl.load(unit_ends + rank, mask=inside, other=0) - rows
-    tl.store(first_units + index, unit, mask=inside)
+    tl.store(found.first + index, unit, mask=inside)
     place = index * RECORD
     columns = tl.load(record_ints + place + COLUMNS, mask=rows > 0, other=0)
     first_row = tl.load(record_ints + place + FIRST_ROW, mask=rows > 0, other=0)
     first, past = columns & 0xFFFF, columns >> 16
     for k in range(0, tl.max(rows, 0)):
         active = (k < rows) & (unit + k < capacity)
-        low, high = _span(records, place, first_row + k, first, past, active)
-        tl.store(unit_owners + unit + k, index.to(tl.int32), mask=active)
-        tl.store(unit_blocks + unit + k, (first_row + k) * blocks_x + low, mask=active)
-        tl.store(unit_widths + unit + k, tl.maximum(high - low, 0), mask=active)
+        low, high = _span(projected.records, place, first_row + k, first, past, active)
+        tl.store(found.owners + unit + k, index.to(tl.int32), mask=active)
+        tl.store(found.blocks + unit + k, (first_row + k) * blocks_x + low, mask=active)
+        tl.store(found.widths + unit + k, tl.maximum(high - low, 0), mask=active)
 
 
 @triton.jit(do_not_specialize=["count", "capacity"])
-def summarise(unit_ends, count, pair_ends, capacity, flags, background, status):
-    """Fill ``status`` [3] int64: number of units, number of pairs, and 1 if a value is bad.
+def summarise(unit_ends, count, capacity, flags, background, found):
+    """Fill the status of ``found`` (`Units`): numbers of units and pairs, 1 if a value is bad.
 
     The number of pairs is correct only if there are at most ``capacity`` units.
     """
     units = tl.load(unit_ends + count - 1, mask=count > 0, other=0)
-    pairs = tl.load(pair_ends + capacity - 1)
+    pairs = tl.load(found.pair_ends + capacity - 1)
     channel = tl.arange(0, 4)
     light = tl.load(background + channel, mask=channel < 3, other=0.0)
     bad = tl.load(flags) | tl.max((~(tl.abs(light) < float("inf"))).to(tl.int32), 0)
-    tl.store(status, units)
-    tl.store(status + 1, pairs)
-    tl.store(status + 2, bad.to(tl.int64))
+    tl.store(found.status, units)
+    tl.store(found.status + 1, pairs)
+    tl.store(found.status + 2, bad.to(tl.int64))
 
 
 @triton.jit
@@ -154,28 +152,17 @@ def units_that_fit(status, units, pairs):
 
 
 @triton.jit(do_not_specialize=["units", "pairs"])
-def write_pairs(
-    unit_owners,
-    unit_blocks,
-    unit_widths,
-    pair_ends,
-    status,
-    units,
-    pairs,
-    keys,
-    owners,
-    GROUP: tl.constexpr,
-):
+def write_pairs(found, units, pairs, keys, owners, GROUP: tl.constexpr):
     """Write the block (``keys``) and the Gaussian (``owners``) of each slot, both [pairs].
 
-    Each lane handles one unit. See `units_that_fit`.
+    Each lane handles one unit of ``found`` (`Units`). See `units_that_fit`.
     """
     unit = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
-    inside = unit < units_that_fit(status, units, pairs)
-    width = tl.load(unit_widths + unit, mask=inside, other=0)
-    slot = tl.load(pair_ends + unit, mask=inside, other=0) - width
-    block = tl.load(unit_blocks + unit, mask=inside, other=0)
-    owner = tl.load(unit_owners + unit, mask=inside, other=0)
+    inside = unit < units_that_fit(found.status, units, pairs)
+    width = tl.load(found.widths + unit, mask=inside, other=0)
+    slot = tl.load(found.pair_ends + unit, mask=inside, other=0) - width
+    block = tl.load(found.blocks + unit, mask=inside, other=0)
+    owner = tl.load(found.owners + unit, mask=inside, other=0)
     for k in range(0, tl.max(width, 0)):
         tl.store(keys + slot + k, (block + k).to(keys.dtype.element_ty), mask=k < width)
         tl.store(owners + slot + k, owner, mask=k < width)
@@ -232,15 +219,6 @@ class Lists(NamedTuple):
     slots: Tensor  # [P] int64 slot of each entry
 
 
-class Rows(NamedTuple):
-    """The places of the rows of Gaussians, those of their units: see `sum_rows`."""
-
-    counts: Tensor  # [N] int32 number of units of each Gaussian
-    first_units: Tensor  # [N] int64
-    pair_ends: Tensor  # [R] int64
-    unit_widths: Tensor  # [R] int32
-
-
 class Blocks(NamedTuple):
     """Inputs of all kernels that go through the lists of blocks."""
 
@@ -269,55 +247,63 @@ def sort_by_depth(scratch: Workspace, projected: Projected, keys: Tensor) -> tup
     return order, unit_ends
 
 
-def find_all_units(
-    memory: Workspace,
-    scratch: Workspace,
-    projected: Projected,
-    order: Tensor,
-    unit_ends: Tensor,
-    capacity: int,
-    blocks_x: int,
-    flags: Tensor,
-    background: Tensor,
-) -> Units:
-    """Find the units of all Gaussians in ``order``, as many as ``capacity`` admits.
+@dataclass
+class Started:
+    """A render up to its units. The host does not know yet how many there are."""
 
-    The host does not wait: the device keeps the real numbers of units and pairs in ``status``.
-    """
-    count = len(order)
-    units = Units(
-        memory.take("first_units", count, torch.int64),
-        memory.take("unit_widths", capacity, torch.int32).zero_(),
-        memory.take("unit_blocks", capacity, torch.int32),
-        memory.take("pair_ends", capacity, torch.int64),
-        scratch.take("unit_owners", capacity, torch.int32),
-        memory.take("status", 3, torch.int64),
-    )
-    launch(find_units, count, 128)(
-        order=order,
-        count=count,
-        row_counts=projected.row_counts,
-        unit_ends=unit_ends,
-        records=projected.records,
-        record_ints=projected.records.view(torch.int32),
-        blocks_x=blocks_x,
-        capacity=capacity,
-        first_units=units.first,
-        unit_owners=units.owners,
-        unit_blocks=units.blocks,
-        unit_widths=units.widths,
-    )
-    torch.cumsum(units.widths, 0, out=units.pair_ends)
-    launch_grid(summarise, 1)(
-        unit_ends=unit_ends,
-        count=count,
-        pair_ends=units.pair_ends,
-        capacity=capacity,
-        flags=flags,
-        background=background,
-        status=units.status,
-    )
-    return units
+    request: RenderRequest
+    view: Tensor  # [24] float32, the numbers of the camera
+    memory: Workspace  # of what the backward pass needs
+    scratch: Workspace
+    allocate: Allocate
+    radii: Tensor  # [N] int32
+    projected: Projected
+    order: Tensor  # [N] int64 Gaussians by depth
+    unit_ends: Tensor  # [N] int64
+    flags: Tensor  # [1] int32
+    units: Units = field(init=False)  # of the last `find_units`
+
+    @property
+    def blocks_x(self) -> int:
+        return -(-self.request.camera.width // BLOCK_WIDTH.value)
+
+    @property
+    def blocks(self) -> int:
+        return self.blocks_x * -(-self.request.camera.height // BLOCK_HEIGHT.value)
+
+    def find_units(self, capacity: int) -> None:
+        """Find the units of all Gaussians, as many as ``capacity`` admits.
+
+        The host does not wait: the device keeps the real numbers of units and pairs in ``status``.
+        """
+        memory, count = self.memory, len(self.order)
+        self.units = Units(
+            memory.take("first_units", count, torch.int64),
+            memory.take("unit_widths", capacity, torch.int32).zero_(),
+            memory.take("unit_blocks", capacity, torch.int32),
+            memory.take("pair_ends", capacity, torch.int64),
+            self.scratch.take("unit_owners", capacity, torch.int32),
+            memory.take("status", 3, torch.int64),
+        )
+        launch(find_units, count, 128)(
+            order=self.order,
+            count=count,
+            unit_ends=self.unit_ends,
+            projected=self.projected,
+            record_ints=self.projected.records.view(torch.int32),
+            blocks_x=self.blocks_x,
+            capacity=capacity,
+            found=self.units,
+        )
+        torch.cumsum(self.units.widths, 0, out=self.units.pair_ends)
+        launch_grid(summarise, 1)(
+            unit_ends=self.unit_ends,
+            count=count,
+            capacity=capacity,
+            flags=self.flags,
+            background=self.request.background,
+            found=self.units,
+        )
 
 
 def check_pairs(pairs: int) -> None:
@@ -328,27 +314,18 @@ def check_pairs(pairs: int) -> None:
         )
 
 
-def make_lists(
-    memory: Workspace, scratch: Workspace, units: Units, room: Room, blocks: int
-) -> Lists:
+def make_lists(started: Started, room: Room) -> Lists:
     """Sort the pairs of all units by block; within a block they stay front to back.
 
     Pairs that ``room`` has more than there are sort behind the last block.
     """
-    pairs = room.pairs
+    memory, scratch, blocks, pairs = started.memory, started.scratch, started.blocks, room.pairs
     key_type = torch.int16 if blocks <= MAX_INT16 else torch.int32
     block_keys = scratch.take(f"block_keys_{key_type}", pairs, key_type).fill_(blocks)
     sorted_keys = scratch.take(f"sorted_keys_{key_type}", pairs, key_type)
     slot_owners = scratch.take("slot_owners", pairs, torch.int32)
     launch(write_pairs, room.units, 128)(
-        unit_owners=units.owners,
-        unit_blocks=units.blocks,
-        unit_widths=units.widths,
-        pair_ends=units.pair_ends,
-        status=units.status,
-        **room._asdict(),
-        keys=block_keys,
-        owners=slot_owners,
+        found=started.units, **room._asdict(), keys=block_keys, owners=slot_owners
     )
     slots = memory.take("slots", pairs, torch.int64)
     torch.sort(block_keys, stable=True, out=(sorted_keys, slots))

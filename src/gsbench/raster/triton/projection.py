@@ -12,87 +12,58 @@ from gsbench.raster.base import CONSTANTS
 from gsbench.raster.staged import MIN_QUATERNION_NORM
 from gsbench.raster.triton.geometry import (
     F0,
-    OF_LANES,
     colors,
+    contour_range,
+    covariance_gradients,
+    dot,
+    exponentials,
+    from_camera,
+    image_axes,
+    image_rows,
     load_camera,
     load_quaternion,
     load_vector,
+    minus,
     normalized,
+    plus,
+    position_gradient,
+    quaternion_gradient,
+    radius_of,
+    record_entries,
+    scaled,
+    splitting_entries,
+    spread,
     store_gradients,
     store_or_zero,
     store_vector,
+    stretched,
+    through,
+    tile_range,
+    view_axes,
 )
 from gsbench.raster.triton.layout import (
     ALPHA_MIN,
     BLOCK_HEIGHT,
     BLOCK_ROWS,
     BLOCK_WIDTH,
-    BLUE,
     CLAMPED,
     COLUMNS,
-    CURVE_T,
-    CURVE_Y,
     FIRST_ROW,
-    GREEN,
     LOG2_ALPHA_MIN,
     LOG2_E,
-    LOG2_OPACITY,
-    MEAN_X,
-    MEAN_Y,
     RECORD,
-    RED,
     RIGHTMOST_Y,
     ROW,
-    SHEAR,
     TILE,
 )
 from gsbench.raster.triton.lists import lists_fit, units_that_fit
 
-clamped_slopes, image_rows, view_axes = (
-    OF_LANES.clamped_slopes,
-    OF_LANES.image_rows,
-    OF_LANES.view_axes,
-)
-dot, minus, plus, scaled = OF_LANES.dot, OF_LANES.minus, OF_LANES.plus, OF_LANES.scaled
-stretched, through, times = OF_LANES.stretched, OF_LANES.through, OF_LANES.times
-from_camera, rotation_matrix = OF_LANES.from_camera, OF_LANES.rotation_matrix
-covariance_gradients, spread = OF_LANES.covariance_gradients, OF_LANES.spread
-position_gradient = OF_LANES.position_gradient
-quaternion_gradient = OF_LANES.quaternion_gradient
-
 NEAR = tl.constexpr(CONSTANTS.near)
-SIGMA_EXTENT = tl.constexpr(CONSTANTS.sigma_extent)
-EIGENVALUE_FLOOR = tl.constexpr(CONSTANTS.eigenvalue_floor)
-MAX_RADIUS = tl.constexpr(CONSTANTS.max_radius)
 MAX_CENTER = tl.constexpr(CONSTANTS.max_center)
 MAX_VARIANCE = tl.constexpr(CONSTANTS.max_variance)
 MIN_SQUARED_NORM = tl.constexpr(MIN_QUATERNION_NORM**2)
-CONTOUR_MARGIN = tl.constexpr(CONSTANTS.contour_margin)
 LAST_KEY = tl.constexpr(2**31 - 1)  # sorts behind every depth
 INVISIBLE = tl.constexpr(-1e9)  # log2(opacity) of the invisible record
-
-
-@triton.jit
-def _tile_range(low, high, tiles, SIZE: tl.constexpr):
-    """First and past-the-last tile of ``SIZE`` px for the pixels ``low`` to ``high`` - 1; int32."""
-    first = tl.floor(tl.minimum(tl.maximum(low * (1.0 / SIZE), 0.0), tiles))
-    past = tl.floor(tl.minimum(tl.maximum((high + (SIZE - 1)) * (1.0 / SIZE), 0.0), tiles))
-    return first.to(tl.int32), past.to(tl.int32)
-
-
-@triton.jit
-def _contour_range(center, half, blocks, SIZE: tl.constexpr):
-    """The blocks of ``SIZE`` px within ``half`` px of ``center``, with a margin for rounding."""
-    half = half * (1 + CONTOUR_MARGIN) + CONTOUR_MARGIN
-    return _tile_range(tl.ceil(center - half), tl.floor(center + half) + 1, blocks, SIZE)
-
-
-@triton.jit
-def _ellipse(quaternion, log_scale, axis_x, axis_y):
-    """R, the scales S, and the rows of N = A R. The covariance is M M^T, M = N S (3DGS eq. 6)."""
-    matrix = rotation_matrix(quaternion)
-    scales = (tl.exp(log_scale[0]), tl.exp(log_scale[1]), tl.exp(log_scale[2]))
-    return matrix, scales, times(axis_x, matrix), times(axis_y, matrix)
 
 
 @triton.jit(do_not_specialize=["count"])
@@ -136,22 +107,17 @@ def project(
     x, y, z = through(view_axes(v), offset)
     visible = inside & (z > NEAR)
     inverse_z = 1.0 / tl.where(visible, z, 1.0)
-    column = x * inverse_z * v.fx + v.pixel_cx
-    row = y * inverse_z * v.fy + v.pixel_cy
-    slope_x, slope_y = clamped_slopes(x * inverse_z, y * inverse_z, v)
-    axis_x, axis_y = image_rows(slope_x, slope_y, inverse_z, v)
-    _, scales, n0, n1 = _ellipse(quaternion, log_scale, axis_x, axis_y)
+    free_x, free_y = x * inverse_z, y * inverse_z
+    column, row = free_x * v.fx + v.pixel_cx, free_y * v.fy + v.pixel_cy
+    _, n0, n1 = image_axes(free_x, free_y, inverse_z, quaternion, v)
+    scales = exponentials(log_scale)
     m0, m1 = scaled(n0, scales), scaled(n1, scales)
     visible &= (tl.abs(column) < MAX_CENTER) & (tl.abs(row) < MAX_CENTER)
     visible &= dot(m0, m0) + dot(m1, m1) < MAX_VARIANCE
     xx, xy, yy, a = spread(m0, m1)
-    # radius = ceil(3 sqrt(largest eigenvalue)), as preprocessCUDA of 3DGS computes it. The
-    # discriminant (trace / 2)^2 - det is written as a sum of squares, so it is never negative.
-    half = (xx - yy) * 0.5
-    largest = (xx + yy) * 0.5 + tl.sqrt(tl.maximum(half * half + xy * xy, EIGENVALUE_FLOOR))
-    radius = tl.minimum(tl.ceil(tl.sqrt(largest) * SIGMA_EXTENT), MAX_RADIUS)
-    first_x, past_x = _tile_range(column - radius, column + radius, v.tiles_x, TILE)
-    first_y, past_y = _tile_range(row - radius, row + radius, v.tiles_y, TILE)
+    radius = radius_of(xx, xy, yy)
+    first_x, past_x = tile_range(column - radius, column + radius, v.tiles_x, TILE)
+    first_y, past_y = tile_range(row - radius, row + radius, v.tiles_y, TILE)
     visible &= (first_x < past_x) & (first_y < past_y)
     tl.store(radii + index, tl.where(visible, radius, 0.0).to(tl.int32), mask=inside)
 
@@ -162,13 +128,14 @@ def project(
     reach = tl.maximum((log2_opacity - LOG2_ALPHA_MIN) * (2 / LOG2_E), 0.0)
     blocks_x = tl.ceil(v.width * (1.0 / BLOCK_WIDTH))
     blocks_y = tl.ceil(v.height * (1.0 / BLOCK_HEIGHT))
-    inner_x, outer_x = _contour_range(column, tl.sqrt(reach * xx), blocks_x, BLOCK_WIDTH)
-    inner_y, outer_y = _contour_range(row, tl.sqrt(reach * yy), blocks_y, BLOCK_HEIGHT)
+    inner_x, outer_x = contour_range(column, tl.sqrt(reach * xx), blocks_x, BLOCK_WIDTH)
+    inner_y, outer_y = contour_range(row, tl.sqrt(reach * yy), blocks_y, BLOCK_HEIGHT)
     first_x, past_x = tl.maximum(first_x, inner_x), tl.minimum(past_x, outer_x)
     first_y = tl.maximum(first_y * BLOCK_ROWS, inner_y)
     past_y = tl.minimum(past_y * BLOCK_ROWS, outer_y)
     seen = visible & (growth * ALPHA_MIN < 1.0) & (first_x < past_x) & (first_y < past_y)
-    tl.store(projected.row_counts + index, tl.where(seen, past_y - first_y, 0), mask=inside)
+    row_counts = tl.where(seen, past_y - first_y, 0).to(tl.int32)
+    tl.store(projected.row_counts + index, row_counts, mask=inside)
     # The bits of positive float32 numbers sort like the numbers.
     tl.store(keys + index, tl.where(seen, z.to(tl.int32, bitcast=True), LAST_KEY), mask=inside)
 
@@ -185,44 +152,30 @@ def project(
     place = index * RECORD
     seen |= index == count
     log2_opacity = tl.where(inside, log2_opacity, INVISIBLE)
-    tl.store(records + place + MEAN_X, column, mask=seen)
-    tl.store(records + place + MEAN_Y, row, mask=seen)
-    tl.store(records + place + SHEAR, -xy / yy, mask=seen)
-    tl.store(records + place + CURVE_T, a * (-0.5 * LOG2_E), mask=seen)
-    tl.store(records + place + CURVE_Y, 1.0 / yy * (-0.5 * LOG2_E), mask=seen)
-    tl.store(records + place + LOG2_OPACITY, log2_opacity, mask=seen)
-    tl.store(records + place + RED, tl.maximum(red, 0.0), mask=seen)
-    tl.store(records + place + GREEN, tl.maximum(green, 0.0), mask=seen)
-    tl.store(records + place + BLUE, tl.maximum(blue, 0.0), mask=seen)
+    curve_y = 1.0 / yy * (-0.5 * LOG2_E)
+    entries = record_entries(column, row, -xy / yy, a, curve_y, log2_opacity, rgb)
+    for k in tl.static_range(9):
+        tl.store(records + place + k, entries[k], mask=seen)
     tl.store(records + place + RIGHTMOST_Y, xy * tl.sqrt(reach / xx), mask=seen)
-    tl.store(record_ints + place + COLUMNS, first_x + (past_x << 16), mask=seen)
-    tl.store(record_ints + place + FIRST_ROW, first_y, mask=seen)
+    columns = first_x.to(tl.int32) + (past_x.to(tl.int32) << 16)
+    tl.store(record_ints + place + COLUMNS, columns, mask=seen)
+    tl.store(record_ints + place + FIRST_ROW, first_y.to(tl.int32), mask=seen)
     tl.store(record_ints + place + CLAMPED, clamped, mask=seen)
     tl.store(flags, 1, mask=tl.max((bad & inside).to(tl.int32), 0) > 0)
 
 
 @triton.jit(do_not_specialize=["units", "pairs"])
-def sum_units(
-    pair_ends,
-    unit_widths,
-    unit_blocks,
-    last_slots,
-    status,
-    units,
-    pairs,
-    rows,
-    GROUP: tl.constexpr,
-):
-    """Sum the ``rows`` [pairs, 16] of each unit, which are adjacent, into its first row.
+def sum_units(found, last_slots, units, pairs, rows, GROUP: tl.constexpr):
+    """Sum the ``rows`` [pairs, 16] of each unit of ``found`` (`Units`), into its first row.
 
     Only rows of entries that compositing reached have been written. These are the slots up to
     ``last_slots`` [blocks], because the slots in the list of a block rise.
     """
     unit = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
-    inside = unit < units_that_fit(status, units, pairs)
-    width = tl.load(unit_widths + unit, mask=inside, other=0)
-    first = tl.load(pair_ends + unit, mask=inside, other=0) - width
-    block = tl.load(unit_blocks + unit, mask=inside, other=0)
+    inside = unit < units_that_fit(found.status, units, pairs)
+    width = tl.load(found.widths + unit, mask=inside, other=0)
+    first = tl.load(found.pair_ends + unit, mask=inside, other=0) - width
+    block = tl.load(found.blocks + unit, mask=inside, other=0)
     place = rows + first[:, None] * ROW + tl.arange(0, ROW)[None, :]  # [GROUP, ROW]
     total = tl.zeros([GROUP, ROW], tl.float32)
     for k in range(0, tl.max(width, 0)):
@@ -233,13 +186,13 @@ def sum_units(
 
 
 @triton.jit
-def sum_rows(index, own_rows, where, rows, NUMBERS: tl.constexpr):
+def sum_rows(index, own_rows, found, rows, NUMBERS: tl.constexpr):
     """Sum the first ``NUMBERS`` columns of the ``rows`` of each Gaussian over its units.
 
-    ``own_rows`` is the number of units of each Gaussian, ``where`` are `Rows`. ``sum_units`` has
+    ``own_rows`` is the number of units of each Gaussian, ``found`` are `Units`. ``sum_units`` has
     already summed the pairs of each unit into the row of its first pair.
     """
-    unit = tl.load(where.first_units + index, mask=own_rows > 0, other=0)
+    unit = tl.load(found.first + index, mask=own_rows > 0, other=0)
     zero = tl.zeros_like(own_rows).to(tl.float32)
     # Triton's tuples grow by ``+``; it knows neither ``*`` nor comprehensions.
     sums = ()
@@ -247,8 +200,8 @@ def sum_rows(index, own_rows, where, rows, NUMBERS: tl.constexpr):
         sums = sums + (zero,)  # type: ignore[assignment]  # noqa: RUF005
     for k in range(0, tl.max(own_rows, 0)):
         active = k < own_rows
-        width = tl.load(where.unit_widths + unit + k, mask=active, other=0)
-        slot = tl.load(where.pair_ends + unit + k, mask=active, other=0) - width
+        width = tl.load(found.widths + unit + k, mask=active, other=0)
+        slot = tl.load(found.pair_ends + unit + k, mask=active, other=0) - width
         grown = ()
         for n in tl.static_range(NUMBERS):
             own = tl.load(rows + slot * ROW + n, mask=width > 0, other=0.0)
@@ -269,15 +222,22 @@ def _turned(to, inverse_distance, g_rgb, color_slopes, index, mask, DEGREE: tl.c
     return stretched(minus(turned, dot(turned, to), to), inverse_distance)
 
 
+@triton.jit
+def store_splitting(g_extra, index, d00, d01, d11, shear, rows, seen, inside):
+    """Write the splitting matrices to ``g_extra`` [N, 9]; see `formulas.splitting_entries`."""
+    entries = splitting_entries(d00, d01, d11, shear, rows)
+    for k in tl.static_range(9):
+        store_or_zero(g_extra + 9 * index + k, entries[k], seen, inside)
+
+
 @triton.jit(do_not_specialize=["count", "units", "pairs"])
 def backproject(
     gaussians,
     count,
     camera,
+    projected,
     record_ints,
-    color_slopes,
-    where,
-    status,
+    found,
     units,
     pairs,
     rows,
@@ -290,19 +250,19 @@ def backproject(
     EXTRA: tl.constexpr,
     GROUP: tl.constexpr,
 ):
-    """Write the ``gradients`` of Gaussians that are seen: those with a row in ``where`` (`Rows`).
+    """Write the ``gradients`` of Gaussians that are seen: those with units.
 
     Other gradients are not changed, except that ``g_screen``, ``g_absolute`` and ``g_extra``
-    become 0. ``EXTRA`` is the function that writes ``g_extra``, for example that of
-    `raster.triton.splitting`, or None. See `lists_fit` for ``status``, ``units`` and ``pairs``.
+    become 0. ``EXTRA`` is the function that writes ``g_extra``, such as `store_splitting`, or None.
+    See `lists_fit` for ``units`` and ``pairs``.
     """
     v = load_camera(camera)
     index = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
     inside = index < count
-    seeable = inside & lists_fit(status, units, pairs)
-    row_count = tl.load(where.counts + index, mask=seeable, other=0)
+    seeable = inside & lists_fit(found.status, units, pairs)
+    row_count = tl.load(projected.row_counts + index, mask=seeable, other=0)
     seen = row_count > 0
-    sums = sum_rows(index, row_count, where, rows, 9 + 2 * ABSOLUTE)
+    sums = sum_rows(index, row_count, found, rows, 9 + 2 * ABSOLUTE)
     h, h_t, h_y, h_tt, h_ty, h_yy, red, green, blue = sums[:9]
     mean = load_vector(gaussians.means, index, seen)
     log_scale = load_vector(gaussians.log_scales, index, seen)
@@ -317,16 +277,16 @@ def backproject(
     )
     store_vector(gradients.sh_dc, index, stretched(g_rgb, F0), seen)
     to, inverse_distance = normalized(offset)
-    tangent = _turned(to, inverse_distance, g_rgb, color_slopes, index, seen, DEGREE)
+    slopes = projected.color_slopes
+    tangent = _turned(to, inverse_distance, g_rgb, slopes, index, seen, DEGREE)
 
     # Repeat the geometry of the forward pass.
     quaternion, inverse_norm, _ = load_quaternion(gaussians.quaternions, index, seen)
     x, y, z = through(view_axes(v), offset)
     inverse_z = 1.0 / tl.where(seen, z, 1.0)
     free_x, free_y = x * inverse_z, y * inverse_z
-    slope_x, slope_y = clamped_slopes(free_x, free_y, v)
-    axis_x, axis_y = image_rows(slope_x, slope_y, inverse_z, v)
-    matrix, scales, n0, n1 = _ellipse(quaternion, log_scale, axis_x, axis_y)
+    matrix, n0, n1 = image_axes(free_x, free_y, inverse_z, quaternion, v)
+    scales = exponentials(log_scale)
     _, xy, yy, a = spread(scaled(n0, scales), scaled(n1, scales))
     e, shear = 1.0 / yy, -xy / yy  # power = -(a t^2 + e dy^2) / 2, t = dx + shear dy
 

@@ -8,7 +8,7 @@ from math import exp, floor, inf, sqrt
 import numpy as np
 
 from gsbench.scene.courtyard.layout import BOX, SPHERE
-from gsbench.scene.courtyard.textures import blend, clamp, ground, octaves, shade_factors
+from gsbench.scene.courtyard.textures import blend, ground, octaves, shade_factors, unit
 from gsbench.system.jit import inlined, kernel
 
 GROUND, SKY = -1, -2
@@ -134,9 +134,6 @@ def cast(layout, origin, direction, any_hit):
         for i in range(layout.group_start[g], layout.group_start[g + 1]):
             size, rotation = layout.size[i], layout.rotation[i]
             start = minus(origin, layout.center[i])
-            along = dot(start, direction)
-            if along * along < dot(start, start) - size[3] * size[3]:
-                continue  # misses the bounding sphere
             local = to_local(rotation, start), to_local(rotation, direction)
             t = hit_primitive(layout.kind[i], size, local[0], local[1])
             if t < best:
@@ -168,19 +165,14 @@ def nearest_surface(layout, point, limit):
     """The smallest |distance| from a point to any surface or the ground, at most ``limit``."""
     best = min(abs(point[2]), limit)
     for g in range(len(layout.group_low)):
-        below, above = minus(layout.group_low[g], point), minus(point, layout.group_high[g])
-        away = (
-            max(below[0], 0.0, above[0]),
-            max(below[1], 0.0, above[1]),
-            max(below[2], 0.0, above[2]),
-        )
+        low, high, away = layout.group_low[g], layout.group_high[g], 0.0
+        for k in range(3):
+            away += max(low[k] - point[k], 0.0, point[k] - high[k]) ** 2
         # no primitive in the group's box can be nearer than the box itself
-        if dot(away, away) >= best * best:
+        if away >= best * best:
             continue
         for i in range(layout.group_start[g], layout.group_start[g + 1]):
             size, offset = layout.size[i], minus(point, layout.center[i])
-            if dot(offset, offset) >= (best + size[3]) ** 2:
-                continue
             local = to_local(layout.rotation[i], offset)
             best = min(best, abs(signed_distance(layout.kind[i], size, local)))
     return best
@@ -221,11 +213,11 @@ def local_normal(kind, size, point):
 @inlined
 def sky(direction, seed):
     """The colour of the sky in a direction: a gradient with faint clouds."""
-    up = clamp(direction[2], 0.0, 1.0)
+    up = unit(direction[2])
     mist = exp(-5.0 * up)
     scale = 1.0 / (up + 0.18)
     place = direction[0] * scale, direction[1] * scale, 0.0
-    cloud = clamp(octaves(place, 1.1, 5, 0.55, 0.02, seed + 301) * 0.9, 0.0, 1.0)
+    cloud = unit(octaves(place, 1.1, 5, 0.55, 0.02, seed + 301) * 0.9)
     clear = 0.24 + 0.50 * mist, 0.42 + 0.42 * mist, 0.80 + 0.16 * mist
     return blend(clear, cloud, (0.95, 0.96, 0.98))
 
@@ -286,7 +278,7 @@ def encode(value):
         value = 0.6 + 0.4 * (1.0 - exp(-(value - 0.6) / 0.4))
     # IEC 61966-2-1
     srgb = 12.92 * value if value <= 0.0031308 else 1.055 * value ** (1 / 2.4) - 0.055
-    return floor(255.0 * clamp(srgb, 0.0, 1.0) + 0.5)
+    return floor(255.0 * unit(srgb) + 0.5)
 
 
 @kernel

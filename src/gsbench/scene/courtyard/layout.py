@@ -4,16 +4,13 @@ from collections.abc import Callable, Iterator
 from enum import IntEnum
 from itertools import pairwise, product
 from math import cos, radians, sin
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
-from gsbench.parsing import SafeLoader
+from gsbench.parsing import table_beside
 
-PLAN = Path(__file__).with_name("plan.yaml")
 BOX, SPHERE, TUBE = 0, 1, 2
 X, Y, Z = 0, 1, 2
 Material = IntEnum(
@@ -24,15 +21,15 @@ Material = IntEnum(
 class Layout(NamedTuple):
     """The primitives as arrays, sorted by group; rays test the bounding box of a group first.
 
-    The first three values of ``size`` are half extents of a BOX, (radius, -, -) of a SPHERE, or
-    (outer radius, half height, inner radius or 0) of a TUBE, whose axis is local z. The fourth is
-    the radius of the bounding sphere. ``rotation`` [S, 3, 3] maps local to world directions.
+    The values of ``size`` are half extents of a BOX, (radius, -, -) of a SPHERE, or (outer radius,
+    half height, inner radius or 0) of a TUBE, whose axis is local z. ``rotation`` [S, 3, 3] maps
+    local to world directions.
     """
 
     kind: NDArray[np.int64]  # [S]
     center: NDArray[np.float64]  # [S, 3] m
     rotation: NDArray[np.float64]  # [S, 3, 3]
-    size: NDArray[np.float64]  # [S, 4] m
+    size: NDArray[np.float64]  # [S, 3] m
     material: NDArray[np.int64]  # [S]
     tint: NDArray[np.float64]  # [S, 3] linear RGB
     group_start: NDArray[np.int64]  # [G + 1] first primitive of each group
@@ -46,7 +43,7 @@ Solid = tuple[int, tuple[float, ...], tuple[float, ...], str, NDArray[np.float64
 
 def build_layout(seed: int) -> Layout:
     """Build the courtyard. The plan is fixed; the seed varies small objects and shrubs."""
-    plan = yaml.load(PLAN.read_text(encoding="utf-8"), Loader=SafeLoader)
+    plan = table_beside(__file__, "plan.yaml")
     rng, rows, starts = np.random.default_rng(seed), list[Any](), [0]
 
     def draw(value: Any) -> float:
@@ -65,23 +62,17 @@ def build_layout(seed: int) -> Layout:
                 lengths = [scale * draw(length) for length in lengths]
                 for kind, at, size, own, rotation in FORMS[form](*lengths, paint, *angles):
                     material, *tint = paints[own]
-                    center, reach = np.array([x, y, 0.0]) + turn @ at, _bounding_radius(kind, size)
+                    center = np.array([x, y, 0.0]) + turn @ at
                     # Half the sides of an upright box around the solid, widened by 1e-6 m.
                     half = np.array((size[0], *size[:2]) if kind == TUBE else size)
-                    half = np.minimum(np.abs(turn @ rotation) @ half, reach) + 1e-6
+                    half = np.abs(turn @ rotation) @ half + 1e-6
                     look = Material[material.upper()], tint, center - half, center + half
-                    rows.append((kind, center, turn @ rotation, (*size, reach), *look))
+                    rows.append((kind, center, turn @ rotation, size, *look))
             starts.append(len(rows))
     *columns, low, high = map(np.array, zip(*rows, strict=True))
     groups = [slice(*ends) for ends in pairwise(starts)]
     boxes = [low[own].min(axis=0) for own in groups], [high[own].max(axis=0) for own in groups]
     return Layout(*columns, *map(np.array, (starts, *boxes)))
-
-
-def _bounding_radius(kind: int, size: tuple[float, ...]) -> float:
-    if kind == SPHERE:
-        return size[0]
-    return float(np.linalg.norm(size if kind == BOX else size[:2]))
 
 
 def _rotation(degrees: float, axis: int) -> NDArray[np.float64]:

@@ -50,9 +50,15 @@ def noise(point, cell, seed):
 
 
 @inlined
+def unit(value):
+    """The nearest number in [0, 1]."""
+    return min(1.0, max(0.0, value))
+
+
+@inlined
 def visible(cell, footprint):
     """The weight of a detail of size ``cell``: 0 up to one pixel of ``footprint``, 1 from two."""
-    return min(1.0, max(0.0, cell / footprint - 1.0))
+    return unit(cell / footprint - 1.0)
 
 
 @inlined
@@ -101,11 +107,6 @@ def groove(position, period, width, footprint):
 
 
 @inlined
-def clamp(value, low, high):
-    return min(high, max(low, value))
-
-
-@inlined
 def blend(color, share, other):
     """``color`` with a ``share`` of the ``other`` colour."""
     return (
@@ -133,23 +134,23 @@ def ground(point, footprint, seed):
     blades = octaves((x * 1.5, y, 0.0), 0.14, 4, 0.85, 0.8 * footprint, seed + 31)
     tuft = noise(flat, 0.33, seed + 41)
     light = 1.0 + 0.10 * patch + 0.13 * blades + 0.06 * tuft
-    dry = clamp(0.35 + 0.30 * patch + 0.12 * tuft, 0.0, 1.0)
+    dry = unit(0.35 + 0.30 * patch + 0.12 * tuft)
     color = (
         light * (0.092 + 0.062 * dry),
         light * (0.135 + 0.020 * dry),
         light * (0.036 + 0.014 * dry),
     )
-    inside = clamp(0.5 - path / edge, 0.0, 1.0)
+    inside = unit(0.5 - path / edge)
     if inside > 0.0:
         _, border, shade = pebbles(x, y, 0.055, seed + 51)
         sharp = visible(0.055, footprint)
-        gap = clamp(1.0 - 4.0 * border, 0.0, 1.0)
+        gap = unit(1.0 - 4.0 * border)
         stone = 0.27 + sharp * (0.26 * (shade - 0.5) - 0.15 * gap + 0.05)
         stone *= 1.0 + 0.10 * octaves(flat, 0.9, 4, 0.7, footprint, seed + 61)
         warm = 0.06 * sharp * (2.0 * random_cell(int(shade * 4096.0), 5, 0, seed) - 1.0)
         gravel = stone * (1.06 + warm), stone * 0.97, stone * (0.83 - warm)
         color = blend(color, inside, gravel)
-    bare = clamp(0.5 - soil / edge, 0.0, 1.0) * (1.0 - inside)
+    bare = unit(0.5 - soil / edge) * (1.0 - inside)
     if bare > 0.0:
         earth = 1.0 + 0.45 * octaves(flat, 0.16, 4, 0.7, footprint, seed + 71)
         color = blend(color, bare, (earth * 0.115, earth * 0.075, earth * 0.045))
@@ -176,7 +177,7 @@ def shade_factors(material, point, face, footprint, seed):
     elif material == Material.PLASTER:
         stain = octaves(point, 1.3, 3, 0.6, footprint, seed + 111)
         grain = octaves(point, 0.11, 4, 0.8, footprint, seed + 121)
-        damp = clamp(1.0 - (v + 1.95) / 0.9, 0.0, 1.0)
+        damp = unit(1.0 - (v + 1.95) / 0.9)
         light = 1.0 + 0.07 * stain + 0.07 * grain - 0.22 * damp * (0.6 + 0.5 * stain)
         warmth = 0.10 * stain
     elif material in (Material.WOOD, Material.PAINT):
@@ -193,7 +194,7 @@ def shade_factors(material, point, face, footprint, seed):
         shift = u + 0.09 * (row - 2.0 * floor(row / 2.0))
         tile = random_cell(floor(shift / 0.18), row, 6, seed) - 0.5
         ridge = (v / 0.2 - row) if footprint < 0.2 else 0.5
-        moss = clamp(octaves(point, 0.5, 4, 0.7, footprint, seed + 151) - 0.25, 0.0, 1.0)
+        moss = unit(octaves(point, 0.5, 4, 0.7, footprint, seed + 151) - 0.25)
         light = (1.0 + 0.55 * tile * visible(0.18, footprint)) * (0.72 + 0.5 * ridge)
         light *= 1.0 - 0.5 * groove(shift, 0.18, 0.012, footprint)
         warmth = 0.4 * tile - 1.1 * moss
@@ -201,7 +202,7 @@ def shade_factors(material, point, face, footprint, seed):
         _, border, leaf = pebbles(u + 0.31 * pz, v + 0.23 * px, 0.032, seed + 161)
         sharp = visible(0.032, footprint)
         clump = octaves(point, 0.22, 3, 0.7, footprint, seed + 171)
-        gap = clamp(1.0 - 5.0 * border, 0.0, 1.0)
+        gap = unit(1.0 - 5.0 * border)
         light = 0.9 + sharp * (0.9 * (leaf - 0.5) - 0.40 * gap) + 0.40 * clump
         warmth = 0.5 * sharp * (leaf - 0.5) + 0.2 * clump
     elif material == Material.CLAY:
@@ -210,11 +211,11 @@ def shade_factors(material, point, face, footprint, seed):
         warmth = 0.3 * noise(point, 0.15, seed + 182)
     elif material in (Material.WATER, Material.GLASS):
         ripple = octaves(point, 0.4, 2, 0.5, footprint, seed + 191)
-        light = 1.0 + 0.35 * ripple + 0.5 * clamp(v, -0.3, 0.3)
+        light = 1.0 + 0.35 * ripple + 0.5 * min(0.3, max(-0.3, v))
     elif material == Material.METAL:
         rust = octaves(point, 0.1, 4, 0.8, footprint, seed + 201)
         light = 1.0 + 0.4 * rust
-        warmth = 0.8 * clamp(rust, 0.0, 1.0)
+        warmth = 0.8 * unit(rust)
     elif material == Material.LOG:
         radius = sqrt(px * px + py * py)
         bark = octaves((px * 2.0, py * 2.0, pz * 0.35), 0.06, 3, 0.8, footprint, seed + 211)

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from gsbench.init import Sfm
 from gsbench.init.base import TrainingPoints
-from gsbench.init.colmap import alignment, mapping, matches, reconstruct
+from gsbench.init.colmap import alignment, mapping, matches, models
 from gsbench.init.colmap import pairs as pairing
 from gsbench.init.colmap.database import DatabaseTask, create_database, write_features
 from gsbench.init.colmap.matches import verify_pairs
@@ -93,7 +93,7 @@ def test_the_poses_of_two_models_are_paired_by_name():
         turn = pose.rotation.matrix()
         moved[name] = camera_at(scale * -turn.T @ pose.translation + shift, turn)
     first, second = model_of(poses()), model_of(moved)
-    centers, rotations, other_centers, other_rotations = reconstruct.common_poses(first, second)
+    centers, rotations, other_centers, other_rotations = alignment.common_poses(first, second)
     places = [[0.8 * (k - 1.5), 0.2 * k, 0.1] for k in (1, 2, 3)]
     turns = [poses()[name].rotation.matrix() for name in NAMES[1:]]
     assert_allclose(centers, places, atol=1e-12)
@@ -102,8 +102,8 @@ def test_the_poses_of_two_models_are_paired_by_name():
     assert_allclose(other_rotations, rotations, atol=1e-12)
     paired = centers, rotations, other_centers, other_rotations
     assert alignment.align_poses(*paired).scale == pytest.approx(scale)
-    nothing = reconstruct.common_poses(first, pycolmap.Reconstruction())
-    assert [part.shape for part in nothing] == [(0, 3), (0, 3, 3)] * 2
+    nothing = alignment.common_poses(first, pycolmap.Reconstruction())
+    assert [len(part) for part in nothing] == [0] * 4
 
 
 def test_points_of_training_views_keep_place_and_observations_and_get_those_views_colours(tmp_path):
@@ -114,7 +114,7 @@ def test_points_of_training_views_keep_place_and_observations_and_get_those_view
             point.xy = np.array([WIDTH / 2, HEIGHT / 2])
     for index, seen in enumerate(((1, 2, 4), (3, 4), (1, 3))):
         add_point(model, POINTS[index], seen_by=dict.fromkeys(seen, index))
-    found = reconstruct.keep_training_points(model, NAMES[:3], tmp_path)
+    found = models.keep_training_points(model, NAMES[:3], tmp_path)
     assert found == TrainingPoints("train", 2, 3, pytest.approx(1 / 3))
     assert sorted(model.points3D) == [1, 3]
     for number, seen, shade in ((1, [1, 2], 15), (3, [1, 3], 35)):
@@ -125,7 +125,7 @@ def test_points_of_training_views_keep_place_and_observations_and_get_those_view
         for image_id in seen:
             assert model.images[image_id].points2D[number - 1].point3D_id == number
     with refusal(r"init\.points_from=train: no point is left"):
-        reconstruct.keep_training_points(model, NAMES[1:2], tmp_path)
+        models.keep_training_points(model, NAMES[1:2], tmp_path)
 
 
 def test_settings_reach_colmaps_verification():

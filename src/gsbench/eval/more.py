@@ -1,16 +1,67 @@
-"""Metrics after an affine correction of a render's colours.
+"""Metrics that ``eval.more`` names: structural ones, and metrics after a correction of colours.
 
-It is for captures whose exposure or white balance changes. A phone chooses exposure anew for each
-photograph, and no renderer can know the exposure of a test view. Mip-NeRF 360 (Barron et al. 2022)
-and gsplat therefore also report metrics after a map of the render's colours to those of the
-photograph.
+MS-SSIM, IW-SSIM, FSIM with colour and GMSD are measured by the library piq (an extra).
+
+The correction of a render's colours is for captures whose exposure or white balance changes. A
+phone chooses exposure anew for each photograph, and no renderer can know the exposure of a test
+view. Mip-NeRF 360 (Barron et al. 2022) and gsplat therefore also report metrics after an affine map
+of the render's colours to those of the photograph.
 """
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from gsbench.eval.images import in_double_precision
-from gsbench.eval.metric import Measure
+from gsbench.eval.images import as_batch, in_double_precision
+from gsbench.eval.metric import Measure, UnavailableError
+
+
+@dataclass(frozen=True)
+class Structural:
+    """A metric of piq: its function there, and the shortest side of an image that it measures."""
+
+    function: str
+    min_side: int  # px
+
+
+# Five scales leave the window of 11 px inside 161 px. FSIM's limit is ours: phases mean little in
+# an image that holds few of the shortest waves.
+STRUCTURAL = {
+    "ms_ssim": Structural("multi_scale_ssim", 161),
+    "iw_ssim": Structural("information_weighted_ssim", 161),
+    "fsim": Structural("fsim", 16),
+    "gmsd": Structural("gmsd", 2),
+}
+
+
+def load_structural(key: str) -> Callable[[Tensor, Tensor], float]:
+    """piq's metric ``key`` of two images [H, W, 3] in [0, 1], in their precision.
+
+    Raises UnavailableError, with the reason in one line, if piq cannot be imported.
+    """
+    try:
+        import piq
+    # torchvision, which piq needs, raises RuntimeError if it was made for another torch
+    except (ImportError, OSError, RuntimeError) as error:
+        why = str(error).partition("\n")[0]
+        raise UnavailableError(
+            f"it needs the package piq: pip install 'gsbench-3dgs[piq]' ({why})", awaited=True
+        ) from error
+    function: Callable[..., Any] = getattr(piq, STRUCTURAL[key].function)
+
+    def measure(image: Tensor, truth: Tensor) -> float:
+        try:
+            return float(function(as_batch(image), as_batch(truth), data_range=1.0))
+        except RuntimeError as error:  # IW-SSIM inverts a matrix that is singular for a flat view
+            if "singular" not in str(error):
+                raise
+            raise UnavailableError("a view is flat: it has no structure to compare") from error
+
+    return measure
+
 
 ROUNDS = 5  # as in Mip-NeRF 360's evaluation; each leaves out the pixels that the last one clipped
 NO_CONTRAST = 1e-10  # smaller singular values, relative to the largest, are rounding errors

@@ -12,7 +12,7 @@ import pycolmap
 from gsbench.errors import InputError
 from gsbench.init.base import TrainingPoints
 from gsbench.scene.colmap import MIN_TRACK, read_reference
-from gsbench.scene.types import Array, Capture
+from gsbench.scene.types import Array, Capture, extent_of_centers
 
 
 def load_reference(capture: Capture, reference: Path | None) -> pycolmap.Reconstruction | None:
@@ -22,27 +22,23 @@ def load_reference(capture: Capture, reference: Path | None) -> pycolmap.Reconst
     return None if capture.model is None else read_reference(capture)
 
 
-def poses_by_name(model: pycolmap.Reconstruction) -> dict[str, tuple[Array, Array]]:
-    """The camera centre [3] and world-to-camera rotation [3, 3] of each registered image."""
-    return {
-        image.name: (image.projection_center(), image.cam_from_world().rotation.matrix())
-        for image in model.images.values()
-        if image.has_pose
-    }
+def posed_images(model: pycolmap.Reconstruction) -> dict[str, pycolmap.Image]:
+    """The images that have a pose, by name."""
+    return {image.name: image for image in model.images.values() if image.has_pose}
 
 
-def common_poses(
-    model: pycolmap.Reconstruction, reference: pycolmap.Reconstruction
-) -> tuple[Array, Array, Array, Array]:
-    """Centres [N, 3] and rotations [N, 3, 3] of model, then reference, for images posed in both."""
-    both = poses_by_name(model), poses_by_name(reference)
-    names = sorted(both[0].keys() & both[1].keys())
-    # the shapes hold without a common image, too
-    centers, rotations = (
-        [np.array([poses[name][part] for name in names]).reshape(shape) for poses in both]
-        for part, shape in enumerate([(-1, 3), (-1, 3, 3)])
+def training_centers(model: pycolmap.Reconstruction, capture: Capture) -> Array:
+    """The centres [V, 3] of the training images with a pose in the model."""
+    images = posed_images(model)
+    return np.array(
+        [images[name].projection_center() for name in capture.train_names if name in images]
     )
-    return centers[0], rotations[0], centers[1], rotations[1]
+
+
+def training_extent(model: pycolmap.Reconstruction, capture: Capture) -> float:
+    """3DGS's ``cameras_extent`` of the training images with a pose in the model, else 0."""
+    centers = training_centers(model, capture)
+    return extent_of_centers(centers) if len(centers) else 0.0
 
 
 def keep_training_points(
@@ -53,19 +49,19 @@ def keep_training_points(
     Positions do not change. Colours are read again, from the photographs in the folder ``images``.
     """
     before = model.num_points3D()
-    kept = {
-        image.image_id for image in model.images.values() if image.has_pose and image.name in names
-    }
+    kept = {image.image_id for name, image in posed_images(model).items() if name in names}
     for point_id in sorted(model.points3D):
         point = model.points3D[point_id]
-        seen = [element for element in point.track.elements if element.image_id in kept]
-        observations = [(element.image_id, element.point2D_idx) for element in seen]
+        observations = [
+            (element.image_id, element.point2D_idx)
+            for element in point.track.elements
+            if element.image_id in kept
+        ]
         track = pycolmap.Track(
             [pycolmap.TrackElement(*observation) for observation in observations]
         )
         copy = pycolmap.Point3D(xyz=np.array(point.xyz), error=point.error, track=track)
-        # `point` and `seen` are views into the model, and invalid from here on
-        model.delete_point3D(point_id)
+        model.delete_point3D(point_id)  # `point` is a view into the model, and invalid from here on
         if len(dict(observations)) < MIN_TRACK:  # an image may see a point twice
             continue
         model.add_point3D_with_id(point_id, copy)
