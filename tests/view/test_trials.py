@@ -4,7 +4,6 @@ import math
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -175,7 +174,7 @@ def test_a_trial_is_drawn_as_the_evaluation_renders_it():
 
 def configured(trial, **settings):
     values = {key.replace("__", "."): value for key, value in settings.items()}
-    return replace(trial, settings=SimpleNamespace(shared=lambda *_: values))
+    return replace(trial, settings={trial.key: values})
 
 
 def test_a_trial_is_loaded_with_all_that_is_drawn(small_runs):

@@ -219,12 +219,14 @@ class Composer:
         folders = read_by_gsbench(
             [word for word in self.hydra_words if key_of(word) == "hydra.searchpath"]
         )
-        for key in map(key_of, choices):
+        for choice in choices:
+            key = key_of(choice)
             group = key.partition("@")[0]
             if group not in GROUPS and not config_loader().get_group_options(
                 group, None, CONFIG_NAME, folders
             ):
                 raise InputError(not_a_setting(key, self._choose([]), words))
+            check_choice(choice, str(parse_word(choice).value()))
         with explained([*self.hydra_words, *words]):
             config = self._composed(choices)
         if self.hydra_words:  # else all files are gsbench's own
@@ -243,12 +245,15 @@ class Composer:
             )
 
     def _check_words(self, words: Sequence[str]) -> None:
-        """Refuse words that would resolve what is not allowed, or leave the folder of a group."""
+        """Refuse words that would resolve what is not allowed, and Hydra's own choices of files.
+
+        Choices in other groups are checked in `_compose`, which knows the groups.
+        """
         for word in words:
             override = parse_word(word)
             value: Any = override.value()
             check_texts({override.key_or_group: value}, self.allowed)
-            if not _is_value(word):
+            if word in self.hydra_words and not _is_value(word):
                 check_choice(word, str(value))
 
 
