@@ -21,7 +21,7 @@ import re
 import resource
 import subprocess
 import sys
-import zipfile
+import tempfile
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -31,12 +31,13 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from gsbench.analysis.regions import region_errors
+from gsbench.claims.archive import unpack_archive
 
 FINDINGS = Path(__file__).resolve().parents[1]
 LINE = re.compile(r"^(\w+) +(?P<scene>\S+?)/\S+-(?P<densify>\S+) seed (?P<seed>\d+) \(\w+\)")
 THRESHOLD = 0.03  # V_th of the paper
 PAGE = FINDINGS / "paper_tables.md"
-STATE, END = "<!-- state -->", "<!-- end -->"
+STATE, END = "<!-- state {} -->", "<!-- end -->"  # around the table of an experiment
 PICTURES = ("renders", "ground_truth")
 MEASURED = "measured_here.csv"  # in the experiment's folder: CPU time of each training
 FIELDS = ("trial", "cpu_seconds", "gaussians", "share_below_threshold")
@@ -142,16 +143,22 @@ def save(clone: Path, experiment: str) -> None:
     PAGE.write_text(with_state(PAGE.read_text(encoding="utf-8"), experiment), encoding="utf-8")
 
 
+def results_in(archive: Path) -> list[dict[str, Any]]:
+    """The results of an archive's trials."""
+    with tempfile.TemporaryDirectory() as folder:
+        unpack_archive(archive, Path(folder))
+        files = sorted(Path(folder).glob("*/*/*/*/results.json"))
+        return [json.loads(file.read_text(encoding="utf-8")) for file in files]
+
+
 def state_table(experiment: str) -> str:
     """The page's table of all trials in the archive."""
     archives = FINDINGS / "archives"
-    with zipfile.ZipFile(archives / f"{experiment}.zip") as archive:
-        lines = archive.read("results.jsonl").splitlines()
     with (archives / f"{experiment}.csv").open() as stream:
         beside = {row["trial"]: row for row in csv.DictReader(stream)}
     table = ["| trial | PSNR | SSIM | LPIPS VGG raw | Gaussians | volumes ≤ V_th | CPU-s |"]
     table += ["|---|--:|--:|--:|--:|--:|--:|"]
-    for trial in sorted((json.loads(line)["results"] for line in lines), key=_order):
+    for trial in sorted(results_in(archives / f"{experiment}.zip"), key=_order):
         own = beside[f"{trial['scene']}-{trial['densify']}-{trial['seed']}"]
         psnr, ssim, lpips = (trial["metrics"][key] for key in ("psnr", "ssim", "lpips_vgg_raw"))
         share = 100 * float(own["share_below_threshold"])
@@ -169,8 +176,11 @@ def _order(trial: dict[str, Any]) -> tuple[str, int, str]:
 
 def with_state(page: str, experiment: str) -> str:
     """The page with the table of the archive's trials between its marks."""
-    before, _, rest = page.partition(STATE)
-    return f"{before}{STATE}\n{state_table(experiment)}{END}{rest.partition(END)[2]}"
+    mark = STATE.format(experiment)
+    before, found, rest = page.partition(mark)
+    if not found:
+        raise ValueError(f"the page has no {mark}")
+    return f"{before}{mark}\n{state_table(experiment)}{END}{rest.partition(END)[2]}"
 
 
 if __name__ == "__main__":

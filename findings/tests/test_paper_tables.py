@@ -1,17 +1,17 @@
 """The paper's tables in small: what lies beside their archives, and A/A of the regions."""
 
 import csv
-import json
 import sys
-import zipfile
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from gsbench.analysis.regions import compare_regions, discoveries
 
 FINDINGS = Path(__file__).parents[1]
 ARCHIVES = FINDINGS / "archives"
+EXPERIMENTS = ("paper_table1", "paper_free")
 sys.path.append(str(FINDINGS / "scripts"))
 import paper_tables  # noqa: E402
 
@@ -38,21 +38,21 @@ def test_regions_light_up_in_at_most_five_of_a_hundred_reports_of_one_arm():
         assert lit <= 5, seeds
 
 
-def test_what_lies_beside_the_archive_has_its_trials():
-    with zipfile.ZipFile(ARCHIVES / "paper_table1.zip") as archive:
-        lines = [json.loads(line) for line in archive.read("results.jsonl").splitlines()]
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_what_lies_beside_the_archive_has_its_trials(experiment):
     results = {
-        f"{line['results']['scene']}-{line['results']['densify']}-{line['results']['seed']}": line
-        for line in lines
+        f"{each['scene']}-{each['densify']}-{each['seed']}": each
+        for each in paper_tables.results_in(ARCHIVES / f"{experiment}.zip")
     }
-    with (ARCHIVES / "paper_table1.csv").open() as stream:
+    with (ARCHIVES / f"{experiment}.csv").open() as stream:
         rows = {row["trial"]: row for row in csv.DictReader(stream)}
-    assert rows.keys() == results.keys() == regions_of("paper_table1_regions.npz").keys()
+    assert rows.keys() == results.keys() == regions_of(f"{experiment}_regions.npz").keys()
     for trial, row in rows.items():
-        assert int(row["gaussians"]) == results[trial]["results"]["num_gaussians"]
+        assert int(row["gaussians"]) == results[trial]["num_gaussians"]
         assert 0.5 < float(row["share_below_threshold"]) < 1
 
 
-def test_the_table_on_the_page_follows_from_the_archive():
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_the_table_on_the_page_follows_from_the_archive(experiment):
     page = paper_tables.PAGE.read_text(encoding="utf-8")
-    assert paper_tables.with_state(page, "paper_table1") == page
+    assert paper_tables.with_state(page, experiment) == page
