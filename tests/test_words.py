@@ -54,6 +54,7 @@ REFUSED = {  # command line: a part of the line that refuses it
     "train": "train is a group: choose one by train=NAME (7k, ",
     "photos": "did you mean scene=photos?",
     "path=/x": "did you mean scene.path?",
+    "densify._target_=${densify.name}": "write the name itself here",
     "densify=adc densify.volume_threshold=1": "it belongs to densify=volumetric",
     "-m densify=adc,volumetric densify.volme_threshold=1": "did you mean volume_threshold? it "
     "belongs to densify=volumetric",

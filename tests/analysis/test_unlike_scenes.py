@@ -84,6 +84,13 @@ def test_no_mean_is_shown_over_scenes_under_different_conditions(tmp_path, key, 
         table_of(tmp_path, "psnr", rows=("densify",))
 
 
+def test_a_condition_that_one_scene_lacks_is_no_difference(tmp_path):
+    """Old trials have no split, renders of another program no rasterizer."""
+    write(tmp_path, "park", _split="every 8th")
+    write(tmp_path, "room")
+    assert lines(tmp_path) == []
+
+
 def test_variants_made_by_other_code_keep_their_means(tmp_path):
     """Each of them has one version of the code on all scenes."""
     for start, version in ((500, 1), (900, 2)):

@@ -129,6 +129,13 @@ STRANGE = {
         "write the settings",
     ),
     "a partial object": ({"densify._partial_": True}, "_partial_: gsbench makes no"),
+    "partial objects of a sweep": (
+        {
+            "hydra.mode": "MULTIRUN",
+            "hydra.sweeper.params": {"+densify.sub": "{_partial_: true},{_args_: [1]}"},
+        },
+        "_: gsbench makes no",
+    ),
     "a copy for logging": ({"hydra.job_logging": "${train}"}, "write the settings"),
     "help": ({"hydra.help._target_": "bomb.Bomb"}, "_target_ is not a setting"),
     "logging": (

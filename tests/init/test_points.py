@@ -78,6 +78,8 @@ WITH_FIELDS = rows(XYZ, RGB, INTENSITY, ALPHA, between=",")
         ("a.csv", f'"x [m]", "y [m]", "z [m]"\n{rows(XYZ, between=", ")}', False),
         ("a.txt", f"//X Y Z Rf Gf Bf\n{rows(XYZ, RGB / 255)}", True),
         ("a.asc", f"# a scan\n# x y z\n{rows(XYZ)}", False),
+        ("a.txt", f"3D points of 2024-05-01\nx y z\n{rows(XYZ)}", False),
+        ("a.txt", f"#\tz\ty\tx\n{rows(XYZ[:, ::-1], between=chr(9))}", False),
         ("a.xyz", rows(XYZ, between="\t"), False),
         ("a.xyz", rows(XYZ, RGB), True),
         ("a.csv", "\ufeff" + rows(XYZ, between=",").replace("\n", "\r\n"), False),

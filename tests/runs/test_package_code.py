@@ -98,6 +98,13 @@ def test_comments_docstrings_and_layout_do_not_count(old, new):
     assert syntax_of(SOURCE.replace(old, new).encode()) == syntax_of(SOURCE.encode())
 
 
+def test_comments_in_a_table_of_data_do_not_count():
+    old, new = b"a: 1  # one\nb: {c: 2}\n", b"# a table\na: 1\n\nb:\n  c: 2\n"
+    assert syntax_of(old, "x.yaml") == syntax_of(new, "x.yaml")
+    for edit in (b"a: 2\nb: {c: 2}", b"b: {c: 2}\na: 1"):
+        assert syntax_of(edit, "x.yaml") != syntax_of(old, "x.yaml")
+
+
 @pytest.mark.parametrize(
     "old, new",
     [

@@ -2,6 +2,7 @@
 
 import os
 import signal
+from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -207,3 +208,17 @@ def test_quaternions_of_any_length_are_normalised(kind, file, length, tmp_path):
     for image_id, image in model.images.items():
         found = read.images[image_id].cam_from_world().matrix()
         assert_allclose(found, image.cam_from_world().matrix(), atol=1e-9)
+
+
+def test_a_folder_that_cannot_be_read_to_its_end_is_no_smaller_capture(tmp_path, monkeypatch):
+    (tmp_path / "broken").mkdir()
+
+    def scan(folder):
+        if Path(folder).name == "broken":
+            raise OSError(5, "Input/output error")
+        return scandir(folder)
+
+    scandir = os.scandir
+    monkeypatch.setattr(os, "scandir", scan)
+    with pytest.raises(OSError, match="Input/output error"):
+        list_images(tmp_path)

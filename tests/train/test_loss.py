@@ -83,6 +83,14 @@ def test_equal_images_have_no_loss_and_no_gradient():
     check_equal_images(photometric_loss, images(20, 33)[0])
 
 
+def test_a_term_may_be_added_to_the_loss_in_place():
+    image = torch.rand(20, 20, 3, requires_grad=True)
+    loss, *_ = photometric_loss(image, torch.rand(20, 20, 3))
+    loss += image.mean()
+    loss.backward()
+    assert image.grad is not None
+
+
 def test_any_number_of_threads_gives_the_same_bits():
     image, target = images(64, 65)
     results = []

@@ -42,6 +42,7 @@ INGREDIENT_NAMES = {f"train.{key}": "learning rates" for key in RATES} | {
 # Conditions and settings that each scene may have for itself. The settings of a budget are not
 # among them, so that a note says where it differs. Iterations are a condition already.
 OF_A_SCENE = ("resolution", "data", "budget")
+ABSENT = "none"  # the value of a condition that a scene's trials do not have
 
 
 def differing_conditions(trials: Sequence[TrialResult], code: bool = True) -> dict[str, list[str]]:
@@ -78,10 +79,15 @@ def differing_settings(trials: Sequence[Trained]) -> dict[str, list[str]]:
 def conditions_between_scenes(trials: Sequence[TrialResult]) -> dict[str, ScenesByValue]:
     """The conditions, without `OF_A_SCENE`, in which the scenes of one arm differ.
 
-    A mean over such scenes would be about nothing.
+    A mean over such scenes would be about nothing. A condition that some scenes lack differs only
+    if the others do: old trials and those of other programs have fewer.
     """
-    found = _between_scenes(trials, attrgetter("conditions"))
-    return {key: scenes for key, scenes in found.items() if key not in OF_A_SCENE}
+    found = _between_scenes(trials, attrgetter("conditions"), ABSENT)
+    return {
+        key: scenes
+        for key, scenes in found.items()
+        if key not in OF_A_SCENE and len(scenes.keys() - {ABSENT}) > 1
+    }
 
 
 def settings_between_scenes(trials: Sequence[TrialResult]) -> dict[str, ScenesByValue]:
@@ -91,7 +97,9 @@ def settings_between_scenes(trials: Sequence[TrialResult]) -> dict[str, ScenesBy
 
 
 def _between_scenes(
-    trials: Sequence[TrialResult], facts_of: Callable[[TrialResult], Mapping[str, Any]]
+    trials: Sequence[TrialResult],
+    facts_of: Callable[[TrialResult], Mapping[str, Any]],
+    absent: str | None = None,
 ) -> dict[str, ScenesByValue]:
     """For each fact that differs between scenes, the scenes that have a value.
 
@@ -106,12 +114,12 @@ def _between_scenes(
     differing: dict[str, ScenesByValue] = {}
     for key in sorted(keys):
         values = {
-            scene: {as_text(facts_of(trial).get(key)) for trial in own}
+            scene: {as_text(facts_of(trial).get(key, absent)) for trial in own}
             for scene, own in by_scene.items()
         }
         if all(len(own) == 1 for own in values.values()):
             differing[key] = group_by(values, lambda scene: min(values[scene]))  # noqa: B023
-    return differing
+    return {key: scenes for key, scenes in differing.items() if len(scenes) > 1}
 
 
 def as_text(value: Any) -> str:

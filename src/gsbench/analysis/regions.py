@@ -60,7 +60,7 @@ def prior_of(variances: Array, degrees: int) -> tuple[float, float]:
     """
     from scipy.optimize import brentq  # here, since it is slow to import
 
-    logs = np.log(variances[variances > 0])
+    logs = np.log(variances[(variances > 0) & np.isfinite(variances)])
     if len(logs) < 2:
         return 0.0, float(variances.mean())
     excess = logs - special.digamma(degrees / 2) + np.log(degrees / 2)

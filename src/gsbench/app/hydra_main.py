@@ -118,8 +118,9 @@ def run_main(
         names = [*own, *config.allow_targets, *(target for _, target in targets_in(nodes))]
     names = [name for name in names if all(part.isidentifier() for part in name.split("."))]
     register_schemas()
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # else Hydra prints errors and ends the process
     with (
+        # else Hydra prints errors and ends the process
+        patch.dict(os.environ, HYDRA_FULL_ERROR="1"),
         WHITELIST([*HYDRAS_CALLBACKS, *names, *(f"{name}.*" for name in names)]),
         redirect_stderr(_WithoutHydrasLine(sys.stderr)),
         hydra_config(None),

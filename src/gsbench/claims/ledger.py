@@ -170,7 +170,7 @@ class Book:
             if one.rule == "confirmation" and not any(map(one.covers, asked)):
                 earlier |= one.digests.keys()
         data = {one.scene: one.record.hashes.get("data") for one in self.experiment.trials}
-        seen = {data.get(scene) for scene in earlier}
+        seen = {data[scene] for scene in earlier & data.keys()} - {None}
         if used := sorted(
             one for one in asked[0].digests if one in earlier or data.get(one, one) in seen
         ):

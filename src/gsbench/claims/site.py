@@ -83,7 +83,8 @@ def _section(experiment: Experiment, key: str) -> dict[str, Any]:
                 title=one.heading,
                 comparison=comparison,
             )
-            tables.append(replace(table, notes=()))
+            shown = tuple(replace(column, group="") for column in table.columns)  # it is the title
+            tables.append(replace(table, columns=shown, notes=()))
     except InputError as error:
         notes.append(f"No table: {error}")
     facts = {"trials": str(len(trials))}

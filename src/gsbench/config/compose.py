@@ -162,7 +162,9 @@ class Composer:
 
     def trial(self, overrides: Sequence[str]) -> Trial:
         """The single trial of the command's words, which are its ``overrides``."""
-        return replace(self.trials([task_words(overrides)])[0], overrides=tuple(overrides))
+        words = task_words(overrides)
+        trial = self._trial(words, words) or self._trial_of_hydra(words)
+        return replace(trial, overrides=tuple(overrides))
 
     def keep_times(self, config: DictConfig) -> None:
         """Let ``${now:…}`` in ``config`` stand for what it stands for in the trials."""
@@ -184,14 +186,15 @@ class Composer:
             return self._checked(config, None, words, {} if seed is None else {"seed": seed})
         return None
 
-    def _trial_of_hydra(self, words: Sequence[str], number: int) -> Trial:
+    def _trial_of_hydra(self, words: Sequence[str], number: int | None = None) -> Trial:
         """The trial of ``words`` as Hydra composes its job, with its number and its node."""
         with hydra_ready(), explained(words):
             config = self._composed(words)
             with open_dict(config):
                 config[PERMISSIONS] = list(self.allowed)
                 config.hydra.mode = self.config.hydra.mode
-                config.hydra.job.num, config.hydra.job.id = number, f"job_id_for_{number}"
+                if number is not None:  # of a job of a sweep
+                    config.hydra.job.num, config.hydra.job.id = number, f"job_id_for_{number}"
             return self._checked(config, config, words, {})
 
     def _checked(
@@ -252,7 +255,8 @@ class Composer:
         for word in words:
             override = parse_word(word)
             value: Any = override.value()
-            check_texts({override.key_or_group: value}, self.allowed)
+            *place, name = override.key_or_group.split(".")
+            check_texts({name: value}, self.allowed, ".".join(place))
             if word in self.hydra_words and not _is_value(word):
                 check_choice(word, str(value))
 

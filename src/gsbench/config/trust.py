@@ -87,6 +87,8 @@ def check_permissions(values: Mapping[str, Any]) -> None:
     for place, target in targets_in(values):
         group = ".".join(place)
         check_target(target, group, allowed, packages_allowed_at(place))
+    for place, key, _ in entries_of(values):
+        check_key((*place, key))
     if is_external(values["densify"]):
         check_program(values["densify"], allowed)
     check_launch(values["launch"], allowed)
@@ -96,6 +98,12 @@ def check_permissions(values: Mapping[str, Any]) -> None:
             f"results would go to {address}, which only a file names; if you trust it, "
             f"{permission_advice([address], allowed)}; tracking=none sends nothing"
         )
+
+
+def check_key(path: Sequence[str]) -> None:
+    """Refuse a key by which Hydra makes objects in another way, such as a function from a class."""
+    if path[-1] in SPECIAL_KEYS:
+        raise InputError(f"{'.'.join(path)}: gsbench makes no objects this way: leave it out")
 
 
 def foreign_address(tracking: Mapping[str, Any], allowed: Sequence[str]) -> str:
@@ -131,8 +139,7 @@ def check_composed(
             continue
         if not isinstance(value, dict | list):  # files of packages were not looked at before
             check_texts({key: value}, allowed, ".".join(place))
-        if key in SPECIAL_KEYS:  # `_partial_` makes a function of anything, to be called later
-            raise InputError(f"{'.'.join(path)}: gsbench makes no objects this way: leave it out")
+        check_key(path)
         # The schema or Hydra reports a target that is no text.
         if key == TARGET and isinstance(value, str) and value != "???":
             is_callback = place[:2] == ("hydra", "callbacks") and len(place) == 3

@@ -113,8 +113,12 @@ class Volumetric(ADC):
         """The rules of ADC, with the split by volume inserted according to ``volume_order``."""
         rules = super().round_at(step)
         if self.volume_due(step):
-            place = ("before_adc", "after_adc", "after_prune").index(self.volume_order)
-            rules.insert(place, self.split_by_volume)
+            next_rule = {
+                "before_adc": self.grow_by_gradient,
+                "after_adc": self.prune,
+                "after_prune": self.reset_statistics,
+            }[self.volume_order]
+            rules.insert(rules.index(next_rule), self.split_by_volume)
         return rules
 
     def volume_due(self, step: int) -> bool:

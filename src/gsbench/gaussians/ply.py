@@ -200,7 +200,7 @@ def _read_columns(path: Path) -> dict[str, Column]:
         _warn_of_activated(vertices, path)
         elements = [element.name for element in content]
         report_header([*content.comments, *content.obj_info], elements, path)
-    for name in [name for name in table.dtype.names or () if is_filter(name)]:
+    for name in [name for name in table.dtype.names or () if is_filter(name)][:1]:
         logits, sizes = _stacked({**vertices, name: table[name]}, ["opacity", name]).T
         scales, logits = filtered(_stacked(vertices, SCALES), logits, sizes, path)
         vertices |= dict(zip(SCALES, scales.T, strict=True))

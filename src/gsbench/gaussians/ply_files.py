@@ -66,6 +66,8 @@ def _check_length(header: bytes, size: int) -> None:
                 count = int(number)
                 if count < 0:
                     raise ValueError("the count of an element is negative")
+            case ["element", *_]:
+                raise ValueError("an element has no count")
             case ["property", kind, *_] if b"format ascii" in header:
                 announced += count * MIN_TEXT_BYTES
             case ["property", kind, *_]:  # of a list, at least the byte of its length

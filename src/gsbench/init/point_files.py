@@ -37,7 +37,7 @@ PTS_LAYOUTS = LAYOUTS | {4: "x y z intensity", 7: "x y z intensity red green blu
 # Colours up to this are fractions, even if tone mapping or rounding went beyond 1. As bytes they
 # would all be black.
 MAX_FRACTION = 2.0
-ROW = re.compile(r'"?[-+.]?\d')
+ROW = re.compile(r'"?[-+]?(\.?\d[\d.]*(e[-+]?\d+)?|nan|inf(inity)?)"?(?=[\s,;]|$)', re.I)
 NO_ROW = re.compile(r"\d+$|#|//")  # a count of points, or a comment
 OF_COLMAP = "it belongs to a COLMAP model: init=dataset reads its folder"
 REMEDY = (
@@ -113,7 +113,7 @@ def _read_table(path: Path) -> Columns:
         values = table.to_numpy(dtype=np.float64)  # [P, columns]
     except ValueError as error:  # pandas' errors are
         raise ValueError(f"{error}; {REMEDY}") from error
-    head, count = lines[first - 1].strip("/# ") if first else "", values.shape[1]
+    head, count = lines[first - 1].strip(" \t,;/#") if first else "", values.shape[1]
     words = re.split("[,;]" if re.search("[,;]", head) else r"\s+", head)
     if len(words) != count:
         layouts = PTS_LAYOUTS if path.suffix.lower() == ".pts" else LAYOUTS

@@ -346,7 +346,7 @@ class _Differentiable(torch.autograd.Function):
         loss, *shown = values.unbind()
         ctx.mark_non_differentiable(*shown)
         ctx.set_materialize_grads(False)
-        return loss, *shown
+        return loss.clone(), *shown  # a view could not be added to in place
 
     @staticmethod
     @once_differentiable

@@ -223,9 +223,11 @@ def _unpack(archive: Path, scratch: Path) -> None:
             (scratch / place).parent.mkdir(parents=True, exist_ok=True)
             content = files[name][1]()
             assert content is not None  # of a regular file
-            # At most the size that the archive says is unpacked, and a wrong size is an error.
+            # At most the size that the archive says is unpacked.
             with content, (scratch / place).open("wb") as file:
                 shutil.copyfileobj(content, file)
+                if file.tell() != files[name][0]:
+                    raise ValueError(f"{place.name} has another size than the archive says")
 
 
 def _wanted(archive: Path, sizes: dict[str, int]) -> dict[str, Path]:

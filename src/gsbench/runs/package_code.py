@@ -7,11 +7,14 @@ syntax does. Loads no torch.
 
 import ast
 import hashlib
+import json
 from collections.abc import Iterable, Mapping
 from functools import cache
 from pathlib import Path
 
-from gsbench.parsing import DamagedError, read_json
+import yaml
+
+from gsbench.parsing import DamagedError, SafeLoader, read_json
 
 PACKAGE = Path(__file__).resolve().parents[1]
 RELEASED = "released.json"  # in gsbench's folder: the digests of all packages at the release
@@ -47,7 +50,7 @@ def state_of(package: str) -> str:
     # the usual case of an installed gsbench, without parsing
     if released.get("bytes") == _digest(contents):
         return AS_RELEASED
-    digest = _digest({name: syntax_of(content) for name, content in contents.items()})
+    digest = _digest({name: syntax_of(content, name) for name, content in contents.items()})
     return AS_RELEASED if digest == released.get("syntax") else digest
 
 
@@ -78,11 +81,16 @@ def _released() -> dict[str, dict[str, str]]:
     return released
 
 
-def syntax_of(source: bytes) -> bytes:
-    """A Python file's syntax tree without docstrings, as text; its source if unparsable."""
+def syntax_of(source: bytes, name: str = "") -> bytes:
+    """A file's content without comments and docstrings, as text; its source if unparsable.
+
+    A file whose ``name`` ends in .yaml is a table of data; any other is Python.
+    """
     try:
+        if name.endswith(".yaml"):  # the order of its entries may count, so they are not sorted
+            return json.dumps(yaml.load(source, Loader=SafeLoader)).encode()
         tree = ast.parse(source)
-    except (SyntaxError, ValueError, RecursionError):
+    except (SyntaxError, ValueError, RecursionError, yaml.YAMLError):
         return source
     for node in ast.walk(tree):
         if not isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
@@ -95,5 +103,5 @@ def syntax_of(source: bytes) -> bytes:
 def digests_at_release(package: str) -> dict[str, str]:
     """The digests of a package's files, and of their syntax, as `RELEASED` records them."""
     contents = _contents(package)
-    syntax = {name: syntax_of(content) for name, content in contents.items()}
+    syntax = {name: syntax_of(content, name) for name, content in contents.items()}
     return {"bytes": _digest(contents), "syntax": _digest(syntax)}

@@ -9,6 +9,7 @@ import os
 import sys
 from collections import Counter
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,11 @@ _SIXTEEN_BIT_MODES = ("I;16", "I;16L", "I;16B", "I;16N")
 _WIDE_MODES = ("I", "F")  # 32-bit integers and floats, which have no agreed value for white
 
 
+def _unreadable(error: OSError) -> None:
+    if not isinstance(error, PermissionError):  # a folder that may not be read counts as empty
+        raise error
+
+
 def list_images(folder: Path) -> list[str]:
     """The sorted image files below a folder, relative, with "/" as separator, without hidden files.
 
@@ -53,7 +59,7 @@ def list_images(folder: Path) -> list[str]:
     seen = {_identity(parent) for parent in folder.resolve().parents}
     places = [folder]
     for place in places:
-        for parent, folders, files in os.walk(place):
+        for parent, folders, files in os.walk(place, onerror=_unreadable):
             if (identity := _identity(Path(parent))) in seen:  # also ends circles of links
                 folders.clear()
                 continue
@@ -199,7 +205,7 @@ def open_image(path: Path, decode: bool = False) -> Image.Image:
     except Exception as error:  # Pillow's readers may raise any exception on a damaged file
         is_none = isinstance(error, UnidentifiedImageError)
         reason = "not a readable image" if is_none else f"the image is damaged ({error})"
-        with path.open("rb") as stream:
+        with suppress(OSError), path.open("rb") as stream:
             if stream.read(len(GIT_LFS)) == GIT_LFS:
                 reason += f", but {LFS_REMEDY}"
         raise InputError(f"{path}: {reason}: replace or remove it") from error

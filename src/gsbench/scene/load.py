@@ -231,6 +231,7 @@ def _model_cameras(
             f"{model_dir}, but at least {MIN_IMAGES} are needed: take more overlapping photos, or "
             "another init"
         )
+    _inspect_views(capture, cameras)  # before hours of work
     return dict(sorted(cameras.items()))
 
 

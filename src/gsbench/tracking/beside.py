@@ -50,7 +50,8 @@ class Mirror:
 
     def __init__(self, idle: bool = False) -> None:
         self._idle = idle
-        self._lines: list[str] = []  # what the process was told of each trial
+        self._lines: list[str] = []  # what the process is told of each trial
+        self._unsent: list[str] = []  # lines that the pipe has not taken yet
 
     def __enter__(self) -> Mirror:
         return self
@@ -72,19 +73,21 @@ class Mirror:
 
     def _tell(self, line: str) -> None:
         """Write a line to the process; one that has crashed is replaced, and told all again."""
-        lines = [line]
+        self._unsent.append(line)
         if self._process is None or self._process.poll() is not None:
-            lines = [*self._lines, SOON]
             try:
                 self._process = self._started()
             except OSError as error:
                 self._fault = str(error)
                 return
+            self._fault, self._unsent = "", [*self._lines, SOON]
+        self._write(self._process)
+
+    def _write(self, process: subprocess.Popen[bytes]) -> None:
+        """Write what the pipe takes. It does not block: a process that hangs delays no trial."""
         with suppress(BrokenPipeError):  # it has just crashed
-            for text in lines:
-                # The pipe does not block: a process that hangs and reads nothing delays no trial.
-                if self._process.stdin.write(text.encode()) is None:  # type: ignore[union-attr]
-                    self._fault = SLOW
+            while self._unsent and process.stdin.write(self._unsent[0].encode()) is not None:  # type: ignore[union-attr]
+                del self._unsent[0]
 
     def _started(self) -> subprocess.Popen[bytes]:
         runs = TrialFolder(Path(json.loads(self._lines[0])["folder"])).runs
@@ -107,9 +110,11 @@ class Mirror:
         if (process := self._process) is not None:
             is_stopped = kind is not None and not issubclass(kind, Exception)
             try:
+                self._write(process)
                 process.stdin.close()  # type: ignore[union-attr]
                 process.wait(min(self._patience, SECONDS_TO_STOP) if is_stopped else self._patience)
-                self._fault = self._fault or self._reason(process.returncode)
+                late = SLOW if self._unsent else ""
+                self._fault = self._fault or self._reason(process.returncode) or late
             except subprocess.TimeoutExpired:
                 self._fault = SLOW
             finally:  # also where a signal interrupts the wait
@@ -139,15 +144,17 @@ def send_beside(lines: Iterable[str], patience: float) -> None:
     wake, stop = threading.Event(), threading.Event()
 
     def read() -> None:
-        for line in lines:
-            if line == SOON:
-                wake.set()
-            else:
-                followed.append(json.loads(line))
-        stop.set()
-        wake.set()
-        time.sleep(patience)
-        os._exit(1)
+        try:
+            for line in lines:
+                if line == SOON:
+                    wake.set()
+                else:
+                    followed.append(json.loads(line))
+        finally:  # also if a sweep that was killed left a part of a line
+            stop.set()
+            wake.set()
+            time.sleep(min(patience, threading.TIMEOUT_MAX))
+            os._exit(1)
 
     threading.Thread(target=read, daemon=True).start()
     is_last, fault = False, None

@@ -146,11 +146,12 @@ def require_own_journal(uri: str) -> Path | None:
     name = sqlalchemy.engine.make_url(uri).database if uri.startswith("sqlite:") else None
     if not name or name == ":memory:":
         return None
-    journal = Path(f"{name}-journal")
+    database = Path(name)  # without a slash at its end, which SQLite leaves out, too
+    journal = Path(f"{database}-journal")
     with suppress(FileNotFoundError):
         if read_tail(journal, len(JOURNAL_END)) == JOURNAL_END:
             raise InputError(f"{journal} would delete another file: remove it")
-    return Path(name)
+    return database
 
 
 def _require_plain(database: Path) -> None:

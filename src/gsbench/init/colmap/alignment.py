@@ -100,8 +100,8 @@ def align_poses(
     best = _misses(fit_similarity(source, target), source, target)  # [N]
     for _ in range(TRIALS):
         triple = generator.choice(len(source), 3, replace=False)
-        spread = _spread(source[triple])
-        if spread[1] > COLLINEAR_RATIO * spread[0]:
+        spreads_of_three = _spread(source[triple]), _spread(target[triple])
+        if all(spread[1] > COLLINEAR_RATIO * spread[0] for spread in spreads_of_three):
             fitted = fit_similarity(source[triple], target[triple])
             best = min(best, _misses(fitted, source, target), key=np.median)
     # At least three cameras are inliers: residuals up to the median and, of three cameras, the
