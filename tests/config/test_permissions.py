@@ -55,7 +55,7 @@ STRANGE = {
     ),
     "a tracker": ({"tracking._target_": "bomb.Bomb"}, "add allow_targets=[bomb]"),
     "a reader": (
-        {"scene.kind": "reader", "scene._target_": "bomb.Bomb"},
+        {"scene.kind": "reader", "scene._target_": "bomb.Bomb", "scene.path": "photos"},
         "add allow_targets=[bomb]",
     ),
     "a program": (

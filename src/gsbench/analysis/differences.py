@@ -8,16 +8,13 @@ ADC. All are read from the trials' recorded configurations and code.
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from operator import attrgetter
-from pathlib import Path
 from typing import Any
-
-import yaml
 
 from gsbench.analysis.notes import Note
 from gsbench.analysis.results import Arm, TrialPair, TrialResult, group_by
 from gsbench.analysis.trial_result import Trained, canonical
 from gsbench.gaussians.paper_values import RATES
-from gsbench.parsing import LOADER
+from gsbench.parsing import table_beside
 from gsbench.runs.config_hash import is_ignored, is_ingredient, is_of_scene
 from gsbench.runs.freshness import Part
 from gsbench.runs.nested import SHOWN
@@ -32,9 +29,7 @@ ELSEWHERE = "a training elsewhere, which left no record"
 BY_PROGRAM = "everything that the program {} does differently"
 TARGET, INITIAL_CLOUD = "densify._target_", "initial cloud"
 
-TABLES: dict[str, dict[str, list[str]]] = yaml.load(
-    Path(__file__).with_name("ingredients.yaml").read_text("utf-8"), LOADER
-)
+TABLES: dict[str, dict[str, list[str]]] = table_beside(__file__, "ingredients.yaml")
 DEPARTURES = TABLES["departures"]  # by the densifier's class
 INGREDIENT_NAMES = {f"train.{key}": "learning rates" for key in RATES} | {
     key: name for name, keys in TABLES["settings"].items() for key in keys

@@ -5,13 +5,10 @@ A note is a record of facts, so that code and tests compare facts. Its sentence 
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Self
 
-import yaml
-
 from gsbench.events import FEW_ROUNDS
-from gsbench.parsing import LOADER
+from gsbench.parsing import table_beside
 from gsbench.words import FORM
 
 
@@ -36,7 +33,7 @@ class Note:
 
 
 SENTENCES: dict[str, str] = {
-    **yaml.load(Path(__file__).with_name("notes.yaml").read_text("utf-8"), LOADER),
+    **table_beside(__file__, "notes.yaml"),
     "few rounds": FEW_ROUNDS,
 }
 

@@ -9,14 +9,12 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import yaml
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
 from gsbench.analysis.cells import Cell
-from gsbench.parsing import LOADER
+from gsbench.parsing import table_beside
 from gsbench.words import markdown_text, printable
 
 if TYPE_CHECKING:
@@ -223,7 +221,7 @@ FORMATS: dict[str, tuple[str, Callable[[Table], str]]] = {  # name -> file suffi
 LATIN_1 = 255  # the last character that pdflatex has in its usual fonts
 WRAPPED_SHARE = 0.7  # share of a LaTeX line for the columns of a ``wrapped`` table
 
-_LATEX = str.maketrans(yaml.load(Path(__file__).with_name("latex.yaml").read_text("utf-8"), LOADER))
+_LATEX = str.maketrans(table_beside(__file__, "latex.yaml"))
 
 
 def escape_latex(text: str) -> str:

@@ -7,13 +7,12 @@ A metric of your own needs no entry here: ``eval.extra.NAME._target_=mine.MyMetr
 """
 
 from dataclasses import asdict, dataclass, fields, replace
-from pathlib import Path
 from typing import Annotated, Literal
 
 from annotated_types import Interval, Predicate
 from pydantic import PositiveFloat, StrictStr
 
-from gsbench.parsing import read_yaml
+from gsbench.parsing import table_beside
 from gsbench.runs.experiments import AT
 from gsbench.runs.trial_record import MetricRecord
 from gsbench.settings import check_values
@@ -49,9 +48,7 @@ class MetricFacts:
 CORRECTED = "_cc"
 # `gsbench.eval.evaluator.Evaluator` measures each but the last, which is measured of the trained
 # model, not of its pictures, and separately in the evaluation.
-*METRICS, FPS = ALL = [
-    MetricFacts(**row) for row in read_yaml(Path(__file__).with_name("metrics.yaml"))
-]
+*METRICS, FPS = ALL = [MetricFacts(**row) for row in table_beside(__file__, "metrics.yaml")]
 
 
 def known_keys() -> tuple[str, ...]:

@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gsbench.errors import InputError
-from gsbench.parsing import read_yaml
+from gsbench.parsing import table_beside
 from gsbench.weights import WeightsFile, find_weights, load_into, load_state
 
 # The networks' input normalisation, per channel: (x - SHIFT) / SCALE for x in [-1, 1].
@@ -99,8 +99,7 @@ def _backbone(net: str, row: Mapping[str, Any]) -> Backbone:
 
 
 BACKBONES = {
-    net: _backbone(net, row)
-    for net, row in read_yaml(Path(__file__).with_name("backbones.yaml")).items()
+    net: _backbone(net, row) for net, row in table_beside(__file__, "backbones.yaml").items()
 }
 
 

@@ -5,17 +5,16 @@ The hash names a trial's folder.
 
 from collections.abc import Mapping
 from functools import cache
-from pathlib import Path
 from typing import Any
 
-from gsbench.parsing import read_yaml
+from gsbench.parsing import table_beside
 from gsbench.runs.nested import GSBENCH, TARGET, flatten, sha256_of
 from gsbench.runs.user_code import user_modules
 
 BOOKKEEPING, READING, PLACE = "bookkeeping", "reading", "place"
 PURPOSES = {
     key: purpose
-    for purpose, keys in read_yaml(Path(__file__).with_name("purposes.yaml")).items()
+    for purpose, keys in table_beside(__file__, "purposes.yaml").items()
     for key in keys
 }
 # Options that cannot change a result, and are in no hash. This holds for gsbench's own classes; a
