@@ -170,9 +170,9 @@ class Book:
             if one.rule == "confirmation" and not any(map(one.covers, asked)):
                 earlier |= one.digests.keys()
         data = {one.scene: one.record.hashes.get("data") for one in self.experiment.trials}
-        seen = {data[scene] for scene in earlier & data.keys()} - {None}
+        seen = {data.get(scene) for scene in earlier} - {None}
         if used := sorted(
-            one for one in asked[0].digests if one in earlier or data.get(one, one) in seen
+            one for one in asked[0].digests if one in earlier or data.get(one) in seen
         ):
             raise InputError(
                 f"{listed(used)} was seen by the ideas, or by an earlier confirmation: "
