@@ -41,9 +41,9 @@ class Process:
     def fileno(self):
         return sys.stderr.fileno()
 
-    def write(self, line):
-        self.told.append(line.decode())
-        return len(line)
+    def write(self, content):
+        self.told += content.decode().splitlines(keepends=True)
+        return len(content)
 
     def poll(self):
         return self.returncode

@@ -297,7 +297,7 @@ def _study(record: TuningRecord, at_once: int) -> Study:
 
 
 def _asked(tune: TuneSettings, trials: Sequence[Trial]) -> dict[str, Any]:
-    """What the records of all searches have in common.
+    """The facts that the records of all searches share.
 
     Raises InputError for an unknown metric, and for one without a better direction.
     """

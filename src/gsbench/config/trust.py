@@ -84,11 +84,10 @@ def check_permissions(values: Mapping[str, Any]) -> None:
     """
     allowed = values.get(PERMISSIONS) or []
     # At any depth: an allowed class may build the classes that its own options name.
-    for place, target in targets_in(values):
-        group = ".".join(place)
-        check_target(target, group, allowed, packages_allowed_at(place))
-    for place, key, _ in entries_of(values):
+    for place, key, value in entries_of(values):
         check_key((*place, key))
+        if key == TARGET and value is not None:
+            check_target(value, ".".join(place), allowed, packages_allowed_at(place))
     if is_external(values["densify"]):
         check_program(values["densify"], allowed)
     check_launch(values["launch"], allowed)

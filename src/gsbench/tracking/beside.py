@@ -51,7 +51,7 @@ class Mirror:
     def __init__(self, idle: bool = False) -> None:
         self._idle = idle
         self._lines: list[str] = []  # what the process is told of each trial
-        self._unsent: list[str] = []  # lines that the pipe has not taken yet
+        self._unsent = b""  # what the pipe has not taken yet of these and of `SOON`
 
     def __enter__(self) -> Mirror:
         return self
@@ -73,21 +73,22 @@ class Mirror:
 
     def _tell(self, line: str) -> None:
         """Write a line to the process; one that has crashed is replaced, and told all again."""
-        self._unsent.append(line)
+        self._unsent += line.encode()
         if self._process is None or self._process.poll() is not None:
             try:
                 self._process = self._started()
             except OSError as error:
                 self._fault = str(error)
                 return
-            self._fault, self._unsent = "", [*self._lines, SOON]
+            self._fault, self._unsent = "", "".join([*self._lines, SOON]).encode()
         self._write(self._process)
 
     def _write(self, process: subprocess.Popen[bytes]) -> None:
         """Write what the pipe takes. It does not block: a process that hangs delays no trial."""
         with suppress(BrokenPipeError):  # it has just crashed
-            while self._unsent and process.stdin.write(self._unsent[0].encode()) is not None:  # type: ignore[union-attr]
-                del self._unsent[0]
+            # a full pipe takes a part, or nothing (None)
+            while sent := process.stdin.write(self._unsent):  # type: ignore[union-attr]
+                self._unsent = self._unsent[sent:]
 
     def _started(self) -> subprocess.Popen[bytes]:
         runs = TrialFolder(Path(json.loads(self._lines[0])["folder"])).runs
