@@ -316,7 +316,7 @@ def fake_trial(monkeypatch):
     behaviour = {}
     order = []
 
-    def run_one(trial, mirror, wait):
+    def run_one(trial, wait):
         seed = trial.values["seed"]
         error = behaviour.get(seed)
         if isinstance(error, BusyError) and not wait:

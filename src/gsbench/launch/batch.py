@@ -47,8 +47,8 @@ def run_batch(trials: Sequence[Trial], asks: bool = True) -> list[Outcome]:
             outcomes += run_slurm(unfinished)
         elif unfinished:
             run = run_serial if launcher == "serial" else run_local
-            with Mirror() as mirror:
-                outcomes += run(unfinished, mirror)
+            with Mirror(unfinished):
+                outcomes += run(unfinished)
         return outcomes
 
 
