@@ -373,13 +373,13 @@ def test_full_disk_ends_the_sweep(fake_trial):
 @pytest.mark.parametrize("number", [errno.EFBIG, errno.ENOLCK, errno.EROFS])
 def test_verbs_that_write_report_storage_errors_in_one_line(number, runs, monkeypatch, refused):
     def refuse(*arguments):
-        raise OSError(number, os.strerror(number), str(runs / "x/plan.json"))
+        raise OSError(number, os.strerror(number), str(runs / "x/commands.jsonl"))
 
     record([bare_trial(runs, words=["seed=0"])], asks=False)
     monkeypatch.setattr("gsbench.runs.commands.append", refuse)
     said = refused("status", "x", "--forget")
     assert len(said.splitlines()) == 1
-    assert "plan.json" in said
+    assert "commands.jsonl" in said
 
 
 def test_finished_trials_are_found_in_a_read_only_folder(runs, monkeypatch):

@@ -11,7 +11,7 @@ from gsbench.launch.batch import check_trackers
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.tracking import connect, ensure_experiment
 from gsbench.tracking.trial import TrackedTrial
-from tests.helpers import refusal, write
+from tests.helpers import refusal, write_lines
 from tests.tracking.helpers import mirror_trial, options, run_of
 from tests.tracking.test_contract import finished
 from tests.trials import STEPS
@@ -33,9 +33,9 @@ def test_mlflow_shows_a_grid_of_test_pictures(runs):
 def test_the_summary_of_a_trial(tmp_path):
     folder, values = finished(tmp_path)
     words = ["densify=a_densify", "scene.path=/my photos"]
-    planned = {"overrides": words, "cwd": "/", "time": 1.0}
-    plan = {"trials": {folder.relative_to(folder.parents[2]).as_posix(): planned}}
-    write(folder.parents[2] / "plan.json", plan)
+    planned = {folder.relative_to(folder.parents[2]).as_posix(): {"words": words}}
+    command = {"words": words, "cwd": "/", "time": 1.0, "trials": planned}
+    write_lines(folder.parents[2] / "commands.jsonl", [command])
     trial = TrackedTrial(TrialFolder(folder), values)
     results = trial.folder.sound_record()
     assert results is not None

@@ -19,7 +19,6 @@ METRICS = "metrics.json"  # of an evaluation
 
 # in an experiment's folder
 COMMANDS = "commands.jsonl"  # all commands, with their trials and questions
-PLAN = "plan.json"  # of earlier versions: the trials of the commands
 DECLARED = "declared.jsonl"  # of earlier versions: declared questions, with their times
 LEDGER = "ledger.jsonl"  # of a ledger of ideas of gsbench 0.1, no longer read
 TUNING = "tuning.json"  # of a search: its ranges and points
