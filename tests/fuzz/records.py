@@ -29,7 +29,7 @@ from gsbench.analysis.table_formats import to_html_page
 from gsbench.analysis.tables import build_table
 from gsbench.errors import InputError
 from gsbench.launch import states
-from gsbench.launch.dry_run import FinishedTrials
+from gsbench.launch.estimates import FinishedTrials
 from gsbench.launch.states import states_of_experiment
 from gsbench.parsing import read_if_sound
 from gsbench.runs.commands import read_history

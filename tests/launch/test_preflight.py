@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from gsbench.launch import batch, dry_run
+from gsbench.launch import batch, estimates
 from gsbench.launch.batch import (
     begin,
     check_trackers,
@@ -171,8 +171,8 @@ def test_weights_are_searched_once_for_equal_options(monkeypatch):
 
     parts = SimpleNamespace(make_evaluator=make_evaluator)
     monkeypatch.setitem(sys.modules, "gsbench.pipeline.parts", parts)
-    dry_run._unavailable_now.cache_clear()
+    estimates._unavailable_now.cache_clear()
     for flip in (False, True, False):
-        assert dry_run.unavailable_now({"flip": flip}) == ["lpips_vgg"]
+        assert estimates.unavailable_now({"flip": flip}) == ["lpips_vgg"]
     assert [options.flip for options in asked] == [False, True]
-    dry_run._unavailable_now.cache_clear()
+    estimates._unavailable_now.cache_clear()

@@ -8,7 +8,7 @@ import pytest
 
 from gsbench.cli import run
 from gsbench.errors import InputError
-from gsbench.launch.progress import _seconds_left, progress_frame
+from gsbench.launch.estimates import _seconds_left, progress_frame
 from gsbench.launch.states import TrialState
 from gsbench.system.locks import hold
 from tests.helpers import write, write_lines

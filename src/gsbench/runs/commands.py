@@ -37,7 +37,7 @@ from gsbench.runs.config_hash import config_hash
 from gsbench.runs.experiments import Arm, list_experiments, make_home
 from gsbench.runs.keys import CODE_OF_STAGE
 from gsbench.runs.layout import COMMANDS, SEED
-from gsbench.runs.nested import SHOWN, sha256_of
+from gsbench.runs.nested import SHOWN, Values, sha256_of
 from gsbench.runs.package_code import edited, states_of
 from gsbench.runs.trial_record import FROM_RENDERS
 from gsbench.runs.user_code import user_modules
@@ -100,7 +100,7 @@ def code_digest(sources: Mapping[str, str], packages: Mapping[str, str]) -> str:
     return sha256_of([dict(sources), changed])[:SHOWN] if sources or changed else ""
 
 
-def digest_of(values: Mapping[str, Any]) -> Digest:
+def digest_of(values: Values) -> Digest:
     """The digest of a trial with the configuration ``values``, by the code as it is now."""
     arm = f"{values['init']['name']}-{values['densify']['name']}"
     packages = states_of(chain(*CODE_OF_STAGE.values()))
