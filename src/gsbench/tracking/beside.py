@@ -19,7 +19,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 from gsbench.parsing import one_line
 from gsbench.runs.layout import CONFIG, FAILED, RESULTS
@@ -36,6 +36,7 @@ log = logging.getLogger(__name__)
 
 SECONDS_TO_STOP = 3.0  # patience after a signal that asks to end
 SECONDS_BETWEEN_LOOKS = 5.0  # at the trials' files
+SECONDS_BETWEEN_STARTS = 300.0  # of a process that crashes
 
 
 class Mirror:
@@ -47,6 +48,8 @@ class Mirror:
     """
 
     _process: subprocess.Popen[bytes] | None = None
+    _said: IO[bytes]  # the process's error output
+    _fault = ""
 
     def __init__(self, trials: Sequence[Trial]) -> None:
         self._trials = [trial for trial in trials if trial.values["tracking"]["enabled"]]
@@ -58,17 +61,26 @@ class Mirror:
             "allowed": permissions(trial.values for trial in self._trials),
         }
         self._told = f"{json.dumps(told)}\n".encode()
-        self._said = tempfile.TemporaryFile()  # noqa: SIM115 - the process's error output
 
     def __enter__(self) -> None:
-        self._start()
+        self._ended, self._keeper = (
+            threading.Event(),
+            threading.Thread(target=self._keep, daemon=True),
+        )
+        if self._trials:
+            self._start()
+            self._keeper.start()
+
+    def _keep(self) -> None:
+        while not self._ended.wait(SECONDS_BETWEEN_STARTS):
+            self._start()
 
     def _start(self) -> None:
-        """Start the process, or replace a crashed one, if there is anything to send."""
-        if not self._trials or (self._process and self._process.poll() is None):
+        """Start the process, or replace a crashed one."""
+        if self._process and self._process.poll() is None:
             return
-        self._fault = ""
         try:
+            self._said = tempfile.TemporaryFile()  # noqa: SIM115 - until the process ends
             self._process = subprocess.Popen(
                 [sys.executable, "-P", "-m", "gsbench", "sync", f"--beside={self._patience}"],
                 stdin=subprocess.PIPE,
@@ -86,6 +98,8 @@ class Mirror:
     def __exit__(self, kind: type[BaseException] | None, error: object, trace: object) -> None:
         if not self._trials:
             return
+        self._ended.set()
+        self._keeper.join()
         self._start()
         if (process := self._process) is not None:
             is_stopped = kind is not None and not issubclass(kind, Exception)
@@ -175,7 +189,7 @@ def _stamps(folder: Path) -> list[int]:
     stamps = []
     for name in (CONFIG, RESULTS, FAILED):
         try:
-            stamps.append(os.stat(folder / name).st_ctime_ns)
+            stamps.append(os.stat(folder / name).st_mtime_ns)
         except OSError:
             stamps.append(0)
     return stamps
