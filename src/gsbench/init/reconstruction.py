@@ -142,7 +142,9 @@ def build_model(job: Job, progress: Progress) -> InitReport:
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.WARNING)
     capture, timer = job.capture, Timer()
     cameras = job.reference or capture.model
-    reference = cameras and read_reference(replace(capture, model=cameras))
+    reference = None
+    if cameras is not None:
+        reference = read_reference(replace(capture, model=cameras))
     options, model, facts = _best_attempt(job, reference, timer, progress)
     if facts["poses"] == "own":
         exact = capture.exact_poses and job.reference is None
