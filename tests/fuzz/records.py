@@ -48,7 +48,6 @@ NAMES = (
     "results.json",
     "config.yaml",
     "commands.jsonl",
-    "declared.jsonl",
     "metrics.jsonl",
     "events.jsonl",
     "volume_histograms.jsonl",
@@ -163,15 +162,6 @@ def write_original(runs):
         {"uri": "u", "token": "t", "started": 1, "logged": {"metrics.jsonl": 5}, "complete": "c"},
     )
     write(done / ".lock.holder", {"host": "h", "pid": 1, "since": 1.0, "slurm": None, "what": "w"})
-    declared = [
-        {"questions": [{"metric": "psnr", "sign": 0}], "time": "2026-11-21T20:05:00Z"},
-        {
-            "questions": [{"metric": "psnr", "name": "a"}],
-            "looks": [2, 3],
-            "time": "2026-11-21T20:05:00Z",
-        },
-    ]
-    write_lines(home / "declared.jsonl", declared)
     planned = {path.relative_to(home).as_posix(): {"words": ["seed=0"]} for path in (done, failed)}
     command = {"words": ["seed=0"], "cwd": str(runs), "time": 1.0, "trials": planned}
     write_lines(home / "commands.jsonl", [command])
@@ -179,7 +169,7 @@ def write_original(runs):
     ranges = {"densify.volume_threshold": "0.01,0.03"}
     write(home / "tuning.json", tuning | {"sweep": home.name, "ranges": ranges})
     places_of = {name: done / name for name in NAMES}
-    places_of |= {name: home / name for name in ("commands.jsonl", "declared.jsonl", "tuning.json")}
+    places_of |= {name: home / name for name in ("commands.jsonl", "tuning.json")}
     places_of |= {
         name: failed / name for name in ("failed.json", "building.json", ".submitted.json")
     }
