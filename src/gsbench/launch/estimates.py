@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from functools import cache
+from itertools import islice
 from pathlib import Path
 from statistics import fmean
 from typing import TYPE_CHECKING, Any
@@ -219,19 +220,11 @@ def has_gpu() -> bool:
 def _first_size(path: str, images: str) -> tuple[int, int] | None:
     folder = Path(path).expanduser()
     for place in (folder / images, folder) if path else ():
-        for file in _files(place):
-            try:
-                return image_size(file)
-            except InputError:
-                continue
-    return None
-
-
-def _files(folder: Path) -> Iterator[Path]:
-    if folder.is_dir():
-        for _, file in zip(range(MAX_ENTRIES), folder.iterdir(), strict=False):
+        for file in islice(place.iterdir(), MAX_ENTRIES) if place.is_dir() else ():
             if file.suffix.lower() in IMAGE_SUFFIXES and file.is_file():
-                yield file
+                with suppress(InputError):
+                    return image_size(file)
+    return None
 
 
 # ---- how far a sweep is: the trials of each arm by state, speed and time left

@@ -43,8 +43,8 @@ class Mirror:
     """Sends to their trackers those of ``trials`` that begin within a ``with`` block.
 
     While the block runs, a process sends every ``tracking.flush_seconds``, and soon after a trial
-    has ended; at the end it gets ``tracking.patience_seconds``. Errors of a tracker are never
-    raised: one line in the log says what is missing.
+    has begun or ended; at the end it gets ``tracking.patience_seconds``. Errors of a tracker are
+    never raised: one line in the log says what is missing.
     """
 
     _process: subprocess.Popen[bytes] | None = None
@@ -145,15 +145,16 @@ def send_beside(lines: Iterator[str], patience: float) -> None:
     threading.Thread(target=end, daemon=True).start()
     allow_modules(allowed := told["allowed"])
     left = {Path(folder): before for folder, before in told["trials"].items()}
-    is_last, fault, sent = False, None, time.monotonic()
+    is_last, fault, sent, shown = False, None, time.monotonic(), list[Path]()
     while not is_last:
         is_last = stop.wait(min(told["pause"], SECONDS_BETWEEN_LOOKS))
         now = {folder: _stamps(folder) for folder in left}
         begun = [folder for folder in left if now[folder] != left[folder]]
         ended = [folder for folder in begun if _has_ended(folder, left[folder], now[folder])]
-        # while the tracker refuses, the end of a trial makes no further tries
-        if is_last or (ended and not fault) or time.monotonic() - sent >= told["pause"]:
-            sent, fault = time.monotonic(), _send(begun, allowed)
+        # while the tracker refuses, a beginning or an end makes no further tries
+        is_new = not fault and (ended or not set(begun) <= set(shown))
+        if is_last or is_new or time.monotonic() - sent >= told["pause"]:
+            sent, shown, fault = time.monotonic(), begun, _send(begun, allowed)
             for folder in () if fault else ended:
                 del left[folder]
     if fault is not None:
