@@ -63,10 +63,8 @@ class Mirror:
         self._told = f"{json.dumps(told)}\n".encode()
 
     def __enter__(self) -> None:
-        self._ended, self._keeper = (
-            threading.Event(),
-            threading.Thread(target=self._keep, daemon=True),
-        )
+        self._ended = threading.Event()
+        self._keeper = threading.Thread(target=self._keep, daemon=True)
         if self._trials:
             self._start()
             self._keeper.start()
