@@ -1,4 +1,4 @@
-"""How long trials take: the listing of a dry run, and the progress of a sweep. Loads no torch."""
+"""Estimates of time: the listing of a dry run, and the progress of a sweep. Loads no torch."""
 
 from __future__ import annotations
 
