@@ -13,9 +13,9 @@ from PIL import Image
 from gsbench.files import file_sha256
 from gsbench.init import Dim, Sfm
 from gsbench.init.base import MODEL_FOLDER
+from gsbench.scene.beside import read_mask
 from gsbench.scene.colmap import read_model
 from gsbench.scene.courtyard.render import render_courtyard
-from gsbench.scene.masks import read_mask
 from tests.end_to_end.conftest import trial_of
 from tests.helpers import read_json
 from tests.scene.captures import read_colmap

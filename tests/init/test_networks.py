@@ -15,7 +15,7 @@ from gsbench.init.colmap import database, matches
 from gsbench.init.colmap.database import DatabaseTask
 from gsbench.init.networks import features, models
 from gsbench.init.networks.features import Features, FeatureStore
-from gsbench.init.reconstruction import Job
+from gsbench.init.sfm import Job
 from tests.helpers import refusal, write
 
 NAMES = ("a.png", "b.png", "c.png")

@@ -16,6 +16,7 @@ from gsbench.init.point_files import read_points
 from gsbench.scene.images import read_image
 from tests.helpers import refusal
 from tests.init.models import camera_at, model_with
+from tests.init.tables import TABLES
 from tests.init.test_report import CENTERS, model_of
 
 RNG = np.random.default_rng(0)
@@ -35,16 +36,7 @@ def write(path, properties, values, text, order):
 @pytest.mark.parametrize("order", ["<", ">"])
 @pytest.mark.parametrize(
     "names, kind, scale",
-    [
-        (("red", "green", "blue"), "u1", 1),
-        (("r", "g", "b"), "f4", 1 / 255),
-        (("red", "green", "blue"), "u2", 257),
-        (("Red", "Green", "Blue"), "u1", 1),
-        (("scalar_R", "scalar_G", "scalar_B"), "f4", 1),
-        (("color_red", "color_green", "color_blue"), "u1", 1),
-        (("ambient_red", "ambient_green", "ambient_blue"), "u1", 1),
-        (("red", "green", "blue"), "f4", 1.001 / 255),  # fractions that go beyond 1
-    ],
+    TABLES["colours of PLY files"],
 )
 def test_ply_properties_may_have_any_order_and_type(tmp_path, text, order, names, kind, scale):
     red, green, blue = ((name, kind) for name in names)
@@ -99,22 +91,7 @@ def test_tables_of_scanners_and_other_programs_are_read(tmp_path, name, text, co
 
 @pytest.mark.parametrize(
     "name, text, message",
-    [
-        ("a.csv", "lat,lon,alt\n47.1,8.5,400\n", "it has no column x, y, z"),
-        ("a.csv", "X;Y;Z;R\n1,5;2,5;3,5;7\n", "with decimal points"),
-        ("a.txt", "1,5\t2,5\t3\n", "with decimal points"),
-        ("a.xyz", "1 2 3 #ff8000\n4 5 6 #00ff00\n", "save it so, or as PLY"),
-        ("a.txt", "#   POINT3D_ID, X, Y, Z, R, G, B\n1 2 3 4 5 6 7 8\n", "init=dataset reads its"),
-        ("a.xyz", "1.0D+00 2.0D+00 3.0D+00\n", "save it so, or as PLY with"),
-        ("a.las", "LASF", "convert it to PLY, for example with CloudCompare"),
-        ("a.splat", "x", "in the format splat: unpack it with npx"),
-        ("points3D.bin", "x", "belongs to a COLMAP model: init=dataset"),
-        ("a.xyz", "1 2 3 0xff8000\n", "save it so, or as PLY with CloudCompare"),
-        ("a.xyz", "1 2 3 4 5 6 7\n", "it has 7 columns without names"),
-        ("a.pts", "2\n1 2 3\n1 2 3 4\n", "Expected 3 fields"),
-        ("a.xyz", "2\na title\nC 1 2 3\n", "save it so, or as PLY"),
-        ("a.ply", "version https://git-lfs.github.com/spec/v1\n", "a pointer of Git LFS"),
-    ],
+    TABLES["clouds refused"],
 )
 def test_tables_that_would_be_read_wrong_are_refused_with_the_remedy(tmp_path, name, text, message):
     (tmp_path / name).write_text(text)

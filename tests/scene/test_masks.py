@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
-from gsbench.scene.masks import (
+from gsbench.scene.beside import (
     fill_ignored,
     find_masks,
     prepare_photograph,

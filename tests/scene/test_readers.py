@@ -187,14 +187,7 @@ LISTS = {  # name of a file: what it lists
 
 @pytest.mark.parametrize(
     "train, test, trained_on, tested_on",
-    [
-        (None, "test", (0, 2, 4, 5), (1, 3)),
-        ("train", "test", (0, 2), (1, 3)),
-        ("train", None, (0, 2), (1, 3, 4, 5)),
-        (None, "bad", r"split lists name 99\.png", None),
-        ("first", "last", "2 images in the split lists, but at least 3 are needed", None),
-        ("train", "first", r"00\.png for training and for testing", None),
-    ],
+    TABLES["split lists"],
 )
 def test_lists_choose_the_training_and_test_views(make_scene, train, test, trained_on, tested_on):
     root = make_scene()

@@ -335,29 +335,12 @@ def focal(side, angle):
     return 0.5 * side / math.tan(angle / 2)
 
 
-WIDE, HIGH = focal(40, math.radians(70)), focal(30, math.radians(50))
-
-
-@pytest.mark.parametrize(
-    "said, focal_x, focal_y",
-    [
-        ({"x_fov": 70.0}, WIDE, WIDE),
-        ({"y_fov": 50.0}, HIGH, HIGH),
-        ({"x_fov": 70.0, "y_fov": 50.0}, WIDE, HIGH),
-        ({"camera_angle_x": 1.2}, focal(40, 1.2), focal(40, 1.2)),
-        ({"camera_angle_y": 0.9}, focal(30, 0.9), focal(30, 0.9)),
-        ({"camera_angle_x": 1.2, "camera_angle_y": 0.9}, focal(40, 1.2), focal(30, 0.9)),
-        ({"fl_y": 51.0}, 51.0, 51.0),
-        ({"fl_x": 50.0, "camera_angle_y": 0.9}, 50.0, focal(30, 0.9)),
-        ({"fl_x": 50.0, "fl_y": 51.0, "x_fov": 70.0, "camera_angle_y": 0.9}, 50.0, 51.0),
-    ],
-)
+@pytest.mark.parametrize("said, x, y", TABLES["fields of view"])
 @pytest.mark.parametrize("edit", [in_each_frame, lambda **said: lambda d: d.update(said)])
-def test_focal_lengths_follow_from_every_way_to_give_a_field_of_view(
-    tmp_path, said, focal_x, focal_y, edit
-):
+def test_focal_lengths_follow_from_every_way_to_give_a_field_of_view(tmp_path, said, x, y, edit):
+    wanted = [focal(*value) if isinstance(value, list) else value for value in (x, y)]
     for camera in cameras(tmp_path / "in", edit(**said), fl_x=None, fl_y=None).values():
-        assert camera.params[:2] == pytest.approx((focal_x, focal_y))
+        assert camera.params[:2] == pytest.approx(tuple(wanted))
 
 
 def test_a_frame_with_a_field_of_view_of_its_own_uses_no_focal_length_of_the_file(tmp_path):
@@ -366,7 +349,7 @@ def test_a_frame_with_a_field_of_view_of_its_own_uses_no_focal_length_of_the_fil
             document["frames"][number].update(keys)
 
     found = [camera.params[0] for camera in cameras(tmp_path, edit).values()]
-    assert found == pytest.approx([focal(40, 0.5), WIDE, 70, 50, 50, 50])
+    assert found == pytest.approx([focal(40, 0.5), focal(40, math.radians(70)), 70, 50, 50, 50])
 
 
 def test_a_focal_length_that_contradicts_the_field_of_view_is_used_with_one_line(tmp_path, caplog):

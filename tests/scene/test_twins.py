@@ -17,20 +17,13 @@ from gsbench.scene.types import Scene, View
 from tests.helpers import refusal
 from tests.scene.captures import read_colmap, read_photos
 from tests.scene.conftest import smooth_image
+from tests.scene.tables import TABLES
 from tests.train.conftest import orbit_camera
 
 
 @pytest.mark.parametrize(
     "names, wanted, left_out",
-    [
-        (["a.jpg", "a.png", "b.jpg"], (), {"a.png": "a.jpg"}),
-        # the format that more photographs have
-        (["a.jpg", "a.png", "b.png"], (), {"a.jpg": "a.png"}),
-        (["a.JPEG", "a.png", "b.png", "c.JPG", "c.tif"], (), {"a.JPEG": "a.png", "c.tif": "c.JPG"}),
-        (["a.jpg", "a.png", "b.jpg"], {"a.png"}, {"a.jpg": "a.png"}),
-        (["1/a.jpg", "2/a.png"], (), {}),
-        (["a.jpg", "a.v2.jpg"], (), {}),
-    ],
+    TABLES["copies by name"],
 )
 def test_one_of_several_photographs_with_the_same_stem_is_used(names, wanted, left_out):
     assert copies_by_name(names, wanted) == left_out

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from gsbench.init import Sfm
 from gsbench.init.base import TrainingPoints
-from gsbench.init.colmap import alignment, mapping, matches, models
+from gsbench.init.colmap import mapping, matches, models
 from gsbench.init.colmap import pairs as pairing
 from gsbench.init.colmap.database import DatabaseTask, create_database, write_features
 from gsbench.init.colmap.matches import verify_pairs
@@ -93,7 +93,7 @@ def test_the_poses_of_two_models_are_paired_by_name():
         turn = pose.rotation.matrix()
         moved[name] = camera_at(scale * -turn.T @ pose.translation + shift, turn)
     first, second = model_of(poses()), model_of(moved)
-    centers, rotations, other_centers, other_rotations = alignment.common_poses(first, second)
+    centers, rotations, other_centers, other_rotations = models.common_poses(first, second)
     places = [[0.8 * (k - 1.5), 0.2 * k, 0.1] for k in (1, 2, 3)]
     turns = [poses()[name].rotation.matrix() for name in NAMES[1:]]
     assert_allclose(centers, places, atol=1e-12)
@@ -101,8 +101,8 @@ def test_the_poses_of_two_models_are_paired_by_name():
     assert_allclose(rotations, turns, atol=1e-12)
     assert_allclose(other_rotations, rotations, atol=1e-12)
     paired = centers, rotations, other_centers, other_rotations
-    assert alignment.align_poses(*paired).scale == pytest.approx(scale)
-    nothing = alignment.common_poses(first, pycolmap.Reconstruction())
+    assert models.align_poses(*paired).scale == pytest.approx(scale)
+    nothing = models.common_poses(first, pycolmap.Reconstruction())
     assert [len(part) for part in nothing] == [0] * 4
 
 

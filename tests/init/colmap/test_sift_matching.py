@@ -15,7 +15,7 @@ from gsbench.init.base import Timer
 from gsbench.init.colmap.database import DatabaseTask, create_database, unknown_camera_groups
 from gsbench.init.colmap.matches import distribute_parts, divide_pairs, extract_sift, match_sift
 from gsbench.init.colmap.pairs import best_pairs
-from gsbench.init.reconstruction import Job
+from gsbench.init.sfm import Job
 from gsbench.logs import no_progress
 
 pairs_of_some_images = st.integers(2, 40).flatmap(

@@ -22,7 +22,7 @@ from gsbench.pipeline.steps.scene import (
 )
 from gsbench.runs.keys import INIT, Step
 from gsbench.runs.store import Store
-from gsbench.scene.masks import read_mask
+from gsbench.scene.beside import read_mask
 from gsbench.scene.options import SceneConfig
 from gsbench.scene.types import Capture
 from tests.helpers import refusal
