@@ -137,7 +137,7 @@ def test_no_keypoint_lies_on_an_ignored_pixel(captures, tmp_path, make, request)
     if make is Dim:
         words |= {"extractor": "aliked", "matcher": "mutual_nearest", "aliked_model": "t16"}
         words |= {"download": False, "weights": request.getfixturevalue("shared") / "weights"}
-    capture = read_colmap("masked", captures[0], masks="masks")
+    capture = read_colmap(captures[0], masks="masks")
     work = tmp_path / "work"
     try:
         make(threads=1, **words).run(capture, tmp_path / "out", work_dir=work)

@@ -143,8 +143,8 @@ def test_panoramas_are_refused_unless_they_are_accepted(tmp_path, size, refused)
         picture = Image.new("RGB", size, (60 * number, 0, 0))
         picture.save(tmp_path / f"{number}.jpg", xmp=XMP)
     with refusal(r"4 photographs declared as panoramas .*accept=\[panorama\]" if refused else None):
-        read_photos("toy", tmp_path)
-    capture = read_photos("toy", tmp_path, accept=["panorama"])
+        read_photos(tmp_path)
+    capture = read_photos(tmp_path, accept=["panorama"])
     assert [(odd.rule, odd.refused) for odd in capture.oddities] == [("panorama", True)] * refused
     with refusal("scene.accept=panoramas is no rule: .*did you mean panorama"):
         SceneConfig(name="toy", kind="photos", path="/x", accept=["panoramas"])
@@ -152,9 +152,7 @@ def test_panoramas_are_refused_unless_they_are_accepted(tmp_path, size, refused)
 
 def test_prepared_views_of_an_accepted_lens_are_judged_again(make_scene, tmp_path):
     root = make_scene(model="SIMPLE_RADIAL", params=[30, 20, 15, -0.5])
-    plain, accepting = (
-        read_colmap("toy", root, accept=accept) for accept in ([], ["lens-turns-back"])
-    )
+    plain, accepting = (read_colmap(root, accept=accept) for accept in ([], ["lens-turns-back"]))
     scene = loaded(accepting, tmp_path)
     again = loaded(accepting, tmp_path)
     assert [odd.refused for odd in again.oddities if odd.rule == "lens-turns-back"] == [True]
