@@ -11,10 +11,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.init import MODEL_FOLDER, Dataset, Ply, Random, read_cloud
-from gsbench.init.base import GAUSSIANS_FILE
+from gsbench.init.base import GAUSSIANS_FILE, REPORT_FILE, TrainingPoints
 from gsbench.scene.types import Capture
 from tests.gaussians.helpers import random_gaussians
-from tests.helpers import refusal
+from tests.helpers import read_json, refusal
 from tests.init.models import add_point
 from tests.init.test_report import CENTERS, NAMES, model_of
 
@@ -50,6 +50,20 @@ def test_dataset_keeps_the_cloud_of_the_model(courtyard, tmp_path):
     assert report.num_points == 20
     assert report.mean_track_length == 3.0
     assert any("only 20 points" in odd.line for odd in report.oddities)
+
+
+def test_the_dataset_s_points_may_come_from_training_views_alone(courtyard, tmp_path):
+    """The first of the three images that see all points is a test view."""
+    add_points(courtyard.model, tmp_path / "model", 20)
+    capture, out = replace(courtyard, model=tmp_path / "model"), tmp_path / "out"
+    report = Dataset(points_from="train").run(capture, out)
+    assert report.training_points == TrainingPoints("train", 20, 20, 0.0)
+    assert report.mean_track_length == 2.0
+    assert read_json(out / REPORT_FILE)["training_points"]["kept"] == 20
+    assert {path.name for path in out.iterdir()} == {"sparse", REPORT_FILE}
+    few = replace(capture, test_names=capture.image_names[:2])
+    with refusal("init.points_from=train: no point is left that two training views see"):
+        Dataset(points_from="train").run(few, out)
 
 
 @pytest.mark.parametrize("seen_by", [1, 3])

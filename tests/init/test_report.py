@@ -122,7 +122,9 @@ def test_an_estimated_model_is_written_in_the_gauge_of_the_reference_or_its_own(
 ):
     model, shift = model_of(CENTERS), np.array([1.0, 2.0, 3.0])
     model.transform(pycolmap.Sim3d(3.0, pycolmap.Rotation3d(), shift))
-    report = reported(capture, model, **align(model, model_of(CENTERS), capture, False, move))
+    poses = {name: camera_at(at) for name, at in zip(NAMES, CENTERS, strict=True)}
+    others = model_with(dict(reversed(poses.items())))  # paired by name, not by number
+    report = reported(capture, model, **align(model, others, capture, False, move))
     write_result(model, report, tmp_path)
     assert report.gauge.scale_to_reference == pytest.approx(1.0 if move else 1 / 3)
     found = posed_images(pycolmap.Reconstruction(tmp_path / MODEL_FOLDER))
