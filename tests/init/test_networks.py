@@ -163,23 +163,7 @@ def test_pairs_that_the_preview_leaves_out_are_counted(networks, job, monkeypatc
     assert (facts["counts"]["pairs_selected"], facts["counts"]["pairs_left_out"]) == (1, 2)
 
 
-def test_the_weights_are_named_by_their_digests_and_tell_stored_files_apart(
-    networks, job, tmp_path
-):
-    run(job)
-    weights = tmp_path / "w.pth"
-    weights.write_bytes(b"weights")
-    networks.weights[1] = weights
-    assert run(job)[2]["settings"]["weights_sha256"] == {
-        file.name: file_sha256(file) for file in networks.weights
-    }
-    assert (len(networks.extracted), len(networks.matched)) == (6, 6)
-    networks.weights[0] = weights
-    run(job)
-    assert (len(networks.extracted), len(networks.matched)) == (9, 9)
-
-
-def test_other_settings_images_or_masks_have_other_files(networks, job):
+def test_other_settings_images_masks_or_weights_have_other_files(networks, job):
     run(job)
     Image.new("L", (8, 8), 255).save(mask := job.work_dir / "mask.png")
     masked = replace(job.capture, masks={"c.png": mask})
@@ -190,3 +174,8 @@ def test_other_settings_images_or_masks_have_other_files(networks, job):
     Image.new("L", (8, 8), 9).save(job.capture.images / "a.png")
     run(job)
     assert len(networks.extracted) == 15
+    for number, file in enumerate(networks.weights):
+        file.write_text("others")
+        digests = {file.name: file_sha256(file) for file in networks.weights}
+        assert run(job)[2]["settings"]["weights_sha256"] == digests
+        assert len(networks.extracted) == 18 + 3 * number

@@ -52,36 +52,20 @@ def rows(*columns, between=" "):
     return "".join(between.join(f"{value:.17g}" for value in row) + "\n" for row in table)
 
 
-INTENSITY = np.arange(len(XYZ)) - 1200.0
+COLUMNS = {"XYZ": XYZ, "ZYX": XYZ[:, ::-1], "RGB": RGB, "FRACTIONS": RGB / 255}
+COLUMNS |= {"NUMBER": np.arange(40), "INTENSITY": np.arange(40) - 1200.0, "ALPHA": np.full(40, 255)}
+TEXTS = [
+    ("a.pts", f"3\n{rows(XYZ[:3], RGB[:3])}37\n{rows(XYZ[3:], RGB[3:])}", True),
+    ("a.csv", "\ufeff" + rows(XYZ, between=",").replace("\n", "\r\n"), False),
+    ("a.csv", '"x","y","z"\n' + re.sub(r"[^,\n]+", r'"\g<0>"', rows(XYZ, between=",")), False),
+    ("a.csv", rows(XYZ, RGB, between=",").replace("\n", ",\n"), True),
+]
+for name, head, columns, between, colored in TABLES["tables of points"]:
+    table = rows(*map(COLUMNS.get, columns.split()), between=between)
+    TEXTS.append((name, head + table, colored))
 
-ALPHA = np.full(len(XYZ), 255)
-COUNTED = rows(np.arange(len(XYZ)), XYZ, RGB, between=",")
-WITH_FIELDS = rows(XYZ, RGB, INTENSITY, ALPHA, between=",")
 
-
-@pytest.mark.parametrize(
-    "name, text, colored",
-    [
-        ("a.pts", f"{len(XYZ)}\n{rows(XYZ, INTENSITY, RGB)}", True),
-        ("a.pts", f"{len(XYZ)}\n{rows(XYZ, INTENSITY)}", False),
-        ("a.pts", f"3\n{rows(XYZ[:3], RGB[:3])}{len(XYZ) - 3}\n{rows(XYZ[3:], RGB[3:])}", True),
-        ("a.csv", f"X,Y,Z,Intensity,R,G,B\n{rows(XYZ, INTENSITY, RGB, between=',')}", True),
-        ("a.csv", f"r;g;b;z;y;x\n{rows(RGB, XYZ[:, ::-1], between=';')}", True),
-        ("a.csv", f'"x [m]", "y [m]", "z [m]"\n{rows(XYZ, between=", ")}', False),
-        ("a.txt", f"//X Y Z Rf Gf Bf\n{rows(XYZ, RGB / 255)}", True),
-        ("a.asc", f"# a scan\n# x y z\n{rows(XYZ)}", False),
-        ("a.txt", f"3D points of 2024-05-01\nx y z\n{rows(XYZ)}", False),
-        ("a.txt", f"#\tz\ty\tx\n{rows(XYZ[:, ::-1], between=chr(9))}", False),
-        ("a.xyz", rows(XYZ, between="\t"), False),
-        ("a.xyz", rows(XYZ, RGB), True),
-        ("a.csv", "\ufeff" + rows(XYZ, between=",").replace("\n", "\r\n"), False),
-        ("a.csv", f"n,pos_x,pos_y,pos_z,Color R,Color G,Color B\n{COUNTED}", True),
-        ("a.csv", f"x,y,z,r,g,b,Scalar field,Cloud index\n{WITH_FIELDS}", True),
-        ("a.csv", '"x","y","z"\n' + re.sub(r"[^,\n]+", r'"\g<0>"', rows(XYZ, between=",")), False),
-        ("a.csv", rows(XYZ, RGB, between=",").replace("\n", ",\n"), True),
-        ("a.csv", f"x,y,z,rgb_r,rgb_g,rgb_b\n{rows(XYZ, RGB, between=',')}", True),
-    ],
-)
+@pytest.mark.parametrize("name, text, colored", TEXTS)
 def test_tables_of_scanners_and_other_programs_are_read(tmp_path, name, text, colored):
     (tmp_path / name).write_bytes(text.encode())
     points, colors = read_points(tmp_path / name)

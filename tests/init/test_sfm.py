@@ -145,12 +145,6 @@ def test_webp_photos_give_the_same_points_as_png_photos(courtyard, tmp_path):
     assert_array_equal(first.colors, second.colors)
 
 
-@pytest.mark.slow
-def test_keypoints_found_at_a_smaller_size_are_scaled_back_to_the_file(courtyard, tmp_path):
-    Sfm(max_image_size=200).run(courtyard, tmp_path)
-    assert np.median(surface_distance(read_cloud(tmp_path / MODEL_FOLDER).points)) < 0.06
-
-
 @pytest.mark.parametrize(
     "pixels, said",
     [

@@ -4,6 +4,7 @@ import json
 import math
 import shutil
 import tempfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -69,7 +70,7 @@ def in_frame(number, **keys):
 
 
 def capture_of(folder, **options):
-    work = tempfile.mkdtemp(dir=folder.parent)
+    work = Path(tempfile.mkdtemp(dir=folder.parent))
     return read_with_step(folder, work, name="t", kind="transforms", **options)
 
 
