@@ -15,7 +15,7 @@ from gsbench.init.base import GAUSSIANS_FILE, REPORT_FILE, TrainingPoints
 from gsbench.scene.types import Capture
 from tests.gaussians.helpers import random_gaussians
 from tests.helpers import read_json, refusal
-from tests.init.models import add_point
+from tests.init.models import add_point, model_with
 from tests.init.test_report import CENTERS, NAMES, model_of
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -25,15 +25,10 @@ def add_points(model_dir, target, count):
     """A copy of the model with points that the first three images see."""
     model = pycolmap.Reconstruction(model_dir)
     points = np.random.default_rng(0).uniform(-1, 1, (count, 3))
-    copy = pycolmap.Reconstruction()
-    for camera in model.cameras.values():
-        copy.add_camera_with_trivial_rig(camera)
-    for image in model.images.values():
-        projected = np.array([image.project_point(point) for point in points])
-        new = pycolmap.Image(
-            name=image.name, keypoints=projected, camera_id=image.camera_id, image_id=image.image_id
-        )
-        copy.add_image_with_trivial_frame(new, image.cam_from_world())
+    images = [image for _, image in sorted(model.images.items())]
+    seen = {image.name: np.array([*map(image.project_point, points)]) for image in images}
+    poses = {image.name: image.cam_from_world() for image in images}
+    copy = model_with(poses, seen, model.cameras[1])
     for index, point in enumerate(points):
         add_point(copy, point, (index, 2 * index, 255 - index), dict.fromkeys((1, 2, 3), index))
     target.mkdir(parents=True)
