@@ -93,8 +93,8 @@ def _without_pose(folder: Path, files: Sequence[str], matched: Iterable[str]) ->
     """The photographs among ``files`` that no image of the model matched."""
     used = {stem_of(file) for file in matched}
     others = [name for name in files if stem_of(name) not in used]
-    kept = set(photographs_among(folder, files, report=False)) if others else set()
-    return [name for name in others if name in kept]
+    reasons = _reasons(folder, files) if others else {}
+    return [name for name in others if name not in reasons]
 
 
 def read_photos(root: Path, options: SceneConfig) -> RawCapture:
@@ -159,14 +159,13 @@ def missing_folder(name: str, root: Path) -> str:
 # ---- what is no photograph by its name
 
 
-def photographs_among(folder: Path, names: Sequence[str], report: bool = True) -> list[str]:
+def photographs_among(folder: Path, names: Sequence[str]) -> list[str]:
     """The ``names`` of image files below ``folder`` that are photographs, in their order.
 
-    With ``report``, one log line says which folders and files are left out, and InputError is
-    raised if none is left.
+    One log line says which folders and files are left out. Raises InputError if none is left.
     """
     reasons = _reasons(folder, names)
-    if reasons and report:
+    if reasons:
         counts = Counter(reasons.values())
         listed = ", ".join(f"{place} ({count})" for place, count in sorted(counts.items()))
         files = counted(len(reasons), "file")
