@@ -73,18 +73,22 @@ def _remote(url: str, policy: RetryPolicy) -> Iterator[zipfile.ZipFile]:
             raise zipfile.BadZipFile(str(error)) from None
 
     with requests.Session() as session:
-        with _opened(lambda: with_retries(once, url, policy), url) as archive:
+        with _opening(url):
+            archive = with_retries(once, url, policy)
+        with archive:
             yield archive
 
 
 def open_archive(file: IO[bytes], where: str) -> zipfile.ZipFile:
     """Open the zip archive in ``file``; raises `InputError` naming ``where`` if it is none."""
-    return _opened(lambda: zipfile.ZipFile(file), where)
+    with _opening(where):
+        return zipfile.ZipFile(file)
 
 
-def _opened(make: Callable[[], zipfile.ZipFile], where: str) -> zipfile.ZipFile:
+@contextmanager
+def _opening(where: str) -> Iterator[None]:
     try:
-        return make()
+        yield
     except InputError:  # a ValueError, too
         raise
     except NO_ARCHIVE as error:
