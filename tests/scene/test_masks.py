@@ -19,6 +19,7 @@ from gsbench.scene.beside import (
 from gsbench.scene.types import Capture
 from tests.helpers import refusal
 from tests.scene.captures import loaded, read_colmap, read_photos
+from tests.scene.tables import TABLES
 
 
 def save(path, pixels, **options):
@@ -150,23 +151,12 @@ def test_filling_between_two_pixels_is_linear():
     assert fill_ignored(row.swapaxes(0, 1), counts.T)[:, 0, 2].tolist() == [0, 25, 75, 100]
 
 
-@pytest.mark.parametrize(
-    "mask, alpha, backdrop, copied",
-    [
-        (None, 255, "black", True),
-        (None, 9, "black", True),  # since reading blends it over black anyway
-        (None, 255, "white", True),
-        (None, 9, "white", False),
-        (np.full((6, 8), 255, np.uint8), 255, "black", True),
-        (np.full((6, 8), 255, np.uint8), 9, "white", False),
-        (half(8, 6), 255, "black", False),
-        (half(8, 6), 255, "white", False),
-    ],
-)
+@pytest.mark.parametrize("mask, alpha, backdrop, copied", TABLES["photographs copied"])
 def test_a_photograph_without_changes_is_copied(tmp_path, mask, alpha, backdrop, copied):
     pixels = np.full((6, 8, 4), (200, 100, 50, alpha), np.uint8)
     original = save(tmp_path / "in" / "a.png", pixels if alpha < 255 else pixels[..., :3])
-    masks = {} if mask is None else {"a.png": save(tmp_path / "a.png", mask)}
+    own = {"half": half(8, 6), "white": np.full((6, 8), 255, np.uint8)}
+    masks = {"a.png": save(tmp_path / "a.png", own[mask])} if mask else {}
     prepare_photograph(tmp_path / "out", tmp_path / "in", masks, "a.png", backdrop)
     made = tmp_path / "out" / "images" / "a.png"
     assert (made.read_bytes() == original.read_bytes()) == copied
