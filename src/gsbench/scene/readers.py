@@ -33,9 +33,9 @@ from gsbench.words import counted, some_of
 log = logging.getLogger(__name__)
 
 Reader = Callable[[Path, SceneConfig], RawCapture]
-DEPTH = FILES["depth"]
+DEPTH_WORDS = FILES["depth"]
 # words in the names of folders and files that hold something else than photographs
-WORDS = frozenset(word + ending for word in DEPTH + FILES["others"] for ending in ("", "s"))
+WORDS = frozenset(word + ending for word in DEPTH_WORDS + FILES["others"] for ending in ("", "s"))
 # a folder of this name may hold the photographs of a lens that is neither wide nor long
 FOLDER_WORDS = WORDS - {"normal"}
 THUMBNAIL = re.compile(r"SYNO(PHOTO|VIDEO|INDEX)_", re.IGNORECASE)  # files of Synology
@@ -202,7 +202,7 @@ def companions_beside(raw: RawCapture, root: Path) -> RawCapture:
             continue
         for stem, file in found.items():
             row = rows[stems[stem]]
-            if words.isdisjoint(DEPTH) or row.depth is not None:
+            if words.isdisjoint(DEPTH_WORDS) or row.depth is not None:
                 rows[row.name] = replace(row, more={**row.more, folder.name: files[file]})
             else:
                 rows[row.name] = replace(row, depth=files[file])
