@@ -190,7 +190,8 @@ def shards_of(record_ints, base, tile_shard, tiles_x):
     """The shards of the first and of the last tile that the record at ``base`` can touch."""
     spans_x, spans_y = record_ints[base + at.TILES_X], record_ints[base + at.TILES_Y]
     first = tile_shard[(spans_y & 0xFFFF) * tiles_x + (spans_x & 0xFFFF)]
-    return first, tile_shard[((spans_y >> 16) - 1) * tiles_x + (spans_x >> 16) - 1]
+    last = tile_shard[((spans_y >> 16) - 1) * tiles_x + (spans_x >> 16) - 1]
+    return np.int64(first), np.int64(last)
 
 
 @kernel
@@ -205,6 +206,6 @@ def place_rows(begins, visible, record_ints, tile_shard, tiles_x):
         for record in range(begins[shard], begins[shard] + visible[shard]):
             base = record * at.RECORD
             first, last = shards_of(record_ints, base, tile_shard, tiles_x)
-            record_ints[base + at.FIRST_ROW] = row - np.int64(first)
-            row += np.int64(last) - np.int64(first) + 1
+            record_ints[base + at.FIRST_ROW] = row - first
+            row += last - first + 1
     return row
