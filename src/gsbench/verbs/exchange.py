@@ -30,9 +30,7 @@ def evaluate(argv: Sequence[str], runs: Path) -> int:
         "evaluate",
         "Names are matched, never guessed. Sizes must be equal.",
         {
-            "renders RENDERS": (
-                "folder of pictures, or predictions of nerfbaselines (.zip, .tar.gz)"
-            ),
+            "renders RENDERS": ("folder of pictures, or of predictions by nerfbaselines"),
             "settings* KEY=VALUE": "settings of the scene, and eval.…",
             "--truth PLACE": "the photographs: a folder, a trial (folder or EXPERIMENT:SCENE:ARM), "
             "or a scene's name, whose test views are taken as a trial sees them; not needed for "
