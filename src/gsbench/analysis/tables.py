@@ -261,9 +261,8 @@ def _reading_notes(
         notes = [Note.of("mean", trials=expected, spread=spread, **facts)]
     if any(0 < cell.count < expected or not cell.trials for cell in cells.values()):
         notes.append(Note.of("few values", trials=expected))
-    for one in dict.fromkeys(quantity for *_, quantity in cells):
-        own = [cell for position, cell in cells.items() if position[2] == one]
-        reasons = {cell.reason for cell in own if cell.trials and cell.reason}
+    for one, places in group_by(cells, lambda position: position[2]).items():
+        reasons = {cells[place].reason for place in places if cells[place].trials} - {""}
         notes += [Note.of("not available", metric=one.name, reason=why) for why in sorted(reasons)]
     return notes
 
