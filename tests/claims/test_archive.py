@@ -78,6 +78,15 @@ def test_results_settings_and_views_are_read_back(tmp_path):
     assert compare(back).sentences == compare(there).sentences
 
 
+def test_an_archive_tells_that_an_earlier_gsbench_was_asked(tmp_path):
+    write_runs(tmp_path / "runs")
+    (tmp_path / "runs/exp/declared.jsonl").write_text("{}")
+    file = tmp_path / "exp.zip"
+    write_archive(loaded(tmp_path / "runs"), file)
+    (answer,) = compare(unpack_archive(file, tmp_path / "other")).answers
+    assert "declared.jsonl" in answer.sentence
+
+
 def test_an_archive_is_a_runs_folder_with_a_list_of_checksums(tmp_path):
     content = members(export(tmp_path, scenes=("yard",), seeds=(0,), densifiers=("adc",)))
     manifest = json.loads(content["archive.json"])
@@ -195,6 +204,19 @@ def flip_a_bit(file):
     file.write_bytes(bytes(data))
 
 
+TRIAL = "courtyard/sfm-adc/c0ffee00-seed0"
+OUTSIDE = (
+    "../up/tuning.json",
+    "exp/x/config.yaml",
+    f"exp/{TRIAL}/renders/../../x.png",
+    "exp/../../x/renders/a.png",
+    f"other/{TRIAL}/renders/a.png",
+    f"exp/{TRIAL}/other/a.png",
+    f"exp/{TRIAL}/renders/",
+    "a.png",
+)
+
+
 @pytest.mark.parametrize(
     "damage, message",
     [
@@ -226,9 +248,8 @@ def flip_a_bit(file):
         (of_trial("config.yaml", b"seed: 0", b"seed: 1"), "says seed 1, its results 0"),
         (of_trial("per_view.csv", b"view000,", b"view009,2"), "per_view.csv"),
         (edit("archive.json", b"{", b"[" * 200_000), "not JSON"),
-        (added("../up/tuning.json", {}), "cannot be a file of an archive"),
         (added("up/tuning.json", search_record([]) | {"points": 3}), "points is 3"),
-        (added("exp/x/config.yaml", {}), "cannot be a file of an archive"),
+        *((added(place, {}), "cannot be a file of an archive") for place in OUTSIDE),
         (
             edit("archive.json", b'"experiment": "exp"', b'"experiment": "../up"'),
             "cannot be the name of an experiment",
