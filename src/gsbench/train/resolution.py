@@ -108,7 +108,7 @@ def _first_reaching(
 
 
 class Resolution:
-    """The size of the pictures at each iteration.
+    """The size of the pictures at each iteration; always the full one without a schedule.
 
     Sizes depend only on the pictures and on the densification window of ``options``; they change
     only after rounds of densification.
@@ -116,7 +116,9 @@ class Resolution:
 
     def __init__(self, options: TrainConfig, views: Sequence[View]) -> None:
         self.options = options
-        self.schedule = scale_schedule([view.image for view in views], options.densify_stop)
+        self.schedule = ScaleSchedule((0,), (1.0,))
+        if options.resolution_schedule == "pictures":
+            self.schedule = scale_schedule([view.image for view in views], options.densify_stop)
 
     def scale(self, step: int) -> int:
         """The number by which the sides of pictures are divided at iteration ``step``."""
