@@ -43,5 +43,7 @@ __all__ = [
     "Volumetric",
 ]
 
+# The parts that `gsbench ablate` can switch off are rows of a table; a class of a user's names its
+# own in ``SWITCHES``.
 for _name, _rows in table_beside(__file__, "switches.yaml").items():
     globals()[_name].SWITCHES = {part: Switch(**row) for part, row in _rows.items()}

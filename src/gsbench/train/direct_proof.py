@@ -33,9 +33,7 @@ def direct_fault(rasterizer: Rasterizer, device: torch.device, case: Case) -> st
     for extended in (False, True):
         expected = _train(rasterizer, device, case, extended)
         for graphs in (False, True) if device.type == "cuda" else (False,):
-            name = (
-                ("extended " if extended else "") + ("recorded" if graphs else "direct") + " steps"
-            )
+            name = f"{'extended ' if extended else ''}{'recorded' if graphs else 'direct'} steps"
             try:
                 found = _train(rasterizer, device, case, extended, graphs)
             except torch.OutOfMemoryError:

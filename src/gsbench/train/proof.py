@@ -128,21 +128,12 @@ def _comparisons(
     if find_executor(rasterizer.name).same_bits:
         # The second run is after all scenes, so that it reuses memory.
         first, again = ([_bits(rasterizer, case, str(device)) for case in scenes] for _ in range(2))
-        unequal = [
-            [name for name in bits if bits[name] != other[name]]
-            for bits, other in zip(first, again, strict=True)
-        ]
-        yield [
-            Error(
-                str(case),
-                "bits of a second run",
-                float(len(names)),
-                0.5,
-                ", ".join(names),
-                " tensors",
-            )
-            for case, names in zip(scenes, unequal, strict=True)
-        ]
+        errors = []
+        for case, bits, other in zip(scenes, first, again, strict=True):
+            unequal = [name for name in bits if bits[name] != other[name]]
+            count, names = float(len(unequal)), ", ".join(unequal)
+            errors.append(Error(str(case), "bits of a second run", count, 0.5, names, " tensors"))
+        yield errors
     yield _training_errors(rasterizer, device, scenes[0], loss)
 
 
