@@ -290,7 +290,8 @@ class Trainer:
             )
         render = self.render(index)
         depth_points = self._add_depth(render, cameras[index])
-        total, scalars = self._loss(render, index, replace_ignored(render.image, target, mask))
+        image = replace_ignored(render.image, target, mask)
+        total, scalars = self._loss(render, index, image, target)
         total.backward()
         if depth_points is not None and depth_points.grad is not None:
             # Terms on depth move the projected means, too: densifiers see the sum.
@@ -305,9 +306,11 @@ class Trainer:
             scalars.append(total)
         return render, torch.stack([scalar.detach().to(total) for scalar in scalars])
 
-    def _loss(self, render: RenderOutput, index: int, image: Tensor) -> tuple[Tensor, list[Tensor]]:
+    def _loss(
+        self, render: RenderOutput, index: int, image: Tensor, target: Tensor
+    ) -> tuple[Tensor, list[Tensor]]:
         """The sum to differentiate, and the scalars of `LossLog`, for a render with ``image``."""
-        ideas, target = self.ideas, self.scaled_views.at(self.scale)[1].get(index)
+        ideas = self.ideas
         if not ideas.reads_renders:
             loss, *shown = self.loss(image, target)
             return loss, [loss, *shown]
