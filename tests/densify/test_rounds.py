@@ -53,6 +53,16 @@ def test_a_round_of_adc_matches_the_restatement(seed, step):
 
 
 @pytest.mark.parametrize("seed", range(2))
+def test_a_round_by_absolute_gradient_matches_the_restatement(seed):
+    """It is a round of ADC with another gradient and four times the threshold."""
+    densifier = ADC(gradient="absolute", gradient_threshold=0.0008)
+    trainable, gradient = prepared(densifier, seed)
+    densifier.statistics["gradient_sum"] *= 4
+    real = Round(densifier, trainable, 600, seed)
+    real.check(real.grown(gradient))
+
+
+@pytest.mark.parametrize("seed", range(2))
 def test_a_round_with_revised_opacity_matches_the_restatement(seed):
     """Clone, original and children of a split each have the opacity 1 - sqrt(1 - o)."""
     trainable, gradient = prepared(densifier := ADC(revised_opacity=True), seed)

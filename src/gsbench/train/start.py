@@ -53,7 +53,7 @@ def check_start(
         far=int((distances > FAR).sum()),
         spread=float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)) / size),
     )
-    # what the rules measure and say; None is not measured
+    # the quantities that the rules measure; None is not measured
     start = SimpleNamespace(
         **vars(facts),
         extent=scene.extent,
