@@ -18,7 +18,6 @@ from gsbench.verbs.arguments import ArgumentParser, path
 from gsbench.words import readable_bytes
 
 DONE, LEFT_OUT = 0, 1
-PAGE = ".html"
 
 log = logging.getLogger(__name__)
 
@@ -31,9 +30,7 @@ def evaluate(argv: Sequence[str], runs: Path) -> int:
         "evaluate",
         "Names are matched, never guessed. Sizes must be equal.",
         {
-            "renders RENDERS": (
-                "folder of pictures, or predictions of nerfbaselines (.zip, .tar.gz)"
-            ),
+            "renders RENDERS": ("folder of pictures, or of predictions by nerfbaselines"),
             "settings* KEY=VALUE": "settings of the scene, and eval.…",
             "--truth PLACE": "the photographs: a folder, a trial (folder or EXPERIMENT:SCENE:ARM), "
             "or a scene's name, whose test views are taken as a trial sees them; not needed for "
@@ -54,16 +51,14 @@ def export(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 0 if the file, or folder, was written."""
     options = ArgumentParser(
         "export",
-        "A .html file is a page with the model and the test cameras, made by npx "
-        "(docs/other_models.md). `gsbench export init TRIAL --out DIR` copies the COLMAP model "
-        "that the trial started from. `gsbench export --results EXPERIMENT` writes results, "
-        "configurations and hashes as one small archive, without pixels unless --pictures is "
-        "given.",
+        "`gsbench export init TRIAL --out DIR` copies the COLMAP model that the trial started "
+        "from. `gsbench export --results EXPERIMENT` writes results, configurations and hashes as "
+        "one small archive, without pixels unless --pictures is given.",
         {
             "--results EXPERIMENT": "the archive of its results (default: EXPERIMENT.zip)",
             "trial* TRIAL": f"{TRIAL}; after the word init: its initial model",
             "--out PATH": (
-                "the .ply or .html file to write, for init the folder; a TRIAL needs it",
+                "the .ply file to write, for init the folder; a TRIAL needs it",
                 path,
             ),
             "--pictures": "with --results: the pictures of the test views, too",
@@ -85,18 +80,14 @@ def export(argv: Sequence[str], runs: Path) -> int:
 
 
 def export_model(trial: TrialResult, out: Path, is_init: bool) -> None:
-    """Write the trained model as a PLY file or a page, or the initial model as a folder."""
-    from gsbench.view.page import write_page
+    """Write the trained model as a PLY file, or the initial model as a folder."""
     from gsbench.view.trials import model_file, model_folder
 
-    is_page = out.suffix.lower() == PAGE
-    if not is_init and not is_page:
+    if not is_init:
         check_form(out)
     with writable_output(out):
         if is_init:
             export_init(model_folder(trial), out, trial.record.to_training)
-        elif is_page:
-            write_page(trial, out)
         else:
             with atomic(out, sync=False) as temporary:
                 shutil.copyfile(model_file(trial), temporary)
@@ -129,8 +120,7 @@ def check_form(out: Path) -> None:
     if not out.name.lower().endswith(".ply") or out.name.lower().endswith(".compressed.ply"):
         raise InputError(
             f"--out {out}: name a file that ends in .ply, the 3DGS form, which every viewer and "
-            "trainer reads, or in .html, a page for browsers (docs/other_models.md says what makes "
-            "other forms)"
+            "trainer reads (docs/other_models.md says what makes other forms, and a page)"
         )
 
 
