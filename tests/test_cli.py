@@ -11,7 +11,7 @@ import pytest
 from gsbench import __version__, cli
 from gsbench.errors import GsbenchError, InputError
 from gsbench.system.stopping import Stopped
-from gsbench.verbs import load_verb
+from gsbench.verbs import VERBS, load_verb
 from tests.processes import completed
 
 pytestmark = pytest.mark.usefixtures("runs")
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("runs")
 # ---- the frame
 
 
-@pytest.mark.parametrize("verb", list(cli.VERBS))
+@pytest.mark.parametrize("verb", list(VERBS))
 def test_every_verb_has_help_without_torch(verb, tmp_path):
     with pytest.raises(SystemExit) as done:
         load_verb(verb)(["--help"], tmp_path)
@@ -78,8 +78,7 @@ def test_the_first_word_tells_what_is_asked(words, asked, monkeypatch):
     found = []
     monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
     monkeypatch.setattr(
-        cli,
-        "load_verb",
+        "gsbench.verbs.load_verb",
         lambda name: lambda argv, runs: found.append(("verb", argv, runs.name)) or 7,
     )
     monkeypatch.setattr(cli, "_help", lambda argv: found.append(("help", argv)) or 7)
@@ -112,7 +111,7 @@ def test_an_error_stays_a_line_whatever_it_quotes(monkeypatch, capfd):
     def write(argv, runs):
         raise OSError(errno.ENOSPC, "full")
 
-    monkeypatch.setattr(cli, "load_verb", lambda name: write)
+    monkeypatch.setattr("gsbench.verbs.load_verb", lambda name: write)
     assert cli.run(["status"]) == 1
     assert " is full: free some space" in capfd.readouterr().err
 
@@ -146,7 +145,7 @@ def test_help_lists_verbs_and_choices_also_of_the_users_folders(tmp_path, said):
     (tmp_path / "own/densify/calm.yaml").touch()
     shown = said("--config-dir own --help")
     assert shown.startswith(cli.USAGE)
-    assert [name for name in cli.VERBS if f"\n  {name} " not in shown] == []
+    assert [name for name in VERBS if f"\n  {name} " not in shown] == []
     assert "calm" in shown
 
 
