@@ -16,8 +16,8 @@ from gsbench.config.build import build
 from gsbench.config.command_words import typed_permissions
 from gsbench.config.compose import Trial, compose_one
 from gsbench.config.overrides import value_text
-from gsbench.config.permissions import permission_advice
-from gsbench.config.trust import ADDRESS_VARIABLES, check_permissions, foreign_address
+from gsbench.config.permissions import ALLOWED, permission_advice
+from gsbench.config.trust import check_permissions, foreign_address
 from gsbench.errors import InputError
 from gsbench.launch.record import record
 from gsbench.runs.commands import Idea, Ledger, append, command_now
@@ -162,7 +162,7 @@ KINDS += ("a class and its permission", "a folder to write", "a variable")
 def test_no_file_of_a_stranger_decides_what_runs_and_where_results_go(
     file, case, monkeypatch, refused
 ):
-    for variable in ADDRESS_VARIABLES:
+    for variable in ALLOWED["addresses"]:
         monkeypatch.delenv(variable, raising=False)
     settings, said = STRANGE[case]
     for function in ("verbs.ledger.run_trials", "app.command.run_batch"):
@@ -329,7 +329,7 @@ def test_a_version_command_cannot_use_values_that_are_known_later():
 
 def test_an_address_counts_if_it_is_typed_or_in_the_environment(place, monkeypatch, refused):
     """It counts as typed if a typed choice of a tracker has it, not if another file changes it."""
-    for variable in ADDRESS_VARIABLES:
+    for variable in ALLOWED["addresses"]:
         monkeypatch.delenv(variable, raising=False)
     began = []
     monkeypatch.setattr("gsbench.app.command.run_trials", lambda trials: began.extend(trials) or 0)
@@ -361,7 +361,7 @@ def test_an_address_counts_if_it_is_typed_or_in_the_environment(place, monkeypat
     ],
 )
 def test_addresses_of_any_tracker_are_found(tracking, allowed, found, monkeypatch):
-    for variable in ADDRESS_VARIABLES:
+    for variable in ALLOWED["addresses"]:
         monkeypatch.delenv(variable, raising=False)
     assert foreign_address(tracking, allowed) == found
 

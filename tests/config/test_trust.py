@@ -16,7 +16,7 @@ from gsbench.app.command import compose_trials
 from gsbench.config.build import build
 from gsbench.config.command_words import typed_permissions
 from gsbench.config.compose import compose_one
-from gsbench.config.permissions import SBATCH_RESOURCES, foreign_variables, load_class
+from gsbench.config.permissions import ALLOWED, foreign_variables, load_class
 from gsbench.runs.user_code import module_digest
 from gsbench.system.programs import allow_modules
 from tests.helpers import refusal, write
@@ -491,7 +491,7 @@ def test_looking_for_a_users_source_imports_nothing(place):
 
 
 def test_options_of_slurm_that_choose_resources_need_no_permission():
-    assert not SBATCH_RESOURCES & {
+    assert not set(ALLOWED["sbatch"]) & {
         "wrap",
         "export",
         "export_file",
