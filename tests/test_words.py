@@ -16,6 +16,7 @@ from gsbench.config.schema import GROUP_SCHEMAS
 from gsbench.errors import InputError
 from gsbench.runs.config_hash import config_hash
 from gsbench.settings import check_values, option_fields
+from tests.helpers import table
 
 REFUSED = table(__file__, "refused") | {
     f"seed={'1' * 5000}": "is not a setting like key=value",

@@ -69,7 +69,7 @@ def test_brackets_are_counted_while_they_are_open():
 @pytest.mark.parametrize(
     "word, said",
     table(__file__, "packages"),
-)  # fmt: skip
+)
 def test_packages_of_settings_need_permission(word, said):
     with refusal(said):
         check_search_path(["a=1", word], ["json"])

@@ -175,7 +175,7 @@ def test_hash_follows_the_source_of_a_users_class(base, place, tmp_path, monkeyp
 @pytest.mark.parametrize(
     "changes, said",
     table(__file__, "rules"),
-)  # fmt: skip
+)
 def test_rules_between_settings(base, changes, said):
     with refusal(said and re.escape(said)):
         values = changed(base, changes)

@@ -133,12 +133,14 @@ def test_what_is_allowed_is_resolved_in_a_defaults_list(capsys, monkeypatch):
     [
         ("a: " + "[" * 3000 + "]" * 3000, "more than 40 levels"),
         ("a: " + "9" * 100_000, "a word of 100,000 characters"),
-        ("a: &a [" + "x," * 300 + "]\nb: &b [" + "*a," * 300 + "]\nc: [" + "*b," * 300 + "]",
-         "more than 100,000 values"),
+        (
+            "a: &a [" + "x," * 300 + "]\nb: &b [" + "*a," * 300 + "]\nc: [" + "*b," * 300 + "]",
+            "more than 100,000 values",
+        ),
         ("a: [", "is not YAML"),
         ("a: !!python/name:os.mkdir", "has the tag"),
     ],
-)  # fmt: skip
+)
 def test_a_file_that_cannot_be_read_is_named(text, said, capsys, monkeypatch):
     write(Path("conf/experiment/e.yaml"), text)
     line = said_of(["+experiment=e"], capsys, monkeypatch)
