@@ -12,6 +12,7 @@ from gsbench import __version__, cli
 from gsbench.errors import GsbenchError, InputError
 from gsbench.system.stopping import Stopped
 from gsbench.verbs import VERBS, load_verb
+from tests.helpers import table
 from tests.processes import completed
 
 pytestmark = pytest.mark.usefixtures("runs")
@@ -63,16 +64,7 @@ def test_errors_become_a_line_and_an_exit_code(error, code, text, monkeypatch, c
 
 @pytest.mark.parametrize(
     "words, asked",
-    [
-        ("status x", ("verb", ["x"], "runs")),
-        ("status --help", ("verb", ["--help"], "runs")),
-        ("help", ("help", [])),
-        ("--help seed=1 -h", ("help", ["seed=1"])),
-        ("seed=1 -h", ("help", ["seed=1"])),
-        *((word, ("trials", [word])) for word in ("seed=1", "+a", "~a", "-m", "status=1")),
-        ("--version seed=1", ("trials", ["--version", "seed=1"])),
-        ("", ("trials", [])),
-    ],
+    table(__file__, "first"),
 )
 def test_the_first_word_tells_what_is_asked(words, asked, monkeypatch):
     found = []
@@ -84,7 +76,7 @@ def test_the_first_word_tells_what_is_asked(words, asked, monkeypatch):
     monkeypatch.setattr(cli, "_help", lambda argv: found.append(("help", argv)) or 7)
     monkeypatch.setattr(cli, "_trials", lambda argv: found.append(("trials", argv)) or 7)
     assert cli.run(words.split()) == 7
-    assert found == [asked]
+    assert [list(one) for one in found] == [asked]
     assert os.environ["PYTHONSAFEPATH"] == "gsbench"
 
 
