@@ -24,7 +24,6 @@ import pandas as pd
 from scipy import stats
 
 from gsbench.analysis.fairness import EQUAL_COUNTS
-from gsbench.analysis.old_declarations import all_questions
 from gsbench.analysis.verdicts import Verdict, judge
 from gsbench.claims.archive import unpack_archive
 from gsbench.words import counted, signed
@@ -221,7 +220,7 @@ def verdicts(name: str) -> dict[str, Verdict]:
         trials = [*experiment.trials, *experiment.older]
         return {
             question.name: judge(trials, question, experiment.unfinished)
-            for question in all_questions(experiment)
+            for question in experiment.history.questions
             if question.name
         }
 

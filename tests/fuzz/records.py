@@ -49,7 +49,6 @@ NAMES = (
     "config.yaml",
     "plan.json",
     "commands.jsonl",
-    "declared.jsonl",
     "metrics.jsonl",
     "events.jsonl",
     "volume_histograms.jsonl",
@@ -167,15 +166,6 @@ def write_original(runs):
     entry = {"overrides": ["seed=0"], "cwd": str(runs), "time": 1.0}
     places = {path.relative_to(home).as_posix(): entry for path in (done, failed)}
     write(home / "plan.json", {"version": 1, "trials": places})
-    declared = [
-        {"questions": [{"metric": "psnr", "sign": 0}], "time": "2026-11-21T20:05:00Z"},
-        {
-            "questions": [{"metric": "psnr", "name": "a"}],
-            "looks": [2, 3],
-            "time": "2026-11-21T20:05:00Z",
-        },
-    ]
-    write_lines(home / "declared.jsonl", declared)
     words = {"words": ["seed=0"], "cwd": str(runs), "time": 1.0}
     write_lines(
         home / "commands.jsonl",
@@ -185,10 +175,7 @@ def write_original(runs):
     ranges = {"densify.volume_threshold": "0.01,0.03"}
     write(home / "tuning.json", tuning | {"sweep": home.name, "ranges": ranges})
     places_of = {name: done / name for name in NAMES}
-    places_of |= {
-        name: home / name
-        for name in ("plan.json", "commands.jsonl", "declared.jsonl", "tuning.json")
-    }
+    places_of |= {name: home / name for name in ("plan.json", "commands.jsonl", "tuning.json")}
     places_of |= {
         name: failed / name for name in ("failed.json", "building.json", ".submitted.json")
     }

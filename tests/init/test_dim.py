@@ -1,6 +1,5 @@
 """Deep image matching with untrained networks, and the behaviour that it needs of libraries."""
 
-import shutil
 from dataclasses import replace
 from functools import partial
 
@@ -12,7 +11,7 @@ from torch.testing import assert_close
 
 from gsbench.init import MODEL_FOLDER, Dim, read_cloud
 from gsbench.init.networks import models
-from gsbench.init.networks.features import Features, FeatureStore
+from gsbench.init.networks.features import Features
 from gsbench.init.networks.models import (
     EXTRACTORS,
     SUPERPOINT_BORDER,
@@ -90,29 +89,6 @@ def test_lightglue_matches_enough_points(few, untrained_weights, tmp_path, caplo
     assert report.counts["inlier_matches"] > 30
     assert len(report.settings["weights_sha256"]) == 2
     assert sum("noncommercial" in message for message in caplog.messages) == 1
-
-
-# ---- an interrupted run continues, and entries of other settings are not read
-
-
-def test_other_settings_or_images_have_other_file_names(courtyard, tmp_path):
-    def paths(extraction, matching, images):
-        capture = replace(courtyard, images=images)
-        store = FeatureStore(tmp_path / "work", capture, extraction, matching, None, None, 1)
-        return store.features_path("0000.png"), store.matches_path("0000.png", "0001.png")
-
-    same, changed = courtyard.images, tmp_path / "changed"
-    shutil.copytree(same, changed)
-    shutil.copy(changed / "0005.png", changed / "0000.png")
-    base = paths({"n": 1}, {"r": 0.9}, same)
-    for n, r, images, is_equal in (
-        (1, 0.9, same, (True, True)),
-        (2, 0.9, same, (False, False)),
-        (1, 0.9, changed, (False, False)),
-        (1, 0.8, same, (True, False)),
-    ):
-        found = paths({"n": n}, {"r": r}, images)
-        assert (found[0] == base[0], found[1] == base[1]) == is_equal
 
 
 # ---- undocumented behaviour of transformers and kornia on which the code relies

@@ -108,10 +108,11 @@ def test_each_image_and_pair_is_computed_once(networks, job, monkeypatch):
         assert_array_equal(again[0][name], keypoints[name])
     assert again[1].keys() == found.keys()
     store = stores[0]  # what is gone or damaged is computed again, and nothing else
-    store.features_path("a.png").unlink()
-    store.features_path("b.png").write_bytes(b"half a file")
-    store.matches_path("b.png", "c.png").unlink()
-    np.save(store.matches_path("a.png", "b.png"), np.zeros((4, 3)))
+    store.path("a.png").unlink()
+    store.path("b.png").write_bytes(b"half a file")
+    store.path("b.png", "c.png").unlink()
+    whole = store.path("a.png", "b.png").read_bytes()
+    store.path("a.png", "b.png").write_bytes(whole[:100])
     run(job)
     assert networks.extracted[3:] == ["a.png", "b.png"]
     assert networks.matched[3:] == [(2, 3), (3, 4)]
@@ -172,7 +173,24 @@ def test_the_weights_are_named_by_their_digests_and_tell_stored_files_apart(
     assert run(job)[2]["settings"]["weights_sha256"] == {
         file.name: file_sha256(file) for file in networks.weights
     }
-    assert (len(networks.extracted), len(networks.matched)) == (3, 6)
+    assert (len(networks.extracted), len(networks.matched)) == (6, 6)
     networks.weights[0] = weights
     run(job)
-    assert (len(networks.extracted), len(networks.matched)) == (6, 9)
+    assert (len(networks.extracted), len(networks.matched)) == (9, 9)
+
+
+def test_other_settings_images_or_masks_have_other_files(networks, job):
+    run(job)
+    Image.new("L", (8, 8), 255).save(mask := job.work_dir / "mask.png")
+    changed = replace(job.capture, masks={"c.png": mask})
+    for count, options, capture in (
+        (3, job.options, job.capture),
+        (6, replace(job.options, max_keypoints=9), job.capture),
+        (9, replace(job.options, filter_threshold=0.5), job.capture),
+        (12, job.options, changed),
+    ):
+        run(replace(job, options=options, capture=capture))
+        assert (len(networks.extracted), len(networks.matched)) == (count, count)
+    Image.new("L", (8, 8), 9).save(job.capture.images / "a.png")
+    run(job)
+    assert len(networks.extracted) == 15

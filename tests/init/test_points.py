@@ -167,11 +167,8 @@ def test_black_counts_as_a_colour_and_points_without_a_camera_are_grey(
     save(tmp_path / "scan.xyz", XYZ[:3])
     seen = np.array([[0, 0, 0], [-1, -1, -1], [0, 9, 255]], dtype=np.int16)
     monkeypatch.setattr("gsbench.init.placed.seen_colors", lambda *_: seen)
-    for factor in (1, 0):
-        cloud = Points(path=tmp_path / "scan.xyz").cloud(courtyard, pycolmap.Reconstruction())
-        grey = [GREY] * 3 if factor else [0] * 3
-        assert_array_equal(cloud.colors, [[0, 0, 0], grey, [0, 9 * factor, 255 * factor]])
-        seen *= 0
+    cloud = Points(path=tmp_path / "scan.xyz").cloud(courtyard, pycolmap.Reconstruction())
+    assert_array_equal(cloud.colors, [[0, 0, 0], [GREY] * 3, [0, 9, 255]])
 
 
 def test_the_points_of_the_reference_are_all_replaced(courtyard, tmp_path, monkeypatch):
@@ -227,7 +224,6 @@ PLYS = [
         ("a.xyz", lambda path: save(path, np.where(XYZ > 1.9, np.nan, XYZ)), "not finite numbers"),
         ("a.xyz", lambda path: path.write_text("1 2 x\n"), "not a readable file of points"),
         ("a.xyz", lambda path: path.write_text("1 2 3", "utf-16"), "UTF-16 or UTF-32: save it as"),
-        ("a.xyz", lambda path: save(path, XYZ + 1e6), "no point is in view of a training camera"),
     ],
 )
 def test_bad_files_are_refused_in_one_line(courtyard, tmp_path, name, make, message):

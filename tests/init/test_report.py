@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from gsbench.init import MODEL_FOLDER
-from gsbench.init.base import OWN_GAUGE_FOLDER, PoseErrors
+from gsbench.init.base import PoseErrors
 from gsbench.init.colmap.alignment import align, align_poses, common_poses, compare_poses
 from gsbench.init.colmap.models import posed_images, training_extent
 from gsbench.init.report import make_report, measure_gauge, write_result
@@ -121,41 +121,28 @@ def test_a_similarity_leaves_no_pose_errors_and_a_tilt_does():
     assert errors.center_max < 1e-9
 
 
-def finished(capture, folder, model, reference):
-    """The report on an estimated ``model``, which is written to ``folder``."""
-    report = reported(
-        capture, model, **align(model, reference, capture, False, folder / OWN_GAUGE_FOLDER)
-    )
-    write_result(model, report, folder)
-    return report
-
-
-def test_two_common_cameras_are_not_compared_and_give_a_warning(capture, tmp_path):
+def test_two_common_cameras_are_not_compared_and_give_a_warning(capture):
     """A similarity needs at least three."""
     model, reference = model_of(CENTERS), model_of(CENTERS)
     for image_id in (3, 4):
         reference.deregister_frame(reference.images[image_id].frame_id)
-    report = finished(capture, tmp_path, model, reference)
-    assert report.pose_errors is None
-    (warning,) = [line for line in report.warnings if "common cameras" in line]
-    others = finished(capture, tmp_path, model, None).warnings
-    assert others == tuple(line for line in report.warnings if line != warning)
+    found = align(model, reference, capture, False, True)
+    assert ["too few common cameras" in line for line in found.pop("warnings")] == [True]
+    assert found == align(model, None, capture, False, True) == {}
 
 
-def test_an_estimated_model_is_written_in_both_gauges(capture, tmp_path):
+@pytest.mark.parametrize("move", [True, False])
+def test_an_estimated_model_is_written_in_the_gauge_of_the_reference_or_its_own(
+    capture, tmp_path, move
+):
     model, shift = model_of(CENTERS), np.array([1.0, 2.0, 3.0])
     model.transform(pycolmap.Sim3d(3.0, pycolmap.Rotation3d(), shift))
-    report = finished(capture, tmp_path, model, model_of(CENTERS))
-    own = report.own_gauge
-    assert report.gauge.scale_to_reference == 1.0
-    assert own.scale_to_reference == pytest.approx(1 / 3)
-    assert own.scene_extent == pytest.approx(3 * report.gauge.scene_extent)
-    assert own.threshold_in_reference == pytest.approx(0.03 / 27)
-    for gauge, centers in ((MODEL_FOLDER, CENTERS), (OWN_GAUGE_FOLDER, 3 * CENTERS + shift)):
-        written = pycolmap.Reconstruction(tmp_path / gauge)
-        found = posed_images(written)
-        places = [found[name].projection_center() for name in NAMES]
-        assert_allclose(places, centers, atol=1e-9)
+    report = reported(capture, model, **align(model, model_of(CENTERS), capture, False, move))
+    write_result(model, report, tmp_path)
+    assert report.gauge.scale_to_reference == pytest.approx(1.0 if move else 1 / 3)
+    found = posed_images(pycolmap.Reconstruction(tmp_path / MODEL_FOLDER))
+    places = [found[name].projection_center() for name in NAMES]
+    assert_allclose(places, CENTERS if move else 3 * CENTERS + shift, atol=1e-9)
 
 
 def test_centre_errors_are_in_reference_units_and_relative_to_the_extent():

@@ -173,11 +173,6 @@ def test_photos_that_cannot_be_matched_are_refused(tmp_path, pixels, said):
         Sfm().run(capture_of(tmp_path), tmp_path.with_name("out"))
 
 
-def test_two_photos_are_refused(courtyard, tmp_path):
-    with refusal("has 2 images: sfm needs at least 3"):
-        Sfm().run(replace(courtyard, image_names=courtyard.image_names[:2]), tmp_path)
-
-
 @pytest.mark.parametrize(
     "pairs, count, auto, every, poses, kept",
     [

@@ -1,7 +1,5 @@
 """Which views each `scene.split` holds out."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -18,33 +16,34 @@ from tests.scene.test_sectors import ring
 NAMES = [f"{k:02d}.png" for k in range(24)]
 
 
-def cameras(names):
-    return ring([15.0 * int(name[:2]) for name in names])
+CAMERAS = dict(zip(NAMES, ring([15.0 * k for k in range(24)]), strict=True))
+
+
+def divided(names=NAMES, lists=(None, None), **rule):
+    return hold_out(names, SplitRule(**rule), lists, CAMERAS)
 
 
 def test_every_eighth_name_is_held_out_by_default():
-    found = hold_out(NAMES, SplitRule())
-    assert found.test == ("00.png", "08.png", "16.png")
-    assert found.description == "every 8th image"
+    assert divided()[1:] == (["00.png", "08.png", "16.png"], "every 8th image")
 
 
 def test_sectors_are_contiguous_and_follow_each_other_around_the_scene():
-    rule = SplitRule(split="sector", sectors=4)
-    parts = [hold_out(NAMES, replace(rule, sector=part), cameras=cameras).test for part in range(4)]
-    assert parts[0] == tuple(NAMES[:6])
+    parts = [divided(split="sector", sectors=4, sector=part)[1] for part in range(4)]
+    assert parts[0] == NAMES[:6]
     assert [name for part in parts for name in part] == NAMES
-    assert "part 0 of 4 by azimuth" in hold_out(NAMES, rule, cameras=cameras).description
+    assert "part 0 of 4 by azimuth" in divided(split="sector", sectors=4)[2]
+    with refusal(r"scene\.sectors=8 are more than the 5 images"):
+        divided(NAMES[:5], split="sector")
 
 
 @given(st.integers(9, 24), st.integers(2, 8), st.integers(0, 1))
 def test_matched_splits_leave_equally_many_views(count, sectors, sector):
-    rule = SplitRule(match_views=True, sectors=sectors, sector=sector)
-    spread = hold_out(NAMES[:count], rule, cameras=cameras)
-    part = hold_out(NAMES[:count], replace(rule, split="sector"), cameras=cameras)
-    assert len(spread.train) == len(part.train) == count - count // sectors
-    for found in (spread, part):
-        assert sorted([*found.train, *found.test]) == NAMES[:count]
-    steps = np.diff([NAMES.index(name) for name in spread.test])
+    rule = {"match_views": True, "sectors": sectors, "sector": sector}
+    spread, part = (divided(NAMES[:count], split=kind, **rule) for kind in ("every_nth", "sector"))
+    assert len(spread[0]) == len(part[0]) == count - count // sectors
+    for train, test, _ in (spread, part):
+        assert sorted(train + test) == NAMES[:count]
+    steps = np.diff([NAMES.index(name) for name in spread[1]])
     assert len(steps) == 0 or steps.max() - steps.min() <= 1, "spread evenly"
 
 
@@ -63,34 +62,32 @@ def test_no_split_is_empty_or_trains_on_a_test_view(data):
     some = st.none() | st.lists(st.sampled_from(names), unique=True)
     lists = (data.draw(some), data.draw(some)) if rule["split"] == "list" else (None, None)
     try:
-        found = hold_out(names, SplitRule(**rule), lists, cameras)
+        train, test, _ = divided(names, lists, **rule)
     except InputError:
         return
-    assert found.train
-    assert found.test
-    assert not set(found.train) & set(found.test)
-    assert {*found.train, *found.test} <= set(names)
+    assert train
+    assert test
+    assert not set(train) & set(test)
+    assert {*train, *test} <= set(names)
 
 
 @pytest.mark.parametrize("split", ["every_nth", "sector"])
 def test_validation_drops_the_test_views_and_divides_the_rest_by_the_same_rule(split):
-    rule = SplitRule(split=split, sectors=4, test_every=4)
-    test = hold_out(NAMES, rule, cameras=cameras).test
-    found = hold_out(NAMES, replace(rule, validation=True), cameras=cameras)
-    assert f"the {len(test)} test views (" in found.description
-    assert found.description.endswith("put away unseen")
-    assert not set(test) & {*found.train, *found.test}
-    assert sorted([*found.train, *found.test, *test]) == NAMES
+    rule = {"split": split, "sectors": 4, "test_every": 4}
+    away = divided(**rule)[1]
+    train, test, description = divided(**rule, validation=True)
+    assert f"the {len(away)} test views (" in description
+    assert description.endswith("put away unseen")
+    assert sorted(train + test + away) == NAMES
     if split == "sector":  # the sector next to the one that was put away
-        assert found.test == tuple(NAMES[6:10])
+        assert test == NAMES[6:10]
 
 
 def test_validation_of_lists_takes_every_nth_of_the_training_list():
-    rule = SplitRule(split="list", validation=True, test_every=5)
-    found = hold_out(NAMES, rule, lists=(NAMES[4:], NAMES[:4]))
-    assert found.test == tuple(NAMES[4::5])
-    assert not set(NAMES[:4]) & {*found.train, *found.test}
-    assert "the 4 test views (by lists) put away unseen" in found.description
+    rule = {"split": "list", "validation": True, "test_every": 5}
+    train, test, description = divided(lists=(NAMES[4:], NAMES[:4]), **rule)
+    assert (test, sorted(train + test)) == (NAMES[4::5], NAMES[4:])
+    assert "the 4 test views (by lists) put away unseen" in description
 
 
 def test_a_view_dropped_by_validation_is_not_in_the_capture(make_scene):
@@ -130,18 +127,10 @@ def test_lists_of_nerfbaselines_are_found_by_their_names(make_scene):
     )
 
 
-@pytest.mark.parametrize(
-    "settings, message",
-    TABLES["settings that contradict each other"],
-)
+@pytest.mark.parametrize("settings, message", TABLES["settings that contradict each other"])
 def test_settings_that_contradict_each_other_are_refused(settings, message):
     with refusal(message):
         SceneConfig(**({"name": "a", "kind": "colmap", "path": "/a"} | settings))
-
-
-def test_too_many_sectors_are_refused():
-    with refusal(r"scene\.sectors=8 are more than the 5 images"):
-        hold_out(NAMES[:5], SplitRule(split="sector"), cameras=cameras)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,6 @@ from typing import Any
 
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.notes import Note, texts
-from gsbench.analysis.old_declarations import all_questions
 from gsbench.analysis.pairs import BASELINE
 from gsbench.analysis.quantities import choose_quantities
 from gsbench.analysis.questions import Asked, choose_pairs
@@ -22,9 +21,13 @@ from gsbench.analysis.sentences import asked_words, badge, headline, risk, sente
 from gsbench.analysis.verdicts import State, Verdict, interval_of, judge
 from gsbench.runs.commands import Question, code_in, questions_elsewhere
 from gsbench.runs.experiments import DEFAULT_METRIC
-from gsbench.runs.layout import LEDGER, TUNING
+from gsbench.runs.layout import DECLARED, LEDGER, TUNING
 
-OLD_LEDGER = f"the ledger of an earlier gsbench decided ({LEDGER})"
+# why nothing is tested where an earlier gsbench wrote what was asked, which is not read
+EARLIER = {
+    LEDGER: "the ledger of an earlier gsbench decided",
+    DECLARED: "an earlier gsbench wrote down what was asked",
+}
 
 
 @dataclass(frozen=True)
@@ -171,9 +174,10 @@ def compare(experiment: Experiment, baseline: str | None = None) -> Comparison:
         if pair[1] not in ideas and pair not in turned and known.issuperset(pair)
     ]
     state: State = "not tested" if baseline else "not asked beforehand"
-    why = OLD_LEDGER if (experiment.folder / LEDGER).exists() else ""
-    if why:
-        state = "not tested"
+    why = ""
+    for name, words in EARLIER.items():
+        if (experiment.folder / name).exists():
+            state, why = "not tested", f"{words} ({name})"
     intervals = [interval_of(trials, *pair, DEFAULT_METRIC, state, why) for pair in unasked]
     if any(verdict.state == "not asked beforehand" for verdict in intervals):
         intervals = _with_askers(experiment, intervals)
@@ -186,7 +190,7 @@ def _asked(experiment: Experiment, trials: Sequence[TrialResult]) -> list[Answer
     everything = [*trials, *experiment.older]
     arms = {(trial.scene, trial.digest): trial.arm for trial in trials}
     verdicts = []
-    for question in all_questions(experiment):
+    for question in experiment.history.questions:
         # with the names that its arms have among all trials
         sides = []
         for side, name in enumerate((question.baseline, question.idea)):

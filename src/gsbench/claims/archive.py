@@ -30,7 +30,6 @@ from gsbench.runs.experiments import TuningRecord
 from gsbench.runs.layout import (
     COMMANDS,
     CONFIG,
-    DECLARED,
     FAILED,
     FROM_PIXELS,
     GROUND_TRUTH,
@@ -58,7 +57,7 @@ BAD_ZIP = (
 FORMAT, VERSION, FIRST_VERSION = "gsbench results", 2, 1
 MANIFEST = "archive.json"
 PICTURES = (RENDERS, GROUND_TRUTH)
-OF_EXPERIMENT = (COMMANDS, DECLARED, LEDGER)  # the second in archives of the first version
+OF_EXPERIMENT = (COMMANDS, LEDGER)  # the second in archives of the first version
 OF_TRIAL = (RESULTS, CONFIG, PER_VIEW, FROM_PIXELS, REGIONS, FAILED)
 # Archives may come from strangers: these limits stop a zip bomb. They are larger than any
 # experiment needs.
@@ -231,4 +230,4 @@ def as_files(name: str, contents: Mapping[str, bytes]) -> dict[str, bytes]:
         views = own.drop(columns="trial").to_csv(index=False, lineterminator="\n")
         texts[f"{folder}/{PER_VIEW}"] = views
     files = {f"{name}/{place}": text.encode() for place, text in texts.items()}
-    return files | {f"{name}/{own}": contents[own] for own in (DECLARED, LEDGER) if own in contents}
+    return files | {f"{name}/{own}": contents[own] for own in OF_EXPERIMENT if own in contents}

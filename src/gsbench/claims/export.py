@@ -22,7 +22,6 @@ from gsbench import __version__
 from gsbench.analysis.comparison import compare
 from gsbench.analysis.fairness import searches_of
 from gsbench.analysis.images import PixelMeasures, region_record, textured_error
-from gsbench.analysis.old_declarations import all_questions
 from gsbench.analysis.quantities import TEXTURED
 from gsbench.analysis.results import Experiment, TrialResult, group_by, newest_code, read_views
 from gsbench.claims.archive import (
@@ -41,7 +40,6 @@ from gsbench.runs.experiments import STAMP, TuningRecord
 from gsbench.runs.layout import (
     COMMANDS,
     CONFIG,
-    DECLARED,
     FAILED,
     FROM_PIXELS,
     PER_VIEW,
@@ -75,8 +73,6 @@ def write_archive(
     files, kept, home = dict[str, bytes](), list[TrialResult](), experiment.folder
     if (home / COMMANDS).is_file():
         files[f"{home.name}/{COMMANDS}"] = _shared_commands(home)
-    if (home / DECLARED).is_file():
-        files[f"{home.name}/{DECLARED}"] = read_bytes(home / DECLARED)
     for trial in (*experiment.trials, *experiment.older):
         try:
             files |= _of_trial(trial, pictures)
@@ -88,7 +84,7 @@ def write_archive(
         raise InputError(f"{experiment.name} has no whole trial to export (first: {left_out[0]})")
     for path in unfinished:
         files |= _of_unfinished(path)
-    if TEXTURED.key in {question.metric for question in all_questions(experiment)}:
+    if TEXTURED.key in {question.metric for question in experiment.history.questions}:
         for trial in kept:
             with suppress(InputError):  # a trial whose pictures cannot be read
                 measures = PixelMeasures(error_textured=textured_error(trial)).to_json()

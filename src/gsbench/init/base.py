@@ -20,8 +20,6 @@ from gsbench.scene.types import Capture
 
 # below the output folder: where COLMAP users and 3DGS trainers look for a model
 MODEL_FOLDER = Path("sparse", "0")
-# the same model in the mapper's gauge, before alignment
-OWN_GAUGE_FOLDER = Path("sparse_own_gauge", "0")
 WORK_FOLDER = "work"  # below the output folder, during a run
 REPORT_FILE = "report.json"
 GAUSSIANS_FILE = "gaussians.ply"  # only if training starts from given Gaussians instead of points
@@ -156,8 +154,6 @@ class InitReport:
     seconds: Mapping[str, float]
     settings: Mapping[str, Any]
     versions: Mapping[str, str]
-    # of the model before its alignment to the reference; None if it was not aligned
-    own_gauge: Gauge | None = None
     # None without a reference, or if the poses are those of the reference
     pose_errors: PoseErrors | None = None
     warnings: tuple[str, ...] = ()

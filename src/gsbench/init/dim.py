@@ -140,7 +140,7 @@ class Dim(Reconstruction):
 
         weights = self.find_weights()
         digests = [*map(file_sha256, weights)]
-        store, pairs, counts = self._store(job, weights, digests), task.pairs, {}
+        store, pairs, counts = self._store(job, task.names, weights, digests), task.pairs, {}
         with timer.phase("extract"):
             steps = _steps(task.names, "extract", progress)
             keypoints = {name: store.features(name).colmap_keypoints for name in steps}
@@ -179,7 +179,9 @@ class Dim(Reconstruction):
             "packages": ["torch", "kornia", *["transformers"] * (self.extractor == "superpoint")],
         }
 
-    def _store(self, job: Job, weights: Sequence[Path], digests: Sequence[str]) -> FeatureStore:
+    def _store(
+        self, job: Job, names: Sequence[str], weights: Sequence[Path], digests: Sequence[str]
+    ) -> FeatureStore:
         """The features and matches of the job's photographs, computed where none are stored."""
         import torch
 
@@ -188,8 +190,7 @@ class Dim(Reconstruction):
 
         torch.set_num_threads(self.num_threads)
         device = select_device(self.device, "init.device")
-        extraction = {**self.extraction, "weights": digests[0]}
-        matching = {**self.matching, "weights": digests[1] if digests[1:] else None}
+        extraction, matching = self.extraction, self.matching
         # loaded when an image needs them, since a run that is continued may need no network
         build = models.EXTRACTORS[self.extractor]
         extractor = cache(partial(build, extraction, weights[0], device))
@@ -204,8 +205,9 @@ class Dim(Reconstruction):
             return models.match(matcher(), *pair)
 
         room = 2 + CACHE_BYTES // (BYTES_OF_KEYPOINT * self.max_keypoints)
-        steps = extract, match
-        return features.FeatureStore(job.work_dir, job.capture, extraction, matching, *steps, room)
+        settings = extraction, matching, digests
+        folder = features.store_folder(job.work_dir, job.capture, names, *settings)
+        return features.FeatureStore(folder, extract, match, room)
 
 
 def _steps(items: Sequence[T], phase: str, progress: Progress) -> Iterator[T]:

@@ -6,7 +6,7 @@ The points are those of the reference, random, or from a file. A file holds poin
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -60,23 +60,17 @@ class PlacedCloud(Initializer):
         work_dir: Path | None = None,
     ) -> InitReport:
         """Write model and report without a ``work_dir``. Raises ``InputError`` without cameras."""
-        if reference is None and capture.model is None:
-            raise InputError(
-                f"init={self.name} needs cameras and scene {capture.name} came without: make them "
-                "with init=sfm first"
-            )
         output_dir.mkdir(parents=True, exist_ok=True)
         return run_isolated(self.build, capture, output_dir, reference, what=self.name)
 
     def build(self, capture: Capture, output_dir: Path, reference: Path | None) -> InitReport:
         """Write the model and the report; runs in the isolated process."""
-        from gsbench.init.colmap.models import load_reference
         from gsbench.init.report import make_report, write_result
+        from gsbench.scene.colmap import read_reference
 
         timer = Timer()
         with timer.phase("read"):
-            model = load_reference(capture, reference)
-        assert model is not None
+            model = read_reference(replace(capture, model=reference or capture.model))
         with timer.phase("place"):
             points = self.set_points(model, capture, output_dir)
         report = make_report(
@@ -167,16 +161,11 @@ class Random(PlacedCloud):
     def cloud(self, capture: Capture, model: pycolmap.Reconstruction) -> PointCloud:
         from gsbench.init.colmap.models import training_centers, training_extent
 
-        extent = training_extent(model, capture)
-        if extent == 0:
-            raise InputError(
-                f"init=random: the training cameras of scene {capture.name} are all at one place"
-            )
         generator = np.random.default_rng(self.seed)
         center = training_centers(model, capture).mean(axis=0)
         cube = generator.uniform(-1.0, 1.0, (self.count, 3))
         colors = generator.integers(0, 256, (self.count, 3), dtype=np.uint8)
-        return PointCloud(center + self.size * extent * cube, colors)
+        return PointCloud(center + self.size * training_extent(model, capture) * cube, colors)
 
 
 def points_in_view(
@@ -242,16 +231,10 @@ class Points(FromFile):
         order = np.random.default_rng(self.seed).permutation(len(points))
         chosen = np.sort(order[: self.max_points])
         points = capture.normalization.apply(points)[chosen]
+        if colors is not None:
+            return PointCloud(points, colors[chosen])
         seen = seen_colors(points, capture, model)
-        if (seen < 0).all():
-            raise InputError(
-                f"init.path={self.path}: no point is in view of a training camera of scene "
-                f"{capture.name}: the cloud lies in other coordinates; bring it into those of the "
-                "cameras"
-            )
-        if colors is None:
-            return PointCloud(points, np.where(seen < 0, GREY, seen).astype(np.uint8))
-        return PointCloud(points, colors[chosen])
+        return PointCloud(points, np.where(seen < 0, GREY, seen).astype(np.uint8))
 
 
 def seen_colors(

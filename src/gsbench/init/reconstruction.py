@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 from gsbench.errors import InputError
 from gsbench.init.base import (
-    OWN_GAUGE_FOLDER,
     REGISTERED_SHARE,
     WORK_FOLDER,
     InitReport,
@@ -24,10 +23,9 @@ from gsbench.init.colmap.pairs import ALL_PAIRS_UP_TO
 from gsbench.init.options import ColmapOptions
 from gsbench.logs import Progress, no_progress
 from gsbench.scene.images import lens_of
-from gsbench.scene.rules import MIN_IMAGES
 from gsbench.scene.types import Capture
 from gsbench.system.isolate import run_isolated
-from gsbench.words import counted, some_of
+from gsbench.words import some_of
 
 if TYPE_CHECKING:
     import pycolmap
@@ -67,11 +65,6 @@ class Reconstruction(ColmapOptions):
 
     def check(self, capture: Capture, reference: Path | None) -> None:
         """Raise ``InputError``, before any work, if ``capture`` does not suit these settings."""
-        if len(capture.image_names) < MIN_IMAGES:
-            raise InputError(
-                f"scene {capture.name} has {counted(len(capture.image_names), 'image')}: "
-                f"{self.name} needs at least {MIN_IMAGES}"
-            )
         if reference is None and self.needs_reference(capture):
             raise InputError(
                 f"init={self.name} takes its cameras from a reference, and scene {capture.name} "
@@ -143,17 +136,19 @@ def build_model(job: Job, progress: Progress) -> InitReport:
 
     from gsbench.init import report
     from gsbench.init.colmap.alignment import align
-    from gsbench.init.colmap.models import load_reference
+    from gsbench.scene.colmap import read_reference
 
     # without this, COLMAP logs a line for each image; the log is for warnings
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.WARNING)
     capture, timer = job.capture, Timer()
-    reference = load_reference(capture, job.reference)
+    cameras = job.reference or capture.model
+    reference = None
+    if cameras is not None:
+        reference = read_reference(replace(capture, model=cameras))
     options, model, facts = _best_attempt(job, reference, timer, progress)
     if facts["poses"] == "own":
         exact = capture.exact_poses and job.reference is None
-        own_gauge = job.output_dir / OWN_GAUGE_FOLDER if options.align else None
-        compared = align(model, reference, capture, exact, own_gauge)
+        compared = align(model, reference, capture, exact, options.align)
         facts["warnings"] += compared.pop("warnings", [])
         facts |= compared
     made = report.make_report(

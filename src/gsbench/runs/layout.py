@@ -20,8 +20,8 @@ METRICS = "metrics.json"  # of an evaluation
 # in an experiment's folder
 COMMANDS = "commands.jsonl"  # all commands, with their trials and questions
 PLAN = "plan.json"  # of earlier versions: the trials of the commands
-DECLARED = "declared.jsonl"  # of earlier versions: declared questions, with their times
-LEDGER = "ledger.jsonl"  # of a ledger of ideas of gsbench 0.1, no longer read
+# of gsbench 0.1, no longer read: declared questions, and a ledger of ideas
+DECLARED, LEDGER = "declared.jsonl", "ledger.jsonl"
 TUNING = "tuning.json"  # of a search: its ranges and points
 SEED = "-seed"  # between hash and seed in the name of a trial's folder
 TRIAL_GLOB = f"*/*/*{SEED}*"  # all trials' folders

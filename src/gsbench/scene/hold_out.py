@@ -5,8 +5,8 @@ the scene are ordered by azimuth around its centre and up direction. Other camer
 the principal axis of their centres, so that planes across the axis separate the sectors.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -166,69 +166,53 @@ def split_names(
 
 # names for training, names for testing
 SplitLists = tuple[Sequence[str] | None, ...]
-CamerasByName = Callable[[Sequence[str]], Sequence[Any]]
-
-
-@dataclass(frozen=True)
-class Split:
-    """Names of training and test views; ``description`` says how they were divided."""
-
-    train: tuple[str, ...]
-    test: tuple[str, ...]
-    description: str
+# names of training views and of test views, and how they were divided, in words
+Split = tuple[list[str], list[str], str]
 
 
 def hold_out(
     names: Sequence[str],
     rule: SplitRule,
     lists: SplitLists = (None, None),
-    cameras: CamerasByName | None = None,
+    cameras: Mapping[str, Any] = {},
 ) -> Split:
     """Divide sorted ``names`` by ``rule``.
 
-    ``lists`` are the resolved names of the training and the test list. ``cameras`` returns the
-    cameras of names; it is None for photographs without cameras. With ``rule.validation``, the test
-    views are dropped and the training views are divided again. Raises InputError if no view is left
-    for training or for testing.
+    ``lists`` are the resolved names of the training and the test list, ``cameras`` those of
+    `arrange_cameras` by name, for sectors. With ``rule.validation``,
+    the test views are dropped and the training views are divided again. Raises InputError if no
+    view is left for training or for testing.
     """
-    split = _divide(names, rule, lists, cameras)
+    train, test, description = _divide(names, rule, lists, cameras)
     if not rule.validation:
-        return split
+        return train, test, description
     if rule.by_lists:  # the lists held out the test views above and cannot divide the rest
         rule = replace(rule, split="every_nth", train_list=None, test_list=None)
-    validation = _divide(split.train, rule, (None, None), cameras)
-    away = f"the {counted(len(split.test), 'test view')} ({split.description}) put away unseen"
-    return replace(validation, description=f"for validation {validation.description}, with {away}")
+    away = f"the {counted(len(test), 'test view')} ({description}) put away unseen"
+    train, test, description = _divide(train, rule, (None, None), cameras)
+    return train, test, f"for validation {description}, with {away}"
 
 
 def _divide(
-    names: Sequence[str], rule: SplitRule, lists: SplitLists, cameras: CamerasByName | None
+    names: Sequence[str], rule: SplitRule, lists: SplitLists, cameras: Mapping[str, Any]
 ) -> Split:
     matched = max(1, len(names) // rule.sectors) if rule.match_views else None
     train, test = lists
     if rule.by_lists:
         description = "by lists"
     elif rule.split == "sector":
-        test, description = _sector(names, rule, matched, cameras)
+        if len(names) < rule.sectors:
+            raise InputError(
+                f"scene.sectors={rule.sectors} are more than the {len(names)} images: give fewer"
+            )
+        order, by = arrange_cameras([cameras[name] for name in names])
+        positions = sector_range(len(names), rule.sector, rule.sectors, matched)
+        test = [names[order[position]] for position in positions]
+        description = f"part {rule.sector} of {rule.sectors} {by}"
     elif matched is None:
         test, description = names[:: rule.test_every], f"every {rule.test_every}th image"
     else:
         test = select_images(names, matched)
         spread = f"{matched} evenly spread over the sorted names"
         description = f"{spread}, as many as in a sector of {rule.sectors}"
-    train, test = split_names(names, train, test)
-    return Split(tuple(train), tuple(test), description)
-
-
-def _sector(
-    names: Sequence[str], rule: SplitRule, exactly: int | None, cameras: CamerasByName | None
-) -> tuple[list[str], str]:
-    assert cameras is not None  # `SceneConfig` refuses sectors of photographs alone
-    if len(names) < rule.sectors:
-        raise InputError(
-            f"scene.sectors={rule.sectors} are more than the {len(names)} images: give fewer"
-        )
-    order, description = arrange_cameras(cameras(names))
-    positions = sector_range(len(names), rule.sector, rule.sectors, exactly)
-    test = [names[order[position]] for position in positions]
-    return test, f"part {rule.sector} of {rule.sectors} {description}"
+    return *split_names(names, train, test), description

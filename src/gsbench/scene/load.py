@@ -29,11 +29,7 @@ from gsbench.runs.store import Store
 from gsbench.runs.trial_record import Oddity
 from gsbench.scene.beside import DEPTH, files_beside, view_of_file
 from gsbench.scene.colmap_files import model_files
-from gsbench.scene.images import (
-    read_image,
-    resize_image,
-    write_png,
-)
+from gsbench.scene.images import read_image, resize_image, write_png
 from gsbench.scene.masks import WHITE, read_mask, resize_mask, write_mask
 from gsbench.scene.options import PrincipalPoint, Resample, downscaled_size
 from gsbench.scene.rules import MIN_IMAGES, inspect, settle
@@ -125,10 +121,6 @@ def load_scene(
         }
         if DEPTH in pictures:
             pictures[DEPTH] *= np.float32(capture.normalization.scale)
-        if image.shape[:2] != (camera.height, camera.width):
-            raise InputError(
-                f"{folder}: {name} is not as it was prepared: delete this folder and run again"
-            )
         if principal_point == "centred":
             camera = replace(camera, cx=camera.width / 2, cy=camera.height / 2)
         mask = None
@@ -309,8 +301,6 @@ def prepare_chunk(images: Sequence[ImageToPrepare]) -> list[Camera]:
 def prepare_image(image: ImageToPrepare) -> Camera:
     """Read, undistort if needed, shrink and write one image; returns its final camera."""
     pixels = read_image(image.source)  # [H, W, 3]
-    if pixels.shape[:2] != (image.camera.height, image.camera.width):
-        raise InputError(f"{image.source}: the image changed its size while it was read: run again")
     if image.camera.distorted:
         pixels, camera = undistort(pixels, image.camera)
     else:

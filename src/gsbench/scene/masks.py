@@ -111,8 +111,6 @@ def prepare_photograph(
         return
     pixels = read_image(images / name, backdrop)
     if mask is not None:
-        if pixels.shape[:2] != mask.shape:
-            raise InputError(f"{masks[name]}: the mask changed while it was read: run again")
         pixels = fill_ignored(pixels, mask)
     write_png(pixels, target, exif)
 

@@ -7,7 +7,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -49,15 +48,12 @@ def hold_out_views(raw: RawCapture, options: SceneConfig, lists: SplitLists) -> 
     train, test = (_resolve(wanted, names, raw.folder) for wanted in lists)
     if train is not None and test is not None:
         names = sorted({*train, *test})
-
-    def cameras(chosen: Sequence[str]) -> list[Any]:
-        return [by_name[name] for name in chosen]
-
-    split = hold_out(select_images(names, options.max_images), options, (train, test), cameras)
-    roles: dict[str, Role] = dict.fromkeys(split.train, "train")
-    roles.update((name, "test") for name in split.test)
+    names = select_images(names, options.max_images)
+    for_training, for_testing, description = hold_out(names, options, (train, test), by_name)
+    roles: dict[str, Role] = dict.fromkeys(for_training, "train")
+    roles |= dict.fromkeys(for_testing, "test")
     kept = [replace(by_name[name], role=roles[name]) for name in sorted(roles)]
-    return replace(raw, photographs=tuple(kept), held_out=split.description)
+    return replace(raw, photographs=tuple(kept), held_out=description)
 
 
 def drop_copies_of_test_views(raw: RawCapture) -> RawCapture:
@@ -112,10 +108,9 @@ def prepare(raw: RawCapture, options: SceneConfig, root: Path, model: Path | Non
     oddities += inspect("capture", raw, str(raw.folder), accept)
     # Only the courtyard has exact poses, and its units fit the paper's threshold.
     exact = options.kind == "courtyard"
-    rows = raw.photographs
-    masks = {row.name: row.mask for row in rows if row.mask is not None}
+    masks = {row.name: row.mask for row in raw.photographs if row.mask is not None}
     beside: dict[str, dict[str, Path]] = defaultdict(dict)
-    for row in rows:
+    for row in raw.photographs:
         for kind, file in {**row.more, DEPTH: row.depth}.items():
             if file is not None:
                 beside[kind][row.name] = file

@@ -21,7 +21,6 @@ from gsbench.words import FORM, did_you_mean, listed
 
 log = logging.getLogger(__name__)
 
-GIVEN = ""  # the measure of a rule whose findings the subject has
 Range = tuple[float, float]  # the ends belong to it
 ANY: Range = (-math.inf, math.inf)
 
@@ -41,20 +40,31 @@ Stage = Literal["file", "read", "capture", "lens", "views", "scene", "model", "c
 class Rule:
     """One row. ``say`` and ``mend`` are formatted with the finding (`gsbench.words.FORM`).
 
-    ``measure`` is a function of the subject, or the name of its attribute, a number, None if it is
-    not known, or a list of names, which are counted. A subject that is a mapping has its findings
-    by the ids of rules. ``it`` is the subject in sentences. A ``fixed`` rule is one of arithmetic
-    or safety, and cannot be accepted.
+    ``measure`` names one of `MEASURES`, or an attribute of the subject: a number, None if it is not
+    known, or a list of names, which are counted. A subject that is a mapping has its findings by
+    the ids of rules. ``it`` is the subject in sentences. A ``fixed`` rule is one of arithmetic or
+    safety, and cannot be accepted.
     """
 
     id: str
-    measure: str | Callable[[Any], Iterable[Finding]]
-    fine: Range
     stage: Stage
     say: str
     mend: str
-    usable: Range = ANY
+    measure: str = ""
+    at_least: float = -math.inf
+    at_most: float = math.inf
+    usable_at_most: float | None = None
     fixed: bool = False
+
+    @property
+    def fine(self) -> Range:
+        return self.at_least, self.at_most
+
+    @property
+    def usable(self) -> Range:
+        if self.usable_at_most is not None:
+            return -math.inf, self.usable_at_most
+        return self.fine if self.fixed else ANY
 
     def judge(self, subject: Any) -> Oddity | None:
         """The oddity of a subject, told by its worst finding; None if all is fine."""
@@ -73,10 +83,10 @@ class Rule:
         )
 
     def _findings(self, subject: Any) -> Iterable[Finding]:
-        if callable(self.measure):
-            return self.measure(subject)
         if isinstance(subject, Mapping):
             return subject.get(self.id, ())
+        if self.measure in MEASURES:
+            return MEASURES[self.measure](subject)
         value = getattr(subject, self.measure)
         if isinstance(value, Sequence):
             return [Finding(len(value), value)]
@@ -157,15 +167,6 @@ def _each_camera(value: Callable[[Camera], float]) -> Callable[[Scene], Iterable
     return measure
 
 
-def _off_center(camera: Camera) -> float:
-    """The distance of the principal point from the middle, in shares of a side."""
-    return max(abs(camera.cx / camera.width - 0.5), abs(camera.cy / camera.height - 0.5))
-
-
-def _brightest(scene: Scene) -> Iterable[Finding]:
-    yield Finding(max(int(view.image.max()) for view in scene.train))
-
-
 def _near_twins(scene: Scene) -> Iterable[Finding]:
     names = [f"{name} ({twin})" for name, twin in scene.twins.near.items()]
     yield Finding(len(names), names, {"tested": len(scene.test)})
@@ -188,25 +189,7 @@ def _panoramas(raw: Any) -> Iterable[Finding]:
     yield Finding(len(names), names)
 
 
-def _rule(
-    name: str,
-    *,
-    measure: str = GIVEN,
-    at_least: float = -math.inf,
-    at_most: float = math.inf,
-    usable_at_most: float | None = None,
-    fixed: bool = False,
-    **row: Any,
-) -> Rule:
-    """The rule of a row of the table."""
-    fine = at_least, at_most
-    usable = fine if fixed else ANY
-    if usable_at_most is not None:
-        usable = -math.inf, usable_at_most
-    return Rule(name, MEASURES.get(measure, measure), fine, usable=usable, fixed=fixed, **row)
-
-
-MEASURES = {
+MEASURES: Mapping[str, Callable[[Any], Iterable[Finding]]] = {
     "panoramas": _panoramas,
     "left_out": _left_out,
     "near_twins": _near_twins,
@@ -215,11 +198,16 @@ MEASURES = {
         lambda camera: math.degrees(2 * math.atan(camera.width / (2 * camera.fx)))
     ),
     "pixel_shape": _each_camera(lambda camera: camera.fy / camera.fx),
-    "off_center": _each_camera(_off_center),
-    "brightest": _brightest,
+    # of the principal point from the middle, in shares of a side
+    "off_center": _each_camera(
+        lambda camera: max(
+            abs(camera.cx / camera.width - 0.5), abs(camera.cy / camera.height - 0.5)
+        )
+    ),
+    "brightest": lambda scene: [Finding(max(int(view.image.max()) for view in scene.train))],
     "fields_of_view": lambda model: model.fields_of_view,
 }
-RULES = tuple(_rule(name, **row) for name, row in table_beside(__file__, "rules.yaml").items())
-BY_ID = {rule.id: rule for rule in RULES}
+BY_ID = {name: Rule(name, **row) for name, row in table_beside(__file__, "rules.yaml").items()}
+RULES = tuple(BY_ID.values())
 # with two views, no third one can reveal a wrong geometry; the smallest side in px
-MIN_IMAGES, MIN_SIZE = (int(BY_ID[name].fine[0]) for name in ("too-few-images", "view-size"))
+MIN_IMAGES, MIN_SIZE = (int(BY_ID[name].at_least) for name in ("too-few-images", "view-size"))

@@ -13,7 +13,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Collection
 from dataclasses import fields, replace
-from functools import cached_property
+from functools import cache, partial
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
@@ -81,7 +81,7 @@ def read_transforms(
         require_subfolder(folder, image_folder, "scene.images")
     files = find_files(folder)
     records = {split: _read_record(path, backdrop) for split, path in files.items()}
-    find = _FileFinder(folder, image_folder)
+    listed = cache(partial(list_images, folder))  # not needed if all names are those of files
     rows: dict[str, Photograph] = {}
     points: PointsFile | None = None
     missing: list[str] = []
@@ -90,8 +90,13 @@ def read_transforms(
         path = files[split]
         applied = applied_transform_of(path, record)
         for frame in record.frames:
-            name = find(path, frame.file_path)
-            if name is None:
+            name = _place(path, frame.file_path, image_folder)
+            if Path(name).suffix.lower() not in IMAGE_SUFFIXES or not (folder / name).is_file():
+                try:  # Blender writes no extension
+                    name = match([name], listed()).get(name, "")
+                except InputError as error:
+                    raise InputError(f"{path}: {error}") from error
+            if not name:
                 missing.append(frame.file_path)
                 continue
             if name in rows:
@@ -114,7 +119,7 @@ def read_transforms(
         mend = "set scene.images to the folder of the photographs"
     require_enough(len(rows), folder, which, mend)
     if "" in files:
-        roles = _named_split(files[""], records[""], rows, find)
+        roles = _named_split(files[""], records[""], rows, image_folder)
         rows = {name: replace(row, role=roles.get(name, row.role)) for name, row in rows.items()}
     read_from = [*files.values()]
     if points is not None:
@@ -170,36 +175,16 @@ def _read_record(path: Path, backdrop: Backdrop) -> TransformsRecord:
     return record
 
 
-class _FileFinder:
-    """Finds the image that ``file_path`` names, as for COLMAP models (`match`)."""
-
-    def __init__(self, folder: Path, image_folder: str | None = None) -> None:
-        self.folder, self.image_folder = folder, image_folder
-
-    @cached_property
-    def _files(self) -> list[str]:
-        return list_images(self.folder)
-
-    def place(self, path: Path, written: str) -> PurePosixPath:
-        """The path of an image as the file writes it, or in the folder that is read instead."""
-        relative = _relative_path(path, written)
-        if self.image_folder is None:
-            return relative
-        return PurePosixPath(self.image_folder, *(relative.parts[1:] or relative.parts))
-
-    def __call__(self, path: Path, written: str) -> str | None:
-        """The name below the folder, or None if no file fits. Blender writes no extension."""
-        relative = self.place(path, written)
-        if relative.suffix.lower() in IMAGE_SUFFIXES and (self.folder / relative).is_file():
-            return relative.as_posix()
-        try:
-            return match([relative.as_posix()], self._files).get(relative.as_posix())
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from error
+def _place(path: Path, written: str, image_folder: str | None) -> str:
+    """The path of an image as the file writes it, or in the folder that is read instead."""
+    relative = _relative_path(path, written)
+    if image_folder is None:
+        return relative.as_posix()
+    return PurePosixPath(image_folder, *(relative.parts[1:] or relative.parts)).as_posix()
 
 
 def _named_split(
-    path: Path, record: TransformsRecord, images: Collection[str], find: _FileFinder
+    path: Path, record: TransformsRecord, images: Collection[str], image_folder: str | None
 ) -> dict[str, Role]:
     """The roles by nerfstudio's lists: names to train on, and to test or else to validate on."""
     train, held_out = record.train_filenames, record.test_filenames or record.val_filenames
@@ -207,7 +192,7 @@ def _named_split(
         return {}
     chosen: dict[str, set[str]] = {}
     for which, listed in (("train", train or []), ("held-out", held_out)):
-        wanted = [find.place(path, name).as_posix() for name in listed]
+        wanted = [_place(path, name, image_folder) for name in listed]
         matches = match(wanted, images)
         if missing := [name for name in wanted if name not in matches]:
             raise InputError(

@@ -6,7 +6,6 @@ the origin (such as a ring at height 0), and the robust one wants a tolerance in
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,8 +14,6 @@ from scipy.spatial.transform import Rotation
 
 from gsbench.init.base import PoseErrors
 from gsbench.init.colmap.models import posed_images, training_extent
-from gsbench.init.report import measure_gauge
-from gsbench.scene.colmap import save_model
 from gsbench.scene.types import Array, Capture
 
 TRIALS = 500  # random triples of cameras
@@ -35,12 +32,11 @@ def align(
     reference: pycolmap.Reconstruction | None,
     capture: Capture,
     exact: bool,
-    own_gauge: Path | None,
+    move: bool,
 ) -> dict[str, Any]:
-    """Compare estimated poses with the reference, and move the model into the reference's gauge.
+    """Compare estimated poses with the reference; ``move`` the model into the reference's gauge.
 
-    ``own_gauge`` is the folder for a copy of the model before it is moved; if it is None, the model
-    is not moved. ``exact`` says that the reference is the truth. Returns arguments of
+    ``exact`` says that the reference is the truth. Returns arguments of
     `gsbench.init.report.make_report`.
     """
     if reference is None:
@@ -51,13 +47,10 @@ def align(
         few = "too few common cameras with the reference: poses are neither aligned nor compared"
         return {"warnings": [few]}
     errors = compare_poses(poses, similarity, training_extent(reference, capture), exact)
-    scale = float(similarity.scale)
-    if own_gauge is None:
-        return {"scale_to_reference": scale, "pose_errors": errors}
-    gauge = measure_gauge(training_extent(model, capture), scale)
-    save_model(model, own_gauge)
-    model.transform(similarity)
-    return {"scale_to_reference": 1.0, "own_gauge": gauge, "pose_errors": errors}
+    if move:
+        model.transform(similarity)
+    scale = 1.0 if move else float(similarity.scale)
+    return {"scale_to_reference": scale, "pose_errors": errors}
 
 
 def common_poses(model: pycolmap.Reconstruction, reference: pycolmap.Reconstruction) -> CommonPoses:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,15 +10,8 @@ import pycolmap
 
 from gsbench.errors import InputError
 from gsbench.init.base import TrainingPoints
-from gsbench.scene.colmap import MIN_TRACK, read_reference
+from gsbench.scene.colmap import MIN_TRACK
 from gsbench.scene.types import Array, Capture, extent_of_centers
-
-
-def load_reference(capture: Capture, reference: Path | None) -> pycolmap.Reconstruction | None:
-    """The model ``reference``, else the capture's, fitted to the image files; None without both."""
-    if reference is not None:
-        capture = replace(capture, model=reference)
-    return None if capture.model is None else read_reference(capture)
 
 
 def posed_images(model: pycolmap.Reconstruction) -> dict[str, pycolmap.Image]:
@@ -49,24 +41,14 @@ def keep_training_points(
     Positions do not change. Colours are read again, from the photographs in the folder ``images``.
     """
     before = model.num_points3D()
-    kept = {image.image_id for name, image in posed_images(model).items() if name in names}
-    for point_id in sorted(model.points3D):
-        point = model.points3D[point_id]
-        observations = [
-            (element.image_id, element.point2D_idx)
-            for element in point.track.elements
-            if element.image_id in kept
-        ]
-        track = pycolmap.Track(
-            [pycolmap.TrackElement(*observation) for observation in observations]
-        )
-        copy = pycolmap.Point3D(xyz=np.array(point.xyz), error=point.error, track=track)
-        model.delete_point3D(point_id)  # `point` is a view into the model, and invalid from here on
-        if len(dict(observations)) < MIN_TRACK:  # an image may see a point twice
-            continue
-        model.add_point3D_with_id(point_id, copy)
-        for image_id, index in observations:
-            model.images[image_id].set_point3D_for_point2D(index, point_id)
+    for name, image in posed_images(model).items():
+        for index, seen in enumerate(image.points2D):
+            if name not in names and seen.has_point3D():
+                model.delete_observation(image.image_id, index)  # and its point, if one is left
+    for point_id, point in list(model.points3D.items()):
+        # an image may see a point twice
+        if len({element.image_id for element in point.track.elements}) < MIN_TRACK:
+            model.delete_point3D(point_id)
     model.extract_colors_for_all_images(images)
     count = model.num_points3D()
     if count == 0:

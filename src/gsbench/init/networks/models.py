@@ -194,7 +194,7 @@ def lightglue_matcher(
             "keypoints": torch.from_numpy(features.keypoints)[None].to(device),  # [1, K, 2]
             "descriptors": torch.from_numpy(features.descriptors)[None].to(device),  # [1, K, D]
             "image_size": torch.tensor(
-                [features.network_size], dtype=torch.float32, device=device
+                np.array([features.network_size]), dtype=torch.float32, device=device
             ),  # [1, 2]
         }
 

@@ -8,7 +8,16 @@ from math import exp, floor, inf, sqrt
 import numpy as np
 
 from gsbench.scene.courtyard.layout import BOX, SPHERE
-from gsbench.scene.courtyard.textures import blend, ground, octaves, shade_factors, unit
+from gsbench.scene.courtyard.textures import (
+    ahead,
+    blend,
+    ground,
+    minus,
+    octaves,
+    scaled,
+    shade_factors,
+    unit,
+)
 from gsbench.system.jit import inlined, kernel
 
 GROUND, SKY = -1, -2
@@ -26,17 +35,6 @@ _EPSILON = 1e-4  # m, how far a shadow ray starts above the surface
 @inlined
 def dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@inlined
-def minus(a, b):
-    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
-
-
-@inlined
-def ahead(origin, t, direction):
-    """The point at distance ``t`` along a ray."""
-    return origin[0] + t * direction[0], origin[1] + t * direction[1], origin[2] + t * direction[2]
 
 
 @inlined
@@ -256,18 +254,9 @@ def shade(layout, origin, direction, pixel, seed):
         sun = sun if blocker == SKY else 0.0
     sun = max(sun, 0.0)
     up = 0.5 + 0.5 * normal[2]
-    return (
-        color[0] * received(0, sun, occlusion, up),
-        color[1] * received(1, sun, occlusion, up),
-        color[2] * received(2, sun, occlusion, up),
-    )
-
-
-@inlined
-def received(channel, sun, occlusion, up):
-    """The light on a surface: sunlight, and ambient light from above (share ``up``) and below."""
-    ambient = up * SKY_LIGHT[channel] + (1 - up) * BOUNCE_LIGHT[channel]
-    return sun * SUN_LIGHT[channel] + occlusion * ambient
+    ambient = ahead(scaled(up, SKY_LIGHT), 1 - up, BOUNCE_LIGHT)
+    red, green, blue = ahead(scaled(occlusion, ambient), sun, SUN_LIGHT)
+    return color[0] * red, color[1] * green, color[2] * blue
 
 
 @inlined

@@ -107,13 +107,25 @@ def groove(position, period, width, footprint):
 
 
 @inlined
+def minus(a, b):
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+@inlined
+def scaled(factor, v):
+    return factor * v[0], factor * v[1], factor * v[2]
+
+
+@inlined
+def ahead(origin, t, direction):
+    """The point at distance ``t`` along a ray."""
+    return origin[0] + t * direction[0], origin[1] + t * direction[1], origin[2] + t * direction[2]
+
+
+@inlined
 def blend(color, share, other):
     """``color`` with a ``share`` of the ``other`` colour."""
-    return (
-        color[0] + share * (other[0] - color[0]),
-        color[1] + share * (other[1] - color[1]),
-        color[2] + share * (other[2] - color[2]),
-    )
+    return ahead(color, share, minus(other, color))
 
 
 @inlined
@@ -135,11 +147,7 @@ def ground(point, footprint, seed):
     tuft = noise(flat, 0.33, seed + 41)
     light = 1.0 + 0.10 * patch + 0.13 * blades + 0.06 * tuft
     dry = unit(0.35 + 0.30 * patch + 0.12 * tuft)
-    color = (
-        light * (0.092 + 0.062 * dry),
-        light * (0.135 + 0.020 * dry),
-        light * (0.036 + 0.014 * dry),
-    )
+    color = scaled(light, ahead((0.092, 0.135, 0.036), dry, (0.062, 0.020, 0.014)))
     inside = unit(0.5 - path / edge)
     if inside > 0.0:
         _, border, shade = pebbles(x, y, 0.055, seed + 51)
@@ -153,7 +161,7 @@ def ground(point, footprint, seed):
     bare = unit(0.5 - soil / edge) * (1.0 - inside)
     if bare > 0.0:
         earth = 1.0 + 0.45 * octaves(flat, 0.16, 4, 0.7, footprint, seed + 71)
-        color = blend(color, bare, (earth * 0.115, earth * 0.075, earth * 0.045))
+        color = blend(color, bare, scaled(earth, (0.115, 0.075, 0.045)))
     return color
 
 
