@@ -119,7 +119,7 @@ READERS: dict[str, Callable[[str], Any]] = {
     "count": _count,
     "counts": comma_separated(_count),
     "seeds": comma_separated(number(Count)),
-    "number_of_ideas": number(Annotated[int, Interval(ge=1, le=10_000)]),
+    "to_10000": number(Annotated[int, Interval(ge=1, le=10_000)]),
     "port": number(Annotated[int, Interval(ge=0, le=65535)]),  # of TCP; 0: any free one
     "rate": number(OpenFraction),
     "difference": number(PositiveFloat),

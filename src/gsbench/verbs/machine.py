@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from gsbench.errors import InputError
+from gsbench.parsing import table_beside
 from gsbench.raster.executors import AUTO, EXECUTORS, missing_tools, names, resolve
 from gsbench.runs.trial_record import RasterProof
 from gsbench.scene.rules import MIN_SIZE
@@ -21,16 +22,7 @@ from gsbench.verbs.arguments import comma_separated, options_of
 from gsbench.words import counted, readable_bytes
 
 LITTLE_SPACE = 5_000_000_000  # bytes
-REQUIRED = ("pycolmap", "kornia", "numba", "mlflow")
-OPTIONAL = {  # module -> what needs it, and the extra that brings it
-    "transformers": ("init=dim", "dim"),
-    "gsplat": ("benchmarks.gsplat_raster", "gsplat"),
-    "piq": ("MS-SSIM, IW-SSIM, FSIM and GMSD (eval.more)", "piq"),
-    "optuna": ("searches (hydra.sweeper.tune)", "search"),
-    "tensorboard": ("tracking=tensorboard", "tensorboard"),
-    "viser": ("gsbench view", "view"),
-    "wandb": ("tracking=wandb", "wandb"),
-}
+PACKAGES = table_beside(__file__, "packages.yaml")
 NOT_SHOWN = ("scene", "threads", "device")  # columns that only the JSON of `bench` has
 MAX_SIDE = 16_384  # px
 # the errors of a proof that its line shows
@@ -159,11 +151,11 @@ def check_packages() -> Iterator[Finding]:
         "python",
         f"{sys.version.split()[0]} ({sys.executable}), {available_threads()} cores to use",
     )
-    for name in REQUIRED:
+    for name in PACKAGES["required"]:
         installed = version_of(name)
         text = installed or f"missing: {install_command()}"
         yield "ok" if installed else "bad", name, text
-    for name, (purpose, extra) in OPTIONAL.items():
+    for name, (purpose, extra) in PACKAGES["optional"].items():
         installed = version_of(name)
         text = installed or f"not installed; needed for {purpose}: {install_command(extra)}"
         yield "ok" if installed else "note", name, text
