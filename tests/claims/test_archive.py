@@ -78,6 +78,15 @@ def test_results_settings_and_views_are_read_back(tmp_path):
     assert compare(back).sentences == compare(there).sentences
 
 
+def test_an_archive_tells_that_an_earlier_gsbench_was_asked(tmp_path):
+    write_runs(tmp_path / "runs")
+    (tmp_path / "runs/exp/declared.jsonl").write_text("{}")
+    file = tmp_path / "exp.zip"
+    write_archive(loaded(tmp_path / "runs"), file)
+    (answer,) = compare(unpack_archive(file, tmp_path / "other")).answers
+    assert "declared.jsonl" in answer.sentence
+
+
 def test_an_archive_is_a_runs_folder_with_a_list_of_checksums(tmp_path):
     content = members(export(tmp_path, scenes=("yard",), seeds=(0,), densifiers=("adc",)))
     manifest = json.loads(content["archive.json"])

@@ -28,12 +28,12 @@ from gsbench.errors import InputError
 from gsbench.parsing import read_typed
 from gsbench.runs.experiments import TuningRecord
 from gsbench.runs.layout import (
+    ASKED_EARLIER,
     COMMANDS,
     CONFIG,
     FAILED,
     FROM_PIXELS,
     GROUND_TRUTH,
-    LEDGER,
     PER_VIEW,
     REGIONS,
     RENDERS,
@@ -57,7 +57,7 @@ BAD_ZIP = (
 FORMAT, VERSION, FIRST_VERSION = "gsbench results", 2, 1
 MANIFEST = "archive.json"
 PICTURES = (RENDERS, GROUND_TRUTH)
-OF_EXPERIMENT = (COMMANDS, LEDGER)  # the second in archives of the first version
+OF_EXPERIMENT = (COMMANDS, *ASKED_EARLIER)
 OF_TRIAL = (RESULTS, CONFIG, PER_VIEW, FROM_PIXELS, REGIONS, FAILED)
 # Archives may come from strangers: these limits stop a zip bomb. They are larger than any
 # experiment needs.

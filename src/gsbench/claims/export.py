@@ -38,6 +38,7 @@ from gsbench.parsing import read_bytes, read_typed, read_yaml
 from gsbench.runs.commands import Command, Idea, PlannedTrial, chained, read_lines
 from gsbench.runs.experiments import STAMP, TuningRecord
 from gsbench.runs.layout import (
+    ASKED_EARLIER,
     COMMANDS,
     CONFIG,
     FAILED,
@@ -73,6 +74,9 @@ def write_archive(
     files, kept, home = dict[str, bytes](), list[TrialResult](), experiment.folder
     if (home / COMMANDS).is_file():
         files[f"{home.name}/{COMMANDS}"] = _shared_commands(home)
+    for name in ASKED_EARLIER:  # not read, but a reader must see that something was asked
+        if (home / name).is_file():
+            files[f"{home.name}/{name}"] = read_bytes(home / name)
     for trial in (*experiment.trials, *experiment.older):
         try:
             files |= _of_trial(trial, pictures)

@@ -21,7 +21,7 @@ METRICS = "metrics.json"  # of an evaluation
 COMMANDS = "commands.jsonl"  # all commands, with their trials and questions
 PLAN = "plan.json"  # of earlier versions: the trials of the commands
 # of gsbench 0.1, no longer read: declared questions, and a ledger of ideas
-DECLARED, LEDGER = "declared.jsonl", "ledger.jsonl"
+DECLARED, LEDGER = ASKED_EARLIER = "declared.jsonl", "ledger.jsonl"
 TUNING = "tuning.json"  # of a search: its ranges and points
 SEED = "-seed"  # between hash and seed in the name of a trial's folder
 TRIAL_GLOB = f"*/*/*{SEED}*"  # all trials' folders
