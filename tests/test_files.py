@@ -1,7 +1,6 @@
 """Writing and checking files: nothing is left half written, followed through a link, or waited for."""
 
 import errno
-import hashlib
 import os
 import socket
 from collections import namedtuple
@@ -17,7 +16,6 @@ from gsbench.files import (
     atomic,
     checked_runs_folder,
     explain_storage,
-    file_sha256,
     link_or_copy,
     make_runs_folder,
     open_plain,
@@ -182,11 +180,6 @@ def test_syncing_reaches_the_disk_and_is_left_out_where_it_is_not_supported(tmp_
     sync_to_disk(tmp_path)
     sync_to_disk(tmp_path / "none")
     assert len(os.listdir("/dev/fd")) == before
-
-
-def test_the_digest_of_a_file_is_its_sha256(tmp_path):
-    (tmp_path / "a").write_bytes(b"abc" * 10**6)
-    assert file_sha256(tmp_path / "a") == hashlib.sha256(b"abc" * 10**6).hexdigest()
 
 
 # ---- the runs folder

@@ -13,7 +13,7 @@ from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import LockHolder
 from gsbench.tracking.trial import TrackedTrial
 from gsbench.words import markdown_code, markdown_text
-from tests.helpers import change_json, read_json, table, write
+from tests.helpers import change_json, read_json, table, write, write_lines
 from tests.trials import write_runs
 
 BEGIN = "FORGED"  # no line of an output may begin with it
@@ -79,8 +79,9 @@ def place(tmp_path_factory):
     write(failed / "failed.json", {"error": HOSTILE, "message": HOSTILE, "traceback": HOSTILE})
     write(failed / ".lock.holder", {"host": HOSTILE, "pid": 1, "since": 1.0, "what": HOSTILE})
     key = "garden/sfm-adc/0123abcd-seed8"
-    planned = {"overrides": [f"densify.note={HOSTILE}"], "cwd": str(root), "time": 1.0}
-    write(root / "runs/exp/plan.json", {"trials": {key: planned}})
+    words = [f"densify.note={HOSTILE}"]
+    command = {"words": words, "cwd": str(root), "time": 1.0, "trials": {key: {"words": words}}}
+    write_lines(root / "runs/exp/commands.jsonl", [command])
     return root, folders
 
 

@@ -159,19 +159,14 @@ def served(server, content):
     return f"{server.url}/served.bin"
 
 
-def test_download_is_checked_and_kept(server, empty_caches):
-    url = served(server, b"good")
-    found = find_weights(spec(b"good", url))
-    assert found == empty_caches / "net.pth"
-    assert found.read_bytes() == b"good"
-    assert find_weights(spec(b"good", url)) == found
-    assert len(server.requests) == 1
-
-
-def test_a_download_logs_its_progress(server, empty_caches, caplog):
+def test_a_download_logs_its_progress_and_is_kept(server, empty_caches, caplog):
     caplog.set_level(logging.INFO, "gsbench")
-    url = served(server, b"g" * 2_500_000)
-    find_weights(spec(b"g" * 2_500_000, url))
+    content = b"g" * 2_500_000
+    url = served(server, content)
+    for _ in range(2):
+        assert find_weights(spec(content, url)) == empty_caches / "net.pth"
+    assert (empty_caches / "net.pth").read_bytes() == content
+    assert len(server.requests) == 1
     lines = [record.getMessage() for record in caplog.records if record.name.startswith("gsbench")]
     assert lines == [
         f"downloading net.pth (2.5 MB) from {url} to {empty_caches}",  # before anything has come
@@ -198,13 +193,6 @@ def test_download_that_ends_early_or_is_damaged_leaves_nothing(
     with pytest.raises(MissingWeightsError, match=said):
         find_weights(spec(b"good", served(server, content)))
     assert list(empty_caches.iterdir()) == []
-
-
-def test_without_a_network_there_is_one_attempt():
-    with pytest.raises(
-        MissingWeightsError, match=r"the download failed: .*1 failures in a row .*refused"
-    ):
-        find_weights(spec(url="http://127.0.0.1:9/net.pth"))
 
 
 @pytest.mark.parametrize("name", ["net.pth", "net.safetensors", "net-pth"])

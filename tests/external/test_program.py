@@ -16,7 +16,7 @@ from gsbench.external.exchange import (
     write_test_cameras,
     write_training_views,
 )
-from gsbench.external.settings import External, fill_placeholders, split_command
+from gsbench.external.settings import fill_placeholders, split_command
 from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.init.base import PointCloud
 from gsbench.normalization import IDENTITY, Normalization
@@ -179,13 +179,6 @@ def test_an_option_changes_the_hash_of_a_trial_and_a_time_limit_does_not():
     assert config_hash(composed(*words, "densify.time_limit_minutes=5")) == base
     assert config_hash(composed(*words, "densify.options.num_downscales=2")) != base
     assert config_hash(composed(*words, "densify.version='2'")) != base
-
-
-def test_a_command_must_contain_data_and_its_result_tells_model_from_renders():
-    with refusal(r"has no \{data\}"):
-        External(command=["a"], result="*.ply", version="1")
-    assert External(command=["a", "{data}"], result="x/*.PLY", version="1").leaves_model
-    assert not External(command=["a", "{data}"], result="x/*.png", version="1").leaves_model
 
 
 def run(tmp_path, code, limit=None):

@@ -29,7 +29,7 @@ from gsbench.analysis.table_formats import to_html_page
 from gsbench.analysis.tables import build_table
 from gsbench.errors import InputError
 from gsbench.launch import states
-from gsbench.launch.dry_run import FinishedTrials
+from gsbench.launch.estimates import FinishedTrials
 from gsbench.launch.states import states_of_experiment
 from gsbench.parsing import read_if_sound
 from gsbench.runs.commands import read_history
@@ -47,7 +47,6 @@ DONE, FAILED, EXPERIMENT = "sfm-adc", "sfm-volumetric", "exp"
 NAMES = (
     "results.json",
     "config.yaml",
-    "plan.json",
     "commands.jsonl",
     "metrics.jsonl",
     "events.jsonl",
@@ -163,19 +162,14 @@ def write_original(runs):
         {"uri": "u", "token": "t", "started": 1, "logged": {"metrics.jsonl": 5}, "complete": "c"},
     )
     write(done / ".lock.holder", {"host": "h", "pid": 1, "since": 1.0, "slurm": None, "what": "w"})
-    entry = {"overrides": ["seed=0"], "cwd": str(runs), "time": 1.0}
-    places = {path.relative_to(home).as_posix(): entry for path in (done, failed)}
-    write(home / "plan.json", {"version": 1, "trials": places})
-    words = {"words": ["seed=0"], "cwd": str(runs), "time": 1.0}
-    write_lines(
-        home / "commands.jsonl",
-        [words | {"trials": {name: {"words": ["seed=0"]} for name in places}}],
-    )
+    planned = {path.relative_to(home).as_posix(): {"words": ["seed=0"]} for path in (done, failed)}
+    command = {"words": ["seed=0"], "cwd": str(runs), "time": 1.0, "trials": planned}
+    write_lines(home / "commands.jsonl", [command])
     tuning = search_record([{"settings": {"densify.volume_threshold": 0.03}, "value": 20.0}])
     ranges = {"densify.volume_threshold": "0.01,0.03"}
     write(home / "tuning.json", tuning | {"sweep": home.name, "ranges": ranges})
     places_of = {name: done / name for name in NAMES}
-    places_of |= {name: home / name for name in ("plan.json", "commands.jsonl", "tuning.json")}
+    places_of |= {name: home / name for name in ("commands.jsonl", "tuning.json")}
     places_of |= {
         name: failed / name for name in ("failed.json", "building.json", ".submitted.json")
     }

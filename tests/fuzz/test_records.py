@@ -37,9 +37,7 @@ def places(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("damage", [*DAMAGES, "fifo", "folder"])
-@pytest.mark.parametrize(
-    "name", ["results.json", "commands.jsonl", "plan.json", "config.yaml", "metrics.jsonl"]
-)
+@pytest.mark.parametrize("name", ["results.json", "commands.jsonl", "config.yaml", "metrics.jsonl"])
 def test_verbs_print_one_line_for_a_damaged_file(name, damage, places, capsys):
     path = places[name]
     if damage in DAMAGES:
@@ -47,8 +45,7 @@ def test_verbs_print_one_line_for_a_damaged_file(name, damage, places, capsys):
     else:
         path.unlink()
         (os.mkfifo if damage == "fifo" else os.mkdir)(path)
-    # the plan of an earlier gsbench, and that of today; one without a line has lost nothing
-    is_plan = name == "plan.json" or (name == "commands.jsonl" and damage != "empty")
+    is_plan = name == "commands.jsonl" and damage != "empty"  # without a line, nothing is lost
     is_result = name in ("results.json", "config.yaml")
     table, status = ["tables", EXPERIMENT], ["status", EXPERIMENT]
     for argv in (table, status, ["status"], [*table, "--format=trials"]):
@@ -74,7 +71,7 @@ def test_every_kind_of_file_is_damaged_in_turn(places):
 READS_ITSELF = {
     "analysis/paper.py",
     "datasets/catalog.py",  # of the package
-    "launch/dry_run.py",  # text of this process
+    "launch/estimates.py",  # text of this process
     "init/base.py",
     "runs/keys.py",  # text of this very process
     "runs/package_code.py",  # tables of the package

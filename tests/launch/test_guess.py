@@ -3,8 +3,8 @@
 import pytest
 from PIL import Image
 
-from gsbench.launch import dry_run as guess
-from gsbench.launch.dry_run import describe_plan, guess_training, picture_size
+from gsbench.launch import estimates as guess
+from gsbench.launch.estimates import describe_plan, guess_training, picture_size
 from tests.trials import bare_trial
 
 

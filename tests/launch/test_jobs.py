@@ -9,7 +9,6 @@ import logging
 import signal
 import sys
 from contextlib import contextmanager
-from pathlib import Path
 from shlex import split
 from types import SimpleNamespace
 
@@ -53,25 +52,6 @@ SLURM = {
 }
 
 
-class Mirrored:
-    """Stands in for a `Mirror`, and keeps what it follows."""
-
-    def __init__(self, idle=False):
-        self.idle, self.followed = idle, list[Path]()
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *error):
-        pass
-
-    def follow(self, folder, values):
-        self.followed.append(folder)
-
-    def trial_ended(self):
-        pass
-
-
 def job(folder, name):
     """Stands in for a job of submitit that has not ended."""
     paths = SimpleNamespace(result_pickle=folder / f"{name}.pkl", stderr=folder / "log")
@@ -97,19 +77,18 @@ def test_an_error_of_a_trial_becomes_its_outcome_unless_it_concerns_all(tmp_path
         raise raised
 
     replace_trials(monkeypatch, run_trial)
-    mirror, failing = Mirrored(), trial(tmp_path)
+    failing = trial(tmp_path)
     log = failing.folder / "log.txt"
     for raised, message, bad_input in (  # noqa: B007 - the trial raises it
         (InputError("no photos"), "no photos", True),
         (TrainingError("nan"), "nan", False),
         (ValueError("a\nb"), f"ValueError: a; the traceback is in {log}", False),
     ):
-        outcome = run_one(failing, mirror, wait=True)
+        outcome = run_one(failing, wait=True)
         assert outcome == Outcome(failing.folder, "failed", message, bad_input)
-    assert mirror.followed == [failing.folder] * 3
     for raised in (BusyError("later"), DiskFullError("full"), KeyboardInterrupt()):
         with pytest.raises(type(raised)):
-            run_one(failing, mirror, wait=True)
+            run_one(failing, wait=True)
 
 
 def test_a_single_trial_waits_for_another_process_and_several_are_counted(
@@ -124,10 +103,10 @@ def test_a_single_trial_waits_for_another_process_and_several_are_counted(
 
     replace_trials(monkeypatch, run_trial)
     trials = [trial(tmp_path, seed) for seed in (0, 1)]
-    (outcome,) = jobs.run_serial(trials[:1], Mirrored())
+    (outcome,) = jobs.run_serial(trials[:1])
     assert outcome == Outcome(trials[0].folder, "done", "psnr 20.46  ssim 0.5")
     assert not caplog.messages
-    jobs.run_serial(trials, Mirrored())
+    jobs.run_serial(trials)
     assert waits == [True, False, False]
     assert caplog.messages == [f"{k} of 2: {trials[k - 1].files.label}" for k in (1, 2)]
 
@@ -175,8 +154,8 @@ def machine(monkeypatch):
     """What a job did to its process, with stand-ins for its trial and for all of that."""
     did = {}
 
-    def run_one(trial, mirror, wait):
-        did["trial"], did["mirror"], did["wait"] = trial, mirror, wait
+    def run_one(trial, wait):
+        did["trial"], did["wait"] = trial, wait
         return did["outcome"]
 
     @contextmanager
@@ -189,7 +168,7 @@ def machine(monkeypatch):
 
     monkeypatch.setattr(jobs, "run_one", run_one)
     monkeypatch.setattr(jobs, "take_slot", take_slot)
-    monkeypatch.setattr(jobs, "Mirror", Mirrored)
+    monkeypatch.setattr(jobs, "Mirror", lambda trials: note("mirrored")(*trials) or nothing())
     for name in split("adopt_modules set_up_logging assign_gpu assign_threads"):
         monkeypatch.setattr(jobs, name, note(name))
     monkeypatch.setattr(
@@ -211,7 +190,7 @@ def test_a_local_job_takes_a_slot_and_its_share_of_the_machine(tmp_path, machine
     assert machine["slots"] == (tmp_path, 2)
     assert machine["assign_gpu"] == (5, "6,7")
     assert machine["assign_threads"] == (3, 2)
-    assert machine["mirror"].idle  # the sweep's own process mirrors
+    assert machine["mirrored"] == ()  # the sweep's own process mirrors
     assert signal.SIGINT not in machine["signals"]  # it belongs to that process, too
     assert capsys.readouterr().err == "no luck\n"
     del machine["assign_gpu"]
@@ -226,7 +205,7 @@ def test_a_job_in_slurm_mirrors_itself_and_is_forgotten_at_its_end(tmp_path, mac
     assert read_submission(tmp_path) is None
     assert not {"slots", "assign_gpu"} & set(machine)
     assert machine["assign_threads"] == (3, 2)
-    assert not machine["mirror"].idle
+    assert len(machine["mirrored"]) == 1
     assert signal.SIGINT in machine["signals"]
     assert capsys.readouterr().err == ""
 
@@ -240,7 +219,7 @@ def test_a_stopped_job_ends_and_is_requeued_when_its_time_is_up(
     monkeypatch.setattr(signal, "getsignal", handlers.get)
     number = getattr(signal, name)
 
-    def stop(trial, mirror, wait):
+    def stop(trial, wait):
         raise Stopped(number)
 
     monkeypatch.setattr(jobs, "run_one", stop)
@@ -307,14 +286,12 @@ def test_local_jobs_run_as_many_at_once_as_asked(tmp_path, monkeypatch, caplog, 
     launch = LOCAL | {"timeout_min": minutes}
     scenes = split("a a b b")
     trials = [trial(tmp_path, seed, launch, scene={"name": scenes[seed]}) for seed in range(4)]
-    mirror = Mirrored()
-    outcomes = jobs.run_local(trials, mirror)
+    outcomes = jobs.run_local(trials)
     # one of each scene first, and a trial begins as soon as another ends
     assert executor.seeds == [0, 2, 1, 3]
     assert executor.most == 2
     assert pauses == [1.0]  # whenever none has ended
     assert [one.folder for one in outcomes] == [trials[k].folder for k in (2, 0, 1, 3)]
-    assert [folder.name[-1] for folder in mirror.followed] == ["0", "2", "1", "3"]
     assert executor.parameters == {"timeout_min": limit}
     assert caplog.messages[0] == ("4 trials, 2 at once; to see how far they are: gsbench status x")
     assert caplog.messages[1].startswith(f"{trials[2].files.label}: the process ended without")
@@ -327,7 +304,7 @@ def test_ctrl_c_is_passed_on_to_the_processes_that_still_run(tmp_path, monkeypat
     executor = Jobs(tmp_path, [0, 9])
     monkeypatch.setattr(submitit, "LocalExecutor", lambda folder: executor)
     with pytest.raises(KeyboardInterrupt):
-        jobs.run_local([trial(tmp_path, seed) for seed in (1, 2)], Mirrored())
+        jobs.run_local([trial(tmp_path, seed) for seed in (1, 2)])
     assert executor.sent == {1: signal.SIGTERM}  # the process of seed 2 has ended
 
 

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from gsbench.launch import batch, dry_run
+from gsbench.launch import batch, estimates
 from gsbench.launch.batch import (
     begin,
     check_trackers,
@@ -17,7 +17,7 @@ from gsbench.launch.batch import (
 from gsbench.launch.outcomes import Outcome
 from gsbench.runs.commands import read_history
 from tests.helpers import refusal
-from tests.launch.test_jobs import SLURM, Mirrored
+from tests.launch.test_jobs import SLURM, nothing
 from tests.trials import LOCAL, bare_trial, write_results
 
 
@@ -35,29 +35,28 @@ def called(monkeypatch):
     names = []
 
     def stand_in(name):
-        def launcher(trials, *mirror, **words):
-            seeds = [one.values["seed"] for one in trials]
-            names.append((name, seeds, len(mirror), *words.values()))
+        def launcher(trials, **words):
+            names.append((name, [one.values["seed"] for one in trials], *words.values()))
             return [Outcome(one.folder, "failed") for one in trials]
 
         return launcher
 
     for name in ("run_serial", "run_local", "run_slurm", "check_parts"):
         monkeypatch.setattr(batch, name, stand_in(name))
-    monkeypatch.setattr(batch, "Mirror", Mirrored)
+    monkeypatch.setattr(batch, "Mirror", lambda trials: stand_in("Mirror")(trials) and nothing())
     return names
 
 
 @pytest.mark.parametrize(
-    "launch, launcher, mirrors",
+    "launch, launchers",
     [
-        (LOCAL | {"name": "serial"}, "run_serial", 1),
-        (LOCAL, "run_local", 1),
-        (SLURM, "run_slurm", 0),
+        (LOCAL | {"name": "serial"}, ["Mirror", "run_serial"]),
+        (LOCAL, ["Mirror", "run_local"]),
+        (SLURM, ["run_slurm"]),
     ],
 )
 def test_unfinished_trials_go_to_their_launcher_once_checked_and_planned(
-    tmp_path, monkeypatch, called, launch, launcher, mirrors
+    tmp_path, monkeypatch, called, launch, launchers
 ):
     runs = tmp_path / "runs"
     declaring = {"eval": {"primary": "psnr"}}
@@ -69,15 +68,18 @@ def test_unfinished_trials_go_to_their_launcher_once_checked_and_planned(
     done, failed = run_batch([one, two, two])
     assert (done.folder, done.status, done.message) == (one.folder, "done", "psnr 20.5")
     assert (failed.folder, failed.status) == (two.folder, "failed")
-    assert called == [("check_parts", [1], 0, launch is not SLURM), (launcher, [1], mirrors)]
+    assert called == [
+        ("check_parts", [1], launch is not SLURM),
+        *[(name, [1]) for name in launchers],
+    ]
     assert set(read_history(runs / "x").planned) == {one.folder, two.folder}
     assert not left.exists()
     called.clear()
     run_batch([one])
     begin([one, two])
     assert called == [
-        ("check_parts", [], 0, launch is not SLURM),
-        ("check_parts", [1], 0, launch is not SLURM),
+        ("check_parts", [], launch is not SLURM),
+        ("check_parts", [1], launch is not SLURM),
     ]
 
 
@@ -169,8 +171,8 @@ def test_weights_are_searched_once_for_equal_options(monkeypatch):
 
     parts = SimpleNamespace(make_evaluator=make_evaluator)
     monkeypatch.setitem(sys.modules, "gsbench.pipeline.parts", parts)
-    dry_run._unavailable_now.cache_clear()
+    estimates._unavailable_now.cache_clear()
     for flip in (False, True, False):
-        assert dry_run.unavailable_now({"flip": flip}) == ["lpips_vgg"]
+        assert estimates.unavailable_now({"flip": flip}) == ["lpips_vgg"]
     assert [options.flip for options in asked] == [False, True]
-    dry_run._unavailable_now.cache_clear()
+    estimates._unavailable_now.cache_clear()

@@ -8,7 +8,7 @@ import pytest
 
 from gsbench.cli import run
 from gsbench.errors import InputError
-from gsbench.launch.progress import _seconds_left, progress_frame
+from gsbench.launch.estimates import _seconds_left, progress_frame
 from gsbench.launch.states import TrialState
 from gsbench.system.locks import hold
 from tests.helpers import write, write_lines
@@ -61,11 +61,9 @@ def test_an_arm_of_several_settings_is_named_with_their_values(tmp_path, planned
         words = {folder: ["densify=adc", "seed=0"] for folder in folders}
         words |= {folder: [*own, "densify.start=7"] for folder, own in words.items()}
         words[other] = split("densify=adc seed=0 +densify.start=5")
-        trials = {
-            "/".join(folder.parts[-3:]): {"overrides": own, "cwd": ".", "time": 0.0}
-            for folder, own in words.items()
-        }
-        write(tmp_path / "swept/plan.json", {"trials": trials})
+        trials = {"/".join(place.parts[-3:]): {"words": own} for place, own in words.items()}
+        command = {"words": [], "cwd": ".", "time": 0.0, "trials": trials}
+        write_lines(tmp_path / "swept/commands.jsonl", [command])
         arms = ["a_init-adc[start=7]", "a_init-adc[start=5]"]
     frame = progress_frame(tmp_path, "swept")
     assert dict(frame["waiting"]) == {arms[0]: 2, arms[1]: 1, "a_init-mcmc": 1}

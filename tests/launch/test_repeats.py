@@ -12,7 +12,6 @@ from gsbench.runs.layout import BUILDING, CURVES, FAILED
 from tests.helpers import write, write_lines
 from tests.trials import bare_trial
 
-MIRROR = SimpleNamespace(follow=lambda *_: None, trial_ended=lambda: None)
 SERIAL = {"name": "serial", "parallel": 1, "wait": True}
 
 
@@ -35,7 +34,7 @@ def started(monkeypatch, trials, error, stage="train", step=0, bad=lambda trial:
         return SimpleNamespace(metrics_line="psnr 1")
 
     monkeypatch.setattr("gsbench.pipeline.trial.run_trial", run_trial)
-    outcomes = jobs.run_serial(trials, MIRROR)
+    outcomes = jobs.run_serial(trials)
     assert [one.folder for one in outcomes] == [one.folder for one in trials]
     return began, outcomes
 
@@ -82,4 +81,4 @@ def test_the_longest_setting_that_a_message_names_is_meant():
     values = {"densify": {"split": 1, "split_size": 2}, "scene": {"path": "x"}}
     assert setting_in("densify.split_size=2 and scene.path", values) == "densify.split_size"
     assert setting_in("densify.nothing", values) == ""
-    assert run_serial([], MIRROR) == []
+    assert run_serial([]) == []

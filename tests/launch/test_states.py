@@ -10,7 +10,7 @@ import pytest
 
 from gsbench.config.compose import Trial
 from gsbench.launch import states
-from gsbench.launch.dry_run import FinishedTrials, describe_plan
+from gsbench.launch.estimates import FinishedTrials, describe_plan
 from gsbench.launch.record import record, remove
 from gsbench.launch.states import (
     QueuedJob,

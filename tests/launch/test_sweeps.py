@@ -16,9 +16,9 @@ from gsbench.config.compose import compose_one
 from gsbench.config.groups import options
 from gsbench.config.permissions import check_target
 from gsbench.files import DiskFullError
-from gsbench.launch import dry_run, jobs
+from gsbench.launch import estimates, jobs
 from gsbench.launch.batch import run_batch
-from gsbench.launch.dry_run import FinishedTrials, describe_plan
+from gsbench.launch.estimates import FinishedTrials, describe_plan
 from gsbench.launch.outcomes import Outcome
 from gsbench.launch.record import record
 from gsbench.launch.states import states_of_experiment
@@ -30,8 +30,7 @@ from gsbench.runs.store import Store
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import BusyError, hold
 from tests.composed import composed
-from tests.helpers import read_json, refusal, write
-from tests.runs.test_trial_folder import edit
+from tests.helpers import refusal, write
 from tests.trials import bare_trial, record_of
 
 pytestmark = pytest.mark.usefixtures("runs")
@@ -41,10 +40,6 @@ def trial_values(*words):
     """A configuration in this test's runs folder."""
     (trial,) = composed(words)
     return trial.values
-
-
-def why_not_done(values):
-    return TrialFolder.of(values).why_not_done(values)
 
 
 def finish(values, seconds=100.0, awaited=()):
@@ -182,47 +177,6 @@ def test_own_and_allowed_targets_pass():
 # ---- finished trials
 
 
-def test_finished_trial_is_recognised_until_something_changes(runs):
-    values = trial_values()
-    assert str(why_not_done(values)) == "results.json is not there, or not complete"
-    results = finish(values)
-    assert why_not_done(values) is None
-    assert TrialFolder.of(values).record() == results
-    assert TrialFolder.of(values).state() == "done"
-    assert why_not_done(trial_values("seed=1"))
-
-
-def drop_inputs(home, folder):
-    values = read_json(folder / "results.json")
-    del values["made_of"]
-    write(folder / "results.json", values)
-
-
-CHANGES = {
-    "photos/a.jpg has changed": lambda home, folder: write(home / "photos/a.jpg", b"other"),
-    "table.csv has changed": lambda home, folder: edit(folder / "table.csv", "a,b", "a,c"),
-    "stage train in the store is damaged or gone (model differs": lambda home, folder: write(
-        next(home.glob("runs/store/train/*/model")), "n"
-    ),
-    "results.json was changed after it was written": lambda home, folder: edit(
-        folder / "results.json", "20.5", "30.5"
-    ),
-    "results.json does not say what it was made of": drop_inputs,
-    "results.json is not JSON": lambda home, folder: write(folder / "results.json", "{"),
-}
-
-
-@pytest.mark.parametrize("reason", CHANGES)
-def test_changes_are_noticed_and_named(reason, runs):
-    """Others are in tests/runs/test_trial_folder.py."""
-    values = trial_values()
-    finish(values)
-    CHANGES[reason](runs.parent, TrialFolder.of(values).path)
-    said = str(why_not_done(values))
-    assert reason in said
-    assert "\n" not in said
-
-
 def test_a_dry_run_says_what_has_changed(runs):
     values = trial_values()
     finish(values)
@@ -249,7 +203,7 @@ def test_a_dry_run_checks_only_what_can_be_computed_now(runs, monkeypatch, missi
         assert not options["download"]  # a dry run downloads nothing
         return missing
 
-    monkeypatch.setattr(dry_run, "unavailable_now", unavailable)
+    monkeypatch.setattr(estimates, "unavailable_now", unavailable)
     values = trial_values()
     finish(values, awaited=["lpips_squeeze"])
     line = describe_plan([replace(composed([])[0], values=values)])[0]
@@ -316,7 +270,7 @@ def fake_trial(monkeypatch):
     behaviour = {}
     order = []
 
-    def run_one(trial, mirror, wait):
+    def run_one(trial, wait):
         seed = trial.values["seed"]
         error = behaviour.get(seed)
         if isinstance(error, BusyError) and not wait:
@@ -373,13 +327,13 @@ def test_full_disk_ends_the_sweep(fake_trial):
 @pytest.mark.parametrize("number", [errno.EFBIG, errno.ENOLCK, errno.EROFS])
 def test_verbs_that_write_report_storage_errors_in_one_line(number, runs, monkeypatch, refused):
     def refuse(*arguments):
-        raise OSError(number, os.strerror(number), str(runs / "x/plan.json"))
+        raise OSError(number, os.strerror(number), str(runs / "x/commands.jsonl"))
 
     record([bare_trial(runs, words=["seed=0"])], asks=False)
     monkeypatch.setattr("gsbench.runs.commands.append", refuse)
     said = refused("status", "x", "--forget")
     assert len(said.splitlines()) == 1
-    assert "plan.json" in said
+    assert "commands.jsonl" in said
 
 
 def test_finished_trials_are_found_in_a_read_only_folder(runs, monkeypatch):

@@ -72,6 +72,10 @@ def test_a_trial_runs_unless_it_is_done_and_one_process_at_a_time(tmp_path, monk
             *(TrainingError, "device=cuda has no memory left: ", False),
         ),
         (RuntimeError("No space left"), DiskFullError, "the disk of ", False),
+        *[
+            (SystemExit(code), TrainingError, "code of the trial ended the process", False)
+            for code in (0, None, 3, "text")
+        ],
     ],
 )
 def test_a_failure_is_recorded_and_raised(tmp_path, monkeypatch, error, kind, message, bad_input):

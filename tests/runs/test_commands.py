@@ -18,7 +18,7 @@ from gsbench.runs.commands import (
     remember_result,
 )
 from gsbench.runs.experiments import Arm
-from tests.helpers import refusal, write
+from tests.helpers import refusal
 
 FOLDER = "garden/sfm-mine/c0ffee00-seed0"
 MINE = "sfm-mine/c0ffee00"
@@ -140,13 +140,6 @@ def test_questions_cover_what_lies_within_them(home, file):
     assert not within.covers(QUESTION)
     for changed in ({"metric": "ssim"}, {"digests": {"garden": ("sfm-adc/c0ffee00", "x")}}):
         assert not QUESTION.covers(replace(within, **changed))
-
-
-def test_a_plan_of_an_earlier_version_is_read(home):
-    home.mkdir(parents=True)
-    old = {"overrides": ["densify=mine"], "cwd": "/old", "time": 1.0}
-    write(home / "plan.json", {"trials": {FOLDER: old}})
-    assert read_history(home).planned[home / FOLDER].words == ("densify=mine",)
 
 
 def test_code_as_released_has_no_digest():

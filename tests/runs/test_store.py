@@ -41,16 +41,6 @@ def store(tmp_path):
     return Store(tmp_path / "store")
 
 
-def test_a_second_request_is_not_built(store):
-    first = store.get(BUILD)
-    second = store.get(FOUND)
-    assert not first.cached
-    assert second.cached
-    assert second.path == first.path
-    assert (second.path / "a.txt").read_text() == "alpha"
-    assert second.seconds == first.seconds
-
-
 def test_a_result_that_edited_code_may_have_built_is_not_kept(store):
     def changed():
         raise InputError("the code was edited meanwhile")

@@ -283,5 +283,13 @@ def test_a_missing_metric_that_can_be_computed_now_is_a_reason_to_run(trial):
         "it lacks lpips_vgg, which can be computed now",
         "it lacks lpips_vgg, flip",
     ]
-    (trial / "results.json").unlink()
-    assert str(folder.why_not_done(values)) == "results.json is not there, or not complete"
+    content = read_json(trial / "results.json")
+    del content["made_of"]
+    for found, reason in (
+        (content, "results.json does not say what it was made of"),
+        (content | {"seed": "0"}, "results.json is damaged: seed is '0'"),
+        ("{", "results.json is not JSON"),
+        (content | {"status": "running"}, "results.json is not there, or not complete"),
+    ):
+        write(trial / "results.json", found)
+        assert str(folder.why_not_done(values)).startswith(reason)

@@ -26,7 +26,7 @@ STARTS = {
     ("system/isolate.py", "_run_child", "subprocess.Popen"): "current",
     ("system/isolate.py", "continue_in_child", "os.fork"): "current",
     ("system/programs.py", "answer_of", "subprocess.run"): "neutral",
-    ("tracking/beside.py", "_started", "subprocess.Popen"): "current",
+    ("tracking/beside.py", "_start", "subprocess.Popen"): "current",
     ("verbs/servers.py", "serve", "subprocess.Popen"): "own",
     ("view/page.py", "write_page", "subprocess.run"): "own",
 }

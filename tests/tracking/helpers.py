@@ -6,6 +6,7 @@ import sys
 from contextlib import contextmanager
 from hashlib import sha256
 from pathlib import Path
+from types import SimpleNamespace
 
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import hold
@@ -38,8 +39,10 @@ def begin_trial(values, uri=None, patience=200.0, **more):
 @contextmanager
 def following(settings, folder):
     """Mirror the trial in ``folder``, which runs while the block does."""
-    with Mirror() as beside, hold(folder / ".lock", "a trial"):
-        beside.follow(folder, read_json(folder / "config.yaml") | {"tracking": settings})
+    values = read_json(folder / "config.yaml") | {"tracking": settings}
+    trial = SimpleNamespace(values=values, folder=folder, files=TrialFolder(folder))
+    with Mirror([trial]), hold(folder / ".lock", "a trial"):
+        write(folder / "config.yaml", values)
         yield
 
 

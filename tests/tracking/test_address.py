@@ -50,16 +50,6 @@ def test_sync_sends_nothing_to_a_tracker_that_was_not_typed(kind, tmp_path, monk
         assert target.is_file()
 
 
-def test_sync_asks_for_an_address_also_where_tracking_was_off(tmp_path, monkeypatch, capfd):
-    address = "http://127.0.0.1:9"
-    ended_trial(tmp_path, name="theirs", uri=address, enabled=False)
-    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path))
-    monkeypatch.delenv(VARIABLE, raising=False)
-    assert run(["sync", "theirs"]) == 0
-    said = capfd.readouterr().out
-    assert f"names the tracker {address}, and --uri {address} was not typed" in said
-
-
 @pytest.mark.parametrize("lacking", ["scene", "densify", "tracking"])
 def test_sync_leaves_out_a_trial_whose_configuration_lacks_a_group(
     lacking, tmp_path, monkeypatch, capfd

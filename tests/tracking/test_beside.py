@@ -2,6 +2,7 @@
 
 import json
 import logging
+import os
 import subprocess
 import sys
 import time
@@ -11,8 +12,9 @@ import pytest
 
 from gsbench.system.locks import hold
 from gsbench.tracking import Mirror, beside, connect
-from gsbench.tracking.beside import SOON, permissions, send_beside
+from gsbench.tracking.beside import permissions, send_beside
 from gsbench.tracking.sync import MirrorError
+from tests.helpers import write
 from tests.tracking.helpers import (
     STATE,
     begun_trial,
@@ -24,6 +26,7 @@ from tests.tracking.helpers import (
     write_trial,
 )
 from tests.tracking.servers import Listener
+from tests.trials import bare_trial
 
 
 class Process:
@@ -38,12 +41,11 @@ class Process:
         self.made.append(self)
         how["stderr"].write(self.said)
 
-    def fileno(self):
-        return sys.stderr.fileno()
-
     def write(self, content):
-        self.told += content.decode().splitlines(keepends=True)
-        return len(content)
+        self.told.append(json.loads(content))
+
+    def flush(self):
+        pass
 
     def poll(self):
         return self.returncode
@@ -55,7 +57,7 @@ class Process:
         self.returncode = self.code
 
     def close(self):
-        self.told.append("")
+        self.told.append("the end")
 
     def kill(self):
         self.killed = True
@@ -65,63 +67,53 @@ class Process:
 def processes(monkeypatch):
     monkeypatch.setattr(Process, "made", [], raising=False)
     monkeypatch.setattr(beside.subprocess, "Popen", Process)
-    monkeypatch.setattr(beside.os, "set_blocking", lambda descriptor, blocks: None)
     return Process.made
 
 
-def configured(values, uri=None, patience=30.0, **more):
-    return values | {"tracking": options(uri, patience) | more}
-
-
-def followed(mirror, runs, seed=0, **more):
-    """Let the mirror follow a new trial."""
-    folder, values = begun_trial(runs, seed)
-    mirror.follow(folder, configured(values, **more))
-
-
-def seeds_in(lines):
-    """The seeds of the trials that lines name, and the other lines as they are."""
-    return [json.loads(line)["folder"][-1] if len(line) > 1 else line for line in lines]
+def tracked(runs, seed=0, uri=None, patience=30.0, **more):
+    """A trial with a tracker."""
+    return bare_trial(runs, seed, tracking=options(uri, patience) | more)
 
 
 def warnings_in(caplog):
     return [one.getMessage() for one in caplog.records if one.levelno == logging.WARNING]
 
 
-def test_one_process_is_told_which_trials_begin_and_that_one_ended(processes, tmp_path):
-    with Mirror() as mirror:
-        for seed in (0, 1):
-            followed(mirror, tmp_path, seed, patience=2.5)
-            mirror.trial_ended()
+def test_one_process_is_told_which_trials_are_to_be_sent(processes, tmp_path):
+    trials = [tracked(tmp_path, seed, patience=2.5) for seed in (0, 1)]
+    write(trials[0].folder / "results.json", "of an earlier command")
+    with Mirror([*trials, tracked(tmp_path, 2, enabled=False)]):
+        ((told,),) = [process.told for process in processes]
+        assert [*told["trials"]] == [str(one.folder) for one in trials]
+        assert [[stamp > 0 for stamp in one] for one in told["trials"].values()] == [
+            [False, True, False],
+            [False] * 3,
+        ]
+        assert (told["pause"], told["allowed"]) == (0.2, [])
     (process,) = processes
-    assert seeds_in(process.told) == [SOON, "0", SOON, SOON, "1", SOON, ""][1:]
+    assert process.told[1:] == ["the end"]
     assert process.how["env"]["GSBENCH_RUNS"] == str(tmp_path)
     assert process.command[1:] == ["-P", "-m", "gsbench", "sync", "--beside=2.5"]
 
 
-def test_a_process_that_crashed_is_replaced_and_told_all(processes, tmp_path, caplog):
-    with Mirror() as mirror:
-        followed(mirror, tmp_path, 0)
+@pytest.mark.parametrize("soon", [True, False])
+def test_a_process_that_crashed_is_replaced_and_told_all(
+    processes, tmp_path, monkeypatch, caplog, soon
+):
+    if soon:
+        monkeypatch.setattr(beside, "SECONDS_BETWEEN_STARTS", 0.01)
+    with Mirror([tracked(tmp_path)]):
         processes[0].returncode = -9
-        followed(mirror, tmp_path, 1)
-    assert seeds_in(processes[1].told) == ["0", "1", SOON, ""]
+        wait_until(lambda: len(processes) == 1 + soon)
+    assert len(processes) == 2
+    assert processes[1].told == [*processes[0].told, "the end"]
     assert warnings_in(caplog) == []
 
 
-def test_a_process_that_reads_nothing_holds_up_no_trial(processes, tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr(Process, "write", lambda self, line: None)  # the pipe is full
-    with Mirror() as mirror:
-        followed(mirror, tmp_path)
-    assert warnings_in(caplog)[0].startswith("tracking: the tracker is slow")
-
-
-@pytest.mark.parametrize(
-    "settings, idle", [({"enabled": False}, False), ({}, True)], ids=["tracking=none", "idle"]
-)
-def test_nothing_is_started_where_nothing_is_to_be_sent(processes, tmp_path, settings, idle):
-    with Mirror(idle) as mirror:
-        followed(mirror, tmp_path, **settings)
-        mirror.trial_ended()
+@pytest.mark.parametrize("trials", [0, 1], ids=["none", "tracking=none"])
+def test_nothing_is_started_where_nothing_is_to_be_sent(processes, tmp_path, trials):
+    with Mirror([tracked(tmp_path, enabled=False)] * trials):
+        pass
     assert processes == []
 
 
@@ -133,8 +125,7 @@ def test_a_slow_tracker_gets_its_patience_and_less_if_the_sweep_is_stopped(
     monkeypatch.setattr(beside, "SECONDS_TO_STOP", 0.1)
 
     def sweep():
-        with Mirror() as mirror:
-            followed(mirror, tmp_path, patience=0.3)
+        with Mirror([tracked(tmp_path, patience=0.3)]):
             if error is not None:
                 raise error
 
@@ -158,8 +149,8 @@ def test_a_failure_is_reported_once_in_one_line(
 ):
     monkeypatch.setattr(Process, "code", code)
     monkeypatch.setattr(Process, "said", said)
-    with Mirror() as mirror:
-        followed(mirror, tmp_path)
+    with Mirror([tracked(tmp_path)]):
+        pass
     (line,) = warnings_in(caplog)
     assert line.startswith("tracking: ")
     assert words in line
@@ -170,16 +161,17 @@ def test_a_process_that_cannot_start_harms_nothing(tmp_path, caplog, monkeypatch
         raise OSError("no more processes")
 
     monkeypatch.setattr(beside.subprocess, "Popen", fail)
-    with Mirror() as mirror:
-        followed(mirror, tmp_path)
+    with Mirror([tracked(tmp_path)]):
+        pass
     assert "tracking: no more processes; the files are complete" in caplog.text
 
 
 def test_the_process_gets_what_the_command_was_allowed_and_no_more(tmp_path):
-    _, values = begun_trial(tmp_path)
-    assert permissions(configured(values)) == []
-    given = configured(values, "http://a:1") | {"allow_targets": ["mine", "http://a:1"]}
-    assert permissions(given) == ["mine", "http://a:1"]
+    values = tracked(tmp_path).values
+    assert permissions([values]) == []
+    more = {"allow_targets": ["mine", "http://a:1"], "tracking": options("http://a:1")}
+    given = values | more
+    assert permissions([given, values, given]) == ["mine", "http://a:1"]
 
 
 # ---- what the process sends
@@ -195,56 +187,70 @@ def sent(monkeypatch):
         return []
 
     monkeypatch.setattr(beside, "sync", send)
-    monkeypatch.setattr(beside, "SECONDS_BETWEEN_SENDS", 0.01)
+    monkeypatch.setattr(beside, "SECONDS_BETWEEN_LOOKS", 0.01)
     return found
 
 
-def told(folder, pause=60.0, since=None):
-    now = time.time() if since is None else since
-    return json.dumps({"folder": str(folder), "since": now, "pause": pause, "allowed": []}) + "\n"
+def told(folders, pause=60.0):
+    trials = {str(folder): beside._stamps(folder) for folder in folders}
+    return json.dumps({"trials": trials, "pause": pause, "allowed": []}) + "\n"
+
+
+def wait_until(condition):
+    deadline = time.monotonic() + 60
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
 
 
 FOR_EVER = 1e6
 
 
-def test_each_trial_is_sent_until_it_has_ended(sent, tmp_path):
-    def lines():
-        for seed in (0, 1):
-            folder, values = begun_trial(tmp_path, seed)
-            yield told(folder)
-            if seed == 0:
-                write_trial(folder, values)
-            count = len(sent)
-            yield SOON
-            while len(sent) <= count:
-                time.sleep(0.01)
+def test_a_trial_is_sent_from_its_beginning_to_its_end_and_at_once_when_it_ends(sent, tmp_path):
+    trials = [tracked(tmp_path, seed) for seed in range(3)]
 
+    def lines():
+        yield told([one.folder for one in trials])
+        for one, seed in zip(trials, "01", strict=False):
+            with hold(one.folder / ".lock", "a trial"):
+                write(one.folder / "config.yaml", one.values)
+                write_trial(one.folder, one.values)
+                wait_until(lambda seed=seed: [seed] in sent)
+                time.sleep(0.1)  # as long as it works, it goes on
+            wait_until(lambda seed=seed: sent.count([seed]) == 2)
+        write(trials[2].folder / "config.yaml", trials[2].values)
+
+    for one in trials:
+        one.folder.mkdir(parents=True)
     send_beside(lines(), FOR_EVER)
-    assert [one for one in sent if one] == [["0"], ["1"], ["1"]]
+    assert sent[:4] == [["0"], ["0"], ["1"], ["1"]]
+    assert {*map(tuple, sent[4:])} == {("2",)}
 
 
 def test_trials_are_sent_every_while_although_none_ends(sent, tmp_path):
+    one = tracked(tmp_path)
+
     def lines():
-        yield told(begun_trial(tmp_path)[0], pause=0.02)
-        while sent.count(["0"]) < 3:
-            time.sleep(0.01)
+        yield told([one.folder], pause=0.02)
+        write(one.folder / "config.yaml", one.values)
+        wait_until(lambda: sent.count(["0"]) > 2)
 
     send_beside(lines(), FOR_EVER)
 
 
-def test_results_of_an_earlier_run_do_not_end_the_sending_of_a_trial(sent, tmp_path):
+def test_a_trial_that_runs_again_is_sent_although_it_has_results_of_an_earlier_run(sent, tmp_path):
     folder, values = begun_trial(tmp_path)
     write_trial(folder, values)
+    earlier = told([folder])
 
     def lines():
-        yield told(folder, since=time.time() + 60)
-        yield SOON
-        while not sent:
-            time.sleep(0.01)
+        yield earlier
+        time.sleep(0.1)
+        assert sent == []
+        os.utime(folder / "config.yaml")
 
     send_beside(lines(), FOR_EVER)
-    assert len(sent) > 1
-    assert sent[-1] == ["0"]
+    assert {*map(tuple, sent)} == {("0",)}
 
 
 def test_the_error_of_the_last_send_is_raised_and_those_before_are_not(monkeypatch, tmp_path):
@@ -255,13 +261,11 @@ def test_the_error_of_the_last_send_is_raised_and_those_before_are_not(monkeypat
         raise MirrorError(f"no {len(answers)}")
 
     monkeypatch.setattr(beside, "sync", refuse)
-    monkeypatch.setattr(beside, "SECONDS_BETWEEN_SENDS", 0.01)
-    folder, _ = begun_trial(tmp_path)
+    monkeypatch.setattr(beside, "SECONDS_BETWEEN_LOOKS", 0.01)
 
     def lines():
-        yield told(folder, pause=0.02)
-        while len(answers) < 2:
-            time.sleep(0.01)
+        yield told([tracked(tmp_path).folder], pause=0.02)
+        wait_until(lambda: len(answers) >= 2)
 
     with pytest.raises(MirrorError) as error:
         send_beside(lines(), FOR_EVER)
@@ -321,7 +325,7 @@ def test_a_process_whose_sweep_was_killed_ends_soon_though_its_tracker_hangs(tmp
     code += "beside.sync = lambda *given: time.sleep(600); beside.send_beside(sys.stdin, 0.5)"
     words = [sys.executable, "-c", code]
     with subprocess.Popen(words, env=child_environment(), stdin=subprocess.PIPE) as child:
-        child.stdin.write(told(folder, pause=0.1).encode())
+        child.stdin.write(told([folder], pause=0.1).encode())
         child.stdin.flush()
         with pytest.raises(subprocess.TimeoutExpired):
             child.wait(10)
@@ -332,9 +336,8 @@ def test_a_process_whose_sweep_was_killed_ends_soon_though_its_tracker_hangs(tmp
 @pytest.mark.slow
 def test_a_trial_whose_lock_another_holds_is_left_alone(runs):
     folder, values = begun_trial(runs, seed=6)
-    write_trial(folder, values)
-    with hold(folder / ".mlflow.lock", "mirroring"), Mirror() as mirror:
-        mirror.follow(folder, configured(values))
+    with hold(folder / ".mlflow.lock", "mirroring"), following(options(), folder):
+        write_trial(folder, values)
     assert not [
         run
         for run in found_runs(connect(None, runs), "tracked")

@@ -306,6 +306,8 @@ def test_a_failure_is_shown_with_its_reason_until_the_trial_succeeds(shown):
     run = shown.one()
     assert run["status"] == ("FAILED", "the loss became nan")
     assert run["files"] is None or run["files"] >= {"config.yaml", "failed.json"}
+    assert not shown.mirror(folder, values)
+    assert shown.one() == run
     (folder / "failed.json").unlink()
     check_one(shown, finished(shown.runs))
 

@@ -4,12 +4,10 @@ import subprocess
 import sys
 import threading
 import time
-from pathlib import Path
 from shlex import split
 
 import pytest
 from numpy.testing import assert_allclose
-from PIL import Image
 
 from gsbench.analysis.comparison import compare
 from gsbench.analysis.results import read_experiment
@@ -23,12 +21,8 @@ from tests.processes import bytes_written
 from tests.tracking.helpers import (
     begin_trial,
     child_environment,
-    ended_trial,
     found_runs,
     free_port,
-    mirror_trial,
-    options,
-    run_of,
     write_trial,
 )
 from tests.trials import trial_values
@@ -164,25 +158,6 @@ def test_a_killed_process_leaves_no_incomplete_database(tmp_path):
     assert not (tmp_path / "mlflow.db").exists()
     assert connect(None, tmp_path).search_experiments()
     assert (tmp_path / "mlflow.db").exists()
-
-
-@pytest.mark.slow
-def test_portrait_and_landscape_pictures_keep_their_sizes(runs):
-    folder, values = ended_trial(runs, seed=2000)
-    sizes = {"a": (8, 4), "b": (4, 8)}
-    for kind in ("renders", "ground_truth"):
-        (folder / kind).mkdir()
-        for name, size in sizes.items():
-            Image.new("RGB", size).save(folder / f"{kind}/{name}.png")
-    assert mirror_trial(options(), folder, values)
-    client = connect(None, runs)
-    run = run_of(client, 2000)
-    paths = [item.path for item in client.list_artifacts(run.info.run_id, "images")]
-    names = [path for path in paths if path.endswith(".png")]
-    assert len(names) == 6
-    for name in names:
-        with Image.open(client.download_artifacts(run.info.run_id, name)) as image:
-            assert image.size == sizes[Path(name).name[0]]
 
 
 @pytest.mark.slow

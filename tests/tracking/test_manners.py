@@ -85,28 +85,27 @@ def test_a_moved_runs_folder_is_mirrored_again_from_its_files(runs, tmp_path):
 JOBS = 8
 
 
-def run_jobs(runs, uri):
-    """Run eight trials at once, each in its own process, all new to the tracker."""
-    commands = [mirror_command(runs, uri, seed) for seed in range(JOBS)]
+@pytest.mark.parametrize("kind", ["sqlite", "postgresql"])
+def test_eight_jobs_at_once_on_a_new_database(kind, tmp_path, request):
+    """Each is a process that mirrors its trial, which is new to the tracker."""
+    uri = None if kind == "sqlite" else request.getfixturevalue("postgresql")
     jobs = [
         subprocess.Popen(
-            command,
+            mirror_command(tmp_path, uri, seed),
             env=child_environment(),
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
         )
-        for command in commands
+        for seed in range(JOBS)
     ]
     outputs = [job.communicate(timeout=240)[0] for job in jobs]
     assert [job.returncode for job in jobs] == [0] * JOBS, outputs
     # A loaded machine may be too slow to send the last values of some; sync sends them.
     for seed in range(JOBS):
-        values = trial_values(runs, seed)
+        values = trial_values(tmp_path, seed)
         mirror_trial(options(uri), TrialFolder.of(values).path, values)
-
-
-def check_jobs(client):
+    client = connect(uri, tmp_path)
     found = trial_runs(client)
     assert sorted(run.data.tags["seed"] for run in found) == [str(seed) for seed in range(JOBS)]
     for run in found:
@@ -120,13 +119,3 @@ def check_jobs(client):
     # and one parent run of their idea
     assert len(found_runs(client, "tracked")) == JOBS + 1
     assert found_runs(client, "Default") == []
-
-
-def test_eight_jobs_at_once_on_a_new_sqlite_database(tmp_path):
-    run_jobs(tmp_path, None)
-    check_jobs(connect(None, tmp_path))
-
-
-def test_eight_jobs_at_once_on_a_new_postgresql_database(tmp_path, postgresql):
-    run_jobs(tmp_path, postgresql)
-    check_jobs(connect(postgresql, tmp_path))

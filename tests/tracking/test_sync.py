@@ -9,6 +9,7 @@ from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import hold
 from gsbench.tracking import sync as module
 from gsbench.tracking.sync import MirrorError, mirror, refusal, sync
+from tests.helpers import change_json
 from tests.tracking.helpers import begin_trial, begun_trial, options, write_trial
 from tests.trials import trial_values
 
@@ -73,6 +74,7 @@ def test_sync_sends_ended_trials_and_counts_them(told, tmp_path, monkeypatch):
         begin_trial(trial_values(tmp_path, seed), "http://strange" if seed == 4 else None)
         for seed in range(6)
     )
+    change_json(strange / "config.yaml", tracking=options("http://strange") | {"enabled": False})
     for folder, seed in ((done, 0), (strange, 4), (busy, 5)):
         write_trial(folder, trial_values(tmp_path, seed))
     (damaged / "results.json").write_text("{")

@@ -13,7 +13,7 @@ import pytest
 from gsbench.config.compose import compose_one
 from gsbench.errors import GsbenchError
 from gsbench.launch import states
-from gsbench.launch.progress import SPEED
+from gsbench.launch.estimates import SPEED
 from gsbench.launch.record import record
 from gsbench.launch.states import TrialState
 from gsbench.runs.commands import read_history

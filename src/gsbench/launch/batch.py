@@ -10,7 +10,7 @@ from gsbench.config.groups import options
 from gsbench.config.schema import COMPONENTS
 from gsbench.errors import InputError
 from gsbench.files import FORBIDDEN, checked_runs_folder, make_runs_folder, storage_errors
-from gsbench.launch.dry_run import unavailable_now
+from gsbench.launch.estimates import unavailable_now
 from gsbench.launch.jobs import run_local, run_serial
 from gsbench.launch.outcomes import Outcome, outcome_of_results
 from gsbench.launch.record import asked_metrics, record
@@ -47,8 +47,8 @@ def run_batch(trials: Sequence[Trial], asks: bool = True) -> list[Outcome]:
             outcomes += run_slurm(unfinished)
         elif unfinished:
             run = run_serial if launcher == "serial" else run_local
-            with Mirror() as mirror:
-                outcomes += run(unfinished, mirror)
+            with Mirror(unfinished):
+                outcomes += run(unfinished)
         return outcomes
 
 

@@ -61,7 +61,7 @@ def say_last(outcomes: Sequence[Outcome], labels: Mapping[Path, str]) -> None:
     log.info("%s: %s  (%d of %d)", label, last.message, len(outcomes), len(labels))
 
 
-def run_serial(trials: Sequence[Trial], mirror: Mirror) -> list[Outcome]:
+def run_serial(trials: Sequence[Trial]) -> list[Outcome]:
     """Run the trials in this process, one after the other.
 
     A trial that another process is running comes last, so that two sweeps share the work.
@@ -76,20 +76,19 @@ def run_serial(trials: Sequence[Trial], mirror: Mirror) -> list[Outcome]:
         if len(trials) > 1:
             log.info("%d of %d: %s", number, len(trials), labels[trial.folder])
         try:
-            outcomes.append(run_one(trial, mirror, wait=len(trials) == 1))
+            outcomes.append(run_one(trial, wait=len(trials) == 1))
             repeats.note(trial, outcomes[-1])
         except BusyError as error:
             log.info("%s; later", error)
             busy.append(trial)
-    return outcomes + [run_one(trial, mirror, wait=True) for trial in busy]
+    return outcomes + [run_one(trial, wait=True) for trial in busy]
 
 
-def run_one(trial: Trial, mirror: Mirror, wait: bool) -> Outcome:
-    """Run and mirror one trial.
+def run_one(trial: Trial, wait: bool) -> Outcome:
+    """Run one trial.
 
     Errors become its outcome, except BusyError, DiskFullError, and exceptions that end the program.
     """
-    mirror.follow(trial.folder, trial.values)
     try:
         # imported here, because a finished sweep needs no torch
         from gsbench.pipeline.trial import run_trial
@@ -99,8 +98,6 @@ def run_one(trial: Trial, mirror: Mirror, wait: bool) -> Outcome:
         raise
     except Exception as error:  # noqa: BLE001 - a failed trial does not stop the others
         return outcome_of_error(trial.folder, error)
-    finally:
-        mirror.trial_ended()
 
 
 # ---- processes of this machine
@@ -151,12 +148,12 @@ class TrialJob:
                         assign_gpu(slot, self.visible_gpus)
                 assign_threads(values["threads"], launch["parallel"])
                 # With launch=local, the sweep's own process mirrors all of its trials.
-                mirror = stack.enter_context(Mirror(idle=launch["name"] == "local"))
+                stack.enter_context(Mirror([trial] if launch["name"] == "slurm" else []))
                 if digest_of(values) != self.digest:
                     error = InputError("code changed since the command; give it again")
                     outcome = outcome_of_error(trial.folder, error)
                 else:
-                    outcome = run_one(trial, mirror, wait=True)
+                    outcome = run_one(trial, wait=True)
                 if outcome.status == "failed":
                     # for the job's log: the trial's folder may lack the reason
                     print(outcome.message, file=sys.stderr)
@@ -175,7 +172,7 @@ class TrialJob:
         return DelayedSubmission(self)
 
 
-def run_local(trials: Sequence[Trial], mirror: Mirror) -> list[Outcome]:
+def run_local(trials: Sequence[Trial]) -> list[Outcome]:
     """Run the trials in processes of this machine, ``launch.parallel`` at once, to the end.
 
     If this process is stopped, it stops them; if it is killed, they go on.
@@ -207,12 +204,10 @@ def run_local(trials: Sequence[Trial], mirror: Mirror) -> list[Outcome]:
                     # passes it on below.
                     with interrupts_ignored():
                         running[trial.folder] = trial, executor.submit(TrialJob(trial))
-                    mirror.follow(trial.folder, trial.values)
                 ended = [folder for folder, (_, job) in running.items() if job.done()]
                 for folder in ended:
                     trial, job = running.pop(folder)
                     outcomes.append(collect(job, trial))
-                    mirror.trial_ended()
                     repeats.note(trial, outcomes[-1])
                     say_last(outcomes, labels)
                 done = len(outcomes) + sum(

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 class Kind(NamedTuple):
     """The meaning of a state for the verbs that show and repeat trials."""
 
-    column: str = "waiting"  # of `gsbench.launch.progress.progress_frame`
+    column: str = "waiting"  # of `gsbench.launch.estimates.progress_frame`
     retried: bool = False  # `gsbench retry` runs it again
     freed: bool = False  # `gsbench clean NAME` lets its results go
     lasts: bool = False  # it began, and goes on

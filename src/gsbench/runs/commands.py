@@ -32,13 +32,12 @@ from gsbench.parsing import (
     Text,
     parse_typed,
     read_bytes,
-    read_typed,
 )
 from gsbench.runs.config_hash import config_hash
 from gsbench.runs.experiments import Arm, list_experiments, make_home
 from gsbench.runs.keys import CODE_OF_STAGE
-from gsbench.runs.layout import COMMANDS, PLAN, SEED
-from gsbench.runs.nested import SHOWN, sha256_of
+from gsbench.runs.layout import COMMANDS, SEED
+from gsbench.runs.nested import SHOWN, Values, sha256_of
 from gsbench.runs.package_code import edited, states_of
 from gsbench.runs.trial_record import FROM_RENDERS
 from gsbench.runs.user_code import user_modules
@@ -101,7 +100,7 @@ def code_digest(sources: Mapping[str, str], packages: Mapping[str, str]) -> str:
     return sha256_of([dict(sources), changed])[:SHOWN] if sources or changed else ""
 
 
-def digest_of(values: Mapping[str, Any]) -> Digest:
+def digest_of(values: Values) -> Digest:
     """The digest of a trial with the configuration ``values``, by the code as it is now."""
     arm = f"{values['init']['name']}-{values['densify']['name']}"
     packages = states_of(chain(*CODE_OF_STAGE.values()))
@@ -261,16 +260,6 @@ def command_now(words: Sequence[str] | None = None, **parts: Any) -> Command:
     return Command(words=tuple(own), cwd=os.getcwd(), time=time.time(), **parts)
 
 
-class _OldTrial(Record):
-    overrides: tuple[Raw, ...]
-    cwd: Raw
-    time: Amount
-
-
-class _OldPlan(Record):
-    trials: dict[Folder, _OldTrial]
-
-
 @dataclass(frozen=True)
 class History:
     """All that was asked in an experiment, and what gave results, in order.
@@ -360,10 +349,6 @@ def read_history(home: Path) -> History:
     commands, results, before = list[Command](), set[tuple[Digest, Place]](), ""
     unread, damaged, unlinked = list[str](), list[str](), list[str]()
     try:
-        commands += _of_old_plan(home)
-    except DamagedError as error:
-        unread.append(f"{PLAN} {error.reason}")
-    try:
         lines = _lines(home)
     except DamagedError as error:
         lines = []
@@ -386,23 +371,6 @@ def read_history(home: Path) -> History:
         unread.append(f"{first} (and {counted(len(others), 'more line')})" if others else first)
     faults = tuple(f"{home.name}: {fault}" for fault in unread)
     return History(home, tuple(commands), frozenset(results), faults, before)
-
-
-def _of_old_plan(home: Path) -> list[Command]:
-    """The trials in ``plan.json`` of an earlier gsbench, each as a command of its own."""
-    try:
-        planned = read_typed(home / PLAN, _OldPlan).trials
-    except FileNotFoundError:
-        return []
-    return [
-        Command(
-            words=one.overrides,
-            cwd=one.cwd,
-            time=one.time,
-            trials={name: PlannedTrial(words=one.overrides)},
-        )
-        for name, one in planned.items()
-    ]
 
 
 def _lines(home: Path) -> list[tuple[bytes, Line | DamagedError]]:

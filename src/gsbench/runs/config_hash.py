@@ -3,12 +3,11 @@
 The hash names a trial's folder.
 """
 
-from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
 from gsbench.parsing import table_beside
-from gsbench.runs.nested import GSBENCH, TARGET, flatten, sha256_of
+from gsbench.runs.nested import GSBENCH, TARGET, Values, flatten, sha256_of
 from gsbench.runs.user_code import user_modules
 
 BOOKKEEPING, READING, PLACE = "bookkeeping", "reading", "place"
@@ -54,7 +53,7 @@ def is_of_scene(key: str) -> bool:
     return key in OF_A_SCENE or ("." in key and is_of_scene(key.rpartition(".")[0]))
 
 
-def config_hash(values: Mapping[str, Any]) -> str:
+def config_hash(values: Values) -> str:
     """sha256 of the settings and the user's code that determine a result, without the seed.
 
     Names, devices, folders, tracking and launchers do not change it.
@@ -63,7 +62,7 @@ def config_hash(values: Mapping[str, Any]) -> str:
     return sha256_of(determining_settings(values) | ({"code": modules} if modules else {}))
 
 
-def determining_settings(values: Mapping[str, Any]) -> dict[str, Any]:
+def determining_settings(values: Values) -> dict[str, Any]:
     """The settings among ``values`` that determine a result, without the seed."""
     kept = {key: value for key, value in values.items() if is_hashed(key)}
     for key, group in kept.items():
@@ -77,7 +76,7 @@ def determining_settings(values: Mapping[str, Any]) -> dict[str, Any]:
     return kept
 
 
-def arm_hash(values: Mapping[str, Any]) -> str:
+def arm_hash(values: Values) -> str:
     """sha256 of what an arm is made of: classes and settings, without names, code and evaluation.
 
     Arms of one hash are the same arm, whatever its name, and versions of it if their code differs.

@@ -18,7 +18,7 @@ from gsbench.parsing import DamagedError, read_bytes
 from gsbench.runs import layout
 from gsbench.runs.config_hash import config_hash
 from gsbench.runs.keys import STAGES
-from gsbench.runs.nested import sha256_of
+from gsbench.runs.nested import Values, sha256_of
 from gsbench.runs.package_code import state_of
 from gsbench.runs.store import read_manifest
 from gsbench.runs.trial_files import MadeOf, Stamp
@@ -120,7 +120,7 @@ _digests: dict[Stamp, str] = {}
 def origin_of(
     folder: Path,
     content: Mapping[str, Any],
-    values: Mapping[str, Any],
+    values: Values,
     sources: Iterable[Path],
     entries: Mapping[str, Path],
     published: Iterable[Path],
@@ -151,9 +151,7 @@ def origin_of(
     )
 
 
-def changes(
-    folder: Path, values: Mapping[str, Any], record: TrialRecord, made: MadeOf
-) -> Iterator[Change]:
+def changes(folder: Path, values: Values, record: TrialRecord, made: MadeOf) -> Iterator[Change]:
     """The changes since the complete trial in ``folder`` was made, quickly found ones first.
 
     Files are compared by size and time of change, small files of gsbench's also by content.

@@ -19,7 +19,6 @@ METRICS = "metrics.json"  # of an evaluation
 
 # in an experiment's folder
 COMMANDS = "commands.jsonl"  # all commands, with their trials and questions
-PLAN = "plan.json"  # of earlier versions: the trials of the commands
 # of gsbench 0.1, no longer read: declared questions, and a ledger of ideas
 DECLARED, LEDGER = ASKED_EARLIER = "declared.jsonl", "ledger.jsonl"
 TUNING = "tuning.json"  # of a search: its ranges and points

@@ -5,6 +5,7 @@ import json
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+Values = Mapping[str, Any]  # the resolved configuration of a trial
 TARGET = "_target_"  # the key of a class's import path
 GSBENCH = "gsbench."  # prefix of the import paths of gsbench's own classes
 SHOWN = 8  # characters of a hash in messages

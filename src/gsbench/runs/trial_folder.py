@@ -44,7 +44,7 @@ from gsbench.runs.freshness import (
     damaged_entries,
     origin_of,
 )
-from gsbench.runs.nested import sha256_of
+from gsbench.runs.nested import Values, sha256_of
 from gsbench.runs.trial_files import (
     Building,
     Configuration,
@@ -78,7 +78,7 @@ class TrialFolder:
         self._origin: MadeOf | None = None  # of the results that were read last, if recorded
 
     @classmethod
-    def of(cls, values: Mapping[str, Any]) -> TrialFolder:
+    def of(cls, values: Values) -> TrialFolder:
         """The folder of the trial with the resolved configuration ``values``."""
         runs = Path(values["runs"]).expanduser().resolve()
         arm = f"{values['init']['name']}-{values['densify']['name']}"
@@ -253,7 +253,7 @@ class TrialFolder:
 
     def write_finished(
         self,
-        values: Mapping[str, Any],
+        values: Values,
         record: TrialRecord,
         sources: Iterable[Path] = (),
         entries: Mapping[str, Path] | None = None,
@@ -291,7 +291,7 @@ class TrialFolder:
 
     def why_not_done(
         self,
-        values: Mapping[str, Any],
+        values: Values,
         unavailable_now: Callable[[dict[str, Any]], Collection[str]] | None = None,
     ) -> Change | None:
         """The reason to run or check the trial with the configuration ``values``; None if done.

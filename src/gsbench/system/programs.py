@@ -39,14 +39,11 @@ def protect_environment() -> None:
     if not given:
         return
     here, entries = os.path.abspath(""), given.split(os.pathsep)
-    kept = [os.path.abspath(entry) for entry in entries if not _is_current(entry, here)]
+    places = [(os.path.isabs(entry), os.path.abspath(entry)) for entry in entries]
+    kept = [place for is_typed, place in places if is_typed or place != here]
     os.environ["PYTHONPATH"] = os.pathsep.join(kept)
     if len(kept) < len(entries) and here not in kept:
         sys.path[:] = [entry for entry in sys.path if entry != here]
-
-
-def _is_current(entry: str, here: str) -> bool:
-    return not os.path.isabs(entry) and os.path.abspath(entry) == here
 
 
 def safe_environment() -> dict[str, str]:

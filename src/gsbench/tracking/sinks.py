@@ -23,7 +23,7 @@ class Run(Record):
     id: str | None = None  # what `Sink.open` returned
     described: bool = False  # its settings and tags were sent
     logged: dict[str, Count] = field(default_factory=dict)  # newest iteration sent, by file
-    complete: str | None = None  # hash of the results that were sent
+    complete: str | None = None  # hash of the results that were sent; for a sink, any end
     ended: str | None = None  # how a trial without results had ended when that was sent
 
 

@@ -6,7 +6,7 @@ import os
 import time
 import uuid
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, chdir, nullcontext
+from contextlib import chdir, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ from gsbench.tracking.sinks import Run, Sink
 from gsbench.tracking.trial import TrackedTrial, Update
 from gsbench.words import counted
 
+Tracking = Mapping[str, Any]  # the settings of the group ``tracking``
 OWN = "gsbench.tracking."
 MLFLOW = f"{OWN}MLflow"
 # The settings ``tracking`` that are not options of the tracker's class; configurations of earlier
@@ -34,33 +35,23 @@ MLFLOW = f"{OWN}MLflow"
 NOT_OPTIONS = ("name", "enabled", "flush_seconds", "patience_seconds", "images", "model", "sink")
 
 
-def class_of(options: Mapping[str, Any]) -> str:
-    """The import path of the tracker's class that the settings ``tracking`` name."""
+def class_of(options: Tracking) -> str:
+    """The import path of the tracker's class."""
     return str(options.get("_target_") or MLFLOW)
 
 
-def place_for(options: Mapping[str, Any]) -> AbstractContextManager[str | Path]:
-    """The folder to call a tracker in: an empty one, but a user's own tracker stays here.
-
-    Trackers' clients read settings in the current folder: W&B would take its server's address from
-    a stranger's ``wandb/settings``.
-    """
-    return own_folder() if class_of(options).startswith(GSBENCH) else nullcontext(Path.cwd())
-
-
-def tracker_name(options: Mapping[str, Any]) -> str:
+def tracker_name(options: Tracking) -> str:
     """The tracker's name in messages."""
     return class_of(options).removeprefix(OWN)
 
 
-def make_sink(options: Mapping[str, Any], allowed: Sequence[str]) -> Sink:
-    """The tracker that the settings ``tracking`` describe.
+def make_sink(options: Tracking, allowed: Sequence[str]) -> Sink:
+    """The tracker that the settings describe.
 
     ``allowed`` are the modules whose code may run. Raises InputError naming a wrong setting.
     """
-    own = {key: value for key, value in options.items() if key not in NOT_OPTIONS}
-    if own.get("uri") is None:
-        own.pop("uri", None)
+    left_out = (*NOT_OPTIONS, "uri") if options.get("uri") is None else NOT_OPTIONS
+    own = {key: value for key, value in options.items() if key not in left_out}
     sink: Sink = build("tracking", own | {"_target_": class_of(options)}, list(allowed))
     return sink
 
@@ -94,7 +85,8 @@ def sync(
     the addresses that may get results. Raises MirrorError if the tracker refuses a trial.
     """
     new = already_there = 0
-    pages: Pages = {}
+    # for each experiment and tracker, a trial and its settings
+    pages: dict[tuple[Path, str | None], tuple[TrialFolder, Tracking]] = {}
     for folder in folders:
         state = folder.state()
         if state == "damaged":
@@ -124,7 +116,10 @@ def sync(
             yield f"left out: {folder.label}: {error}"
             continue
         try:
-            with place_for(options) as place, chdir(place):
+            # Trackers' clients read settings in the current folder: W&B would take its server's
+            # address from a stranger's ``wandb/settings``. A user's own tracker stays here.
+            is_own = class_of(options).startswith(GSBENCH)
+            with own_folder() if is_own else nullcontext(Path.cwd()) as place, chdir(place):
                 is_new = mirror(folder, options, values, allowed, live=state == "running")
         except BusyError:
             yield f"{folder.label} is being mirrored by another process"
@@ -146,22 +141,17 @@ def sync(
     yield f"{counted(new, 'trial')} mirrored now, {already_there} before"
 
 
-# for each experiment and tracker, a trial and its settings ``tracking``
-Pages = dict[tuple[Path, str | None], tuple[TrialFolder, dict[str, Any]]]
-
-
 def mirror(
     folder: TrialFolder,
-    options: Mapping[str, Any],
+    options: Tracking,
     values: dict[str, Any],
     allowed: Sequence[str] = (),
     live: bool = False,
 ) -> bool:
     """Send a trial that has ended or (``live``) runs; returns False if the tracker lacks nothing.
 
-    ``options`` are the settings ``tracking``, ``values`` the whole configuration; ``allowed`` are
-    the modules whose code may run. Raises BusyError if another process mirrors the trial, and any
-    error of the tracker.
+    ``values`` are the whole configuration; ``allowed`` are the modules whose code may run. Raises
+    BusyError if another process mirrors the trial, and any error of the tracker.
     """
     folder.require_no_links()
     file = _state_file(folder, options)
@@ -181,13 +171,14 @@ def mirror(
         # Kept before the tracker creates the run, so that the token finds it even if the tracker's
         # answer is lost.
         keep(run)
-        name = sink.open(trial, run)
+        shown = run.complete if live or results else run.ended
+        is_shown = shown == (results or trial.ending())
+        name = sink.open(trial, replace(run, complete=shown if is_shown else None))
         if name != run.id:
-            run = Run(token=run.token, started=run.started, id=name)
+            is_shown, run = False, Run(token=run.token, started=run.started, id=name)
         if not run.described:
             sink.send(Update(params=trial.params(), tags=trial.tags()))
         run = keep(run, described=True)
-        is_shown = run.ended == trial.ending() if results is None else run.complete == results
         if is_shown and not live:
             return False
         for name, newest, scalars in trial.curves(run.logged, live):
@@ -203,7 +194,7 @@ def mirror(
         return True
 
 
-def _ending(trial: TrackedTrial, options: Mapping[str, Any]) -> Update:
+def _ending(trial: TrackedTrial, options: Tracking) -> Update:
     """The end of a trial as its files say: failed, done, else killed."""
     folder = trial.folder
     if folder.has_failed():
@@ -214,14 +205,14 @@ def _ending(trial: TrackedTrial, options: Mapping[str, Any]) -> Update:
     return trial.summary(results, int(options["images"]), bool(options.get("model")))
 
 
-def _state_file(folder: TrialFolder, options: Mapping[str, Any]) -> Path:
+def _state_file(folder: TrialFolder, options: Tracking) -> Path:
     """The file in a trial's folder that says what its tracker has got."""
     name = tracker_name(options)
     own = class_of(options).startswith(OWN)
     return folder.path / f"{name.lower() if own else f'tracker-{name}'}.json"
 
 
-def refusal(folder: TrialFolder, options: Mapping[str, Any], error: BaseException) -> MirrorError:
+def refusal(folder: TrialFolder, options: Tracking, error: BaseException) -> MirrorError:
     """A MirrorError, in one line, for an ``error`` of the tracker's client about a trial."""
     reason = one_line(f"{type(error).__name__}: {error}")
     return MirrorError(f"{folder.label} could not be sent to {tracker_name(options)} ({reason})")

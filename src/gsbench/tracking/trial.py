@@ -181,16 +181,17 @@ class TrackedTrial:
             source = next((file for place in places if (file := place / name).exists()), None)
             rows = [] if source is None else read_rows(source)
             if records := [row for row in rows if row["step"] > logged.get(name, 0)]:
-                yield (
-                    name,
-                    int(records[-1]["step"]),
-                    [
-                        Scalar(names[key], float(value), int(record["step"]), _seconds(record))
-                        for record in records
+                scalars = []
+                for record in records:
+                    step = int(record["step"])
+                    # without a recorded time, one that each reading gives alike
+                    seconds = float(record.get("seconds", step / 1000))
+                    scalars += [
+                        Scalar(names[key], float(value), step, seconds)
                         for key, value in record.items()
                         if key in names
-                    ],
-                )
+                    ]
+                yield name, int(records[-1]["step"]), scalars
 
     def summary(self, results: TrialRecord, images: int, with_model: bool) -> Update:
         """The finished trial with at most ``images`` test views, and its model ``with_model``."""
@@ -254,11 +255,3 @@ class TrackedTrial:
                 error = np.abs(render.astype(np.int16) - truth.astype(np.int16))
                 pictures[picture_key(path.stem, wrong)] = error.astype(np.uint8)
         return pictures
-
-
-def _seconds(record: Mapping[str, float]) -> float:
-    """The training time of a record.
-
-    For a record without a time it is computed from the iteration, so that each reading agrees.
-    """
-    return float(record.get("seconds", record["step"] / 1000))

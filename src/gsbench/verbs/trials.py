@@ -22,8 +22,7 @@ from gsbench.config.compose import Trial, compose_one
 from gsbench.config.overrides import changed_words, key_of
 from gsbench.errors import InputError
 from gsbench.files import checked_runs_folder, make_runs_folder
-from gsbench.launch.dry_run import describe_plan
-from gsbench.launch.progress import SPEED, progress_frame
+from gsbench.launch.estimates import SPEED, describe_plan, progress_frame
 from gsbench.launch.record import check_looks, check_questions, planned_rows, record, remove
 from gsbench.launch.states import (
     STATES,

@@ -1,30 +1,46 @@
-"""The listing of a dry run: each trial with its state, and the time left. Loads no torch."""
+"""Estimates of time: the listing of a dry run, and the progress of a sweep. Loads no torch."""
 
 from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from functools import cache
+from itertools import islice
 from pathlib import Path
 from statistics import fmean
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from gsbench.analysis.results import TrialResult, read_experiment
 from gsbench.config.compose import Trial
 from gsbench.errors import InputError
-from gsbench.launch.states import ask_queue, labels_of, state_in_queue, summary_of
+from gsbench.launch.states import (
+    STATES,
+    TrialState,
+    arm_names,
+    ask_queue,
+    labels_of,
+    state_in_queue,
+    states_of_experiment,
+    summary_of,
+)
 from gsbench.parsing import DamagedError
-from gsbench.runs.layout import RESULTS, TRIAL_GLOB
-from gsbench.runs.nested import sha256_of
+from gsbench.runs.experiments import experiment_home
+from gsbench.runs.layout import CURVES, RESULTS, TRIAL_GLOB
+from gsbench.runs.nested import Values, sha256_of
+from gsbench.runs.trial_files import read_rows
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.scene.images import image_size
 from gsbench.scene.names import IMAGE_SUFFIXES
 from gsbench.scene.options import downscaled_size
 from gsbench.system.resources import available_threads, installed_gpus
 from gsbench.words import counted, readable_time
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 class FinishedTrials:
@@ -56,7 +72,7 @@ class FinishedTrials:
         )
         return next((folder.relative_to(trial.runs).parts[0] for folder in others), None)
 
-    def estimate(self, values: Mapping[str, Any]) -> tuple[float, int]:
+    def estimate(self, values: Values) -> tuple[float, int]:
         """Seconds for the trial with ``values``, and the number of trials that this rests on.
 
         These trials have the same scene at the same size, the same rasterizer and, if possible, the
@@ -68,7 +84,7 @@ class FinishedTrials:
         return 0.0, 0
 
 
-def _similarities(settings: Mapping[str, Any]) -> tuple[str, str]:
+def _similarities(settings: Values) -> tuple[str, str]:
     """Hashes of scene, rasterizer and densifier, and of scene and rasterizer.
 
     Trials that share one of them take similar times.
@@ -162,7 +178,7 @@ GAUSSIANS_OF_PIXEL = 0.46
 MAX_ENTRIES = 10_000  # of a folder that are looked at for a picture
 
 
-def guess_training(values: Mapping[str, Any], parallel: int = 1) -> tuple[float, str] | None:
+def guess_training(values: Values, parallel: int = 1) -> tuple[float, str] | None:
     """The seconds of a training, and what they rest on; None without a picture."""
     size = picture_size(values["scene"])
     if size is None:
@@ -204,16 +220,81 @@ def has_gpu() -> bool:
 def _first_size(path: str, images: str) -> tuple[int, int] | None:
     folder = Path(path).expanduser()
     for place in (folder / images, folder) if path else ():
-        for file in _files(place):
-            try:
-                return image_size(file)
-            except InputError:
-                continue
+        for file in islice(place.iterdir(), MAX_ENTRIES) if place.is_dir() else ():
+            if file.suffix.lower() in IMAGE_SUFFIXES and file.is_file():
+                with suppress(InputError):
+                    return image_size(file)
     return None
 
 
-def _files(folder: Path) -> Iterator[Path]:
-    if folder.is_dir():
-        for _, file in zip(range(MAX_ENTRIES), folder.iterdir(), strict=False):
-            if file.suffix.lower() in IMAGE_SUFFIXES and file.is_file():
-                yield file
+# ---- how far a sweep is: the trials of each arm by state, speed and time left
+
+SPEED = "iterations_per_second"
+Name = tuple[str, str]  # arm, scene
+
+
+def progress_frame(runs: Path, experiment: str) -> pd.DataFrame:
+    """A row for each arm of an experiment, as ``gsbench status --watch`` shows it.
+
+    Its columns are done, running, failed, waiting (numbers of trials) and iterations_per_second (of
+    running trainings). ``attrs`` has seconds_left, which is None as long as no trial is done.
+    Raises InputError for an unknown experiment.
+    """
+    import pandas as pd
+
+    home = experiment_home(runs, experiment)
+    # A superseded trial will never be done, so with it no sweep would end.
+    found = read_experiment(home)
+    states = [one for one in states_of_experiment(home, found) if one.state != "superseded"]
+    names = {path: (arm, path.parents[1].name) for path, arm in arm_names(states).items()}
+    columns: dict[str, float] = {"done": 0, "running": 0, "failed": 0, "waiting": 0, SPEED: 0.0}
+    rows = {arm: columns.copy() for arm in sorted({arm for arm, _ in names.values()})}
+    for state in states:
+        row = rows[names[state.folder][0]]
+        row[STATES[state.state].column] += 1
+        if state.state == "running":
+            row[SPEED] += _speed(TrialFolder(state.folder))
+    frame = pd.DataFrame.from_dict(rows, orient="index", columns=[*columns])
+    done = [trial for trial in found.trials if trial.path in names]
+    frame.attrs["seconds_left"] = _seconds_left(states, names, done)
+    return frame
+
+
+def _speed(files: TrialFolder) -> float:
+    """The iterations per second of the present training; 0 without one."""
+    building = files.building()
+    file = Path(building.folder, CURVES) if building.folder else None
+    rows = read_rows(file) if file is not None and file.exists() else []
+    seconds = float(rows[-1].get("seconds", 0.0)) if rows else 0.0
+    return float(rows[-1]["step"]) / seconds if seconds > 0 else 0.0
+
+
+def _kinds(name: Name) -> tuple[Name, ...]:
+    """The keys of trials that tell how long one takes: its arm and scene, its arm, all."""
+    return name, (name[0], ""), ("", "")
+
+
+def _seconds_left(
+    states: Sequence[TrialState], names: Mapping[Path, Name], done: Sequence[TrialResult]
+) -> float | None:
+    """The seconds until all trials have ended, if as many run at once as now.
+
+    A trial takes as long as the finished ones of its arm and scene, else of its arm, else of all.
+    """
+    known: dict[Name, list[float]] = defaultdict(list)
+    for trial in done:
+        for kind in _kinds(names[trial.path]):
+            known[kind].append(sum(trial.record.seconds.values()))
+    if not known:
+        return None
+    total = 0.0
+    for state in states:
+        if state.state in ("done", "failed"):
+            continue
+        similar = next(known[kind] for kind in _kinds(names[state.folder]) if kind in known)
+        share, files = 0.0, TrialFolder(state.folder)
+        if state.state == "running":
+            with suppress(InputError, KeyError, TypeError):
+                share = files.share_done(files.configuration()["train"]["iterations"])
+        total += fmean(similar) * (1 - share)
+    return total / max(1, sum(state.state == "running" for state in states))
