@@ -16,6 +16,7 @@ from gsbench.files import (
     atomic,
     checked_runs_folder,
     explain_storage,
+    is_safe_member,
     link_or_copy,
     make_runs_folder,
     open_plain,
@@ -266,3 +267,9 @@ def test_on_a_disk_without_free_space_any_failed_write_counts_as_a_full_disk(tmp
 def test_a_text_with_a_name_that_is_not_utf_8_is_written(tmp_path):
     write_text(tmp_path / "a.txt", "a \udcff b")
     assert (tmp_path / "a.txt").read_text() == "a \\udcff b"
+
+
+def test_only_a_member_that_stays_below_its_folder_is_safe():
+    assert is_safe_member("color/a.png")
+    for name in ("/a", "../a", "a/../../b", "C:/a", "a\\b", "a\0b", "a\nb", ""):
+        assert not is_safe_member(name), name

@@ -9,7 +9,7 @@ the experiment is there. It then trains one after the other what has no result y
 killed and started again at any time. ``save`` writes the archive, with all trials so far, and
 beside it what archives lack and a machine that is gone cannot tell: ``EXPERIMENT.csv`` (CPU time,
 the share of volumes below V_th) and ``EXPERIMENT_regions.npz`` (the mean squared errors of regions
-of 32 px by trial and view, `gsbench.analysis.regions`).
+of 32 px by trial and view, `gsbench.analysis.images.region_errors`).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from gsbench.analysis.regions import region_errors
+from gsbench.analysis.images import region_errors
 from gsbench.claims.archive import unpack_archive
 
 FINDINGS = Path(__file__).resolve().parents[1]

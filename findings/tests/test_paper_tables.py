@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gsbench.analysis.regions import compare_regions, discoveries
+from gsbench.analysis.report.where import compare_regions, discoveries
 
 FINDINGS = Path(__file__).parents[1]
 ARCHIVES = FINDINGS / "archives"

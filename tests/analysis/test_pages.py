@@ -11,7 +11,6 @@ from gsbench.analysis import table_formats
 from gsbench.analysis.report.build import build_report
 from gsbench.claims.export import write_archive
 from gsbench.cli import run
-from gsbench.view import page as model_page
 from tests.analysis.helpers import loaded
 from tests.markup import Page
 from tests.trials import write_runs
@@ -86,7 +85,7 @@ def test_every_page_is_among_those_that_are_tried(both):
     }
     assert whole == both[0].keys()
     written = [file for file in ROOT.rglob("*.py") if "<html" in file.read_text().lower()]
-    assert not written  # and `gsbench export --out page.html`, which is tried below
+    assert not written
 
 
 def test_no_text_of_a_page_becomes_an_element_or_a_script(both):
@@ -127,14 +126,3 @@ def test_no_hostile_text_runs_in_a_browser(both, tmp_path):
         with Browser(file.as_uri(), tmp_path / f"profile-{name}") as browser:
             found = browser.wait_for(partial(look, browser), "a whole page")
             assert found == [False, len(Page(text).scripts)], name
-
-
-def test_the_name_of_a_photograph_stays_a_text_in_the_page_of_a_model():
-    annotation = model_page._annotation(f"0{HOSTILE}.png", {"target": [0, 0, 0]})
-    assert not set("<>&") & set(str(annotation))
-    page = model_page.with_policy("<!DOCTYPE html><html><head lang='x'><title>t</title></head>")
-    first = Page(page).elements[2]
-    assert first == (
-        "meta",
-        {"http-equiv": "Content-Security-Policy", "content": model_page.POLICY},
-    )

@@ -1,5 +1,8 @@
 """Plans against simulated sweeps that the judge's test decides."""
 
+import itertools
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -9,6 +12,8 @@ from gsbench.analysis.planning import (
     Design,
     deviation_range,
     estimate_components,
+    fewest_seeds,
+    power_like_these,
     power_of_mean,
     sweep_designs,
     sweep_power,
@@ -29,14 +34,27 @@ def shown(rng, noise, seeds, difference):
     return t_test(pairs).interval().excludes_zero()
 
 
-@pytest.mark.parametrize("level", [0.05, 0.0125])
-def test_designs_have_the_fewest_seeds_that_suffice(level):
-    designs = sweep_designs(0.2, EVEN, level)
+LIKE = Components(0.3, 0.5, 4, 12)
+like_these = partial(power_like_these, difference=0.35, components=LIKE)
+
+
+@pytest.mark.parametrize(
+    "designs, power",
+    [
+        (sweep_designs(0.2, EVEN, 0.05), lambda one: sweep_power(one, 0.2, EVEN, 0.05)),
+        (sweep_designs(0.2, EVEN, 0.0125), lambda one: sweep_power(one, 0.2, EVEN, 0.0125)),
+        (fewest_seeds(like_these, range(1, 31)), like_these),
+    ],
+    ids=["these scenes", "at a quarter of the level", "scenes like these"],
+)
+def test_designs_have_the_fewest_seeds_that_suffice(designs, power):
     assert designs
     for one in designs:
-        assert sweep_power(one, 0.2, EVEN, level) >= POWER
-        fewer = Design(one.scenes, one.seeds - 1)
-        assert one.seeds == 2 or sweep_power(fewer, 0.2, EVEN, level) < POWER
+        assert power(one) >= POWER
+        assert one.seeds == 2 or power(Design(one.scenes, one.seeds - 1)) < POWER
+    ordered = sorted(designs, key=lambda one: one.scenes)
+    assert all(b.seeds < a.seeds for a, b in itertools.pairwise(ordered))
+    assert power is not like_these or ordered[0].scenes >= 6
 
 
 @pytest.mark.parametrize("ratios", [(1, 1, 1), (4, 1, 1), (2, 1, 1), (1, 4, 4)])

@@ -9,17 +9,16 @@ from PIL import Image
 from scipy import special, stats
 
 from gsbench.analysis.comparison import compare
-from gsbench.analysis.images import regions_of
-from gsbench.analysis.regions import (
+from gsbench.analysis.images import region_errors, regions_of
+from gsbench.analysis.report.build import build_report
+from gsbench.analysis.report.where import (
     _p_values,
     compare_regions,
     discoveries,
     prior_of,
-    region_errors,
+    region_maps,
     region_psnr,
 )
-from gsbench.analysis.report.build import build_report
-from gsbench.analysis.report.where import region_maps
 from gsbench.analysis.results import load_experiment
 from gsbench.claims.archive import unpack_archive
 from gsbench.claims.export import write_archive

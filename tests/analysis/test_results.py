@@ -7,7 +7,6 @@ import pytest
 
 from gsbench.analysis.results import load_experiment, read_views
 from gsbench.runs.experiments import list_experiments
-from gsbench.runs.trial_files import read_rows
 from tests.analysis.helpers import loaded, trials_of
 from tests.helpers import change_json, refusal, write
 from tests.trials import write_arms, write_runs
@@ -123,12 +122,6 @@ def test_views_must_average_to_the_metrics_of_their_trial(tmp_path):
     (path / "per_view.csv").unlink()
     with refusal("is missing"):
         read_views(trial)
-
-
-def test_reading_json_lines_stops_at_a_damaged_line(tmp_path):
-    (tmp_path / "m.jsonl").write_text('{"step": 1}\n{"step": 2}\n{"st')
-    assert read_rows(tmp_path / "m.jsonl") == [{"step": 1}, {"step": 2}]
-    assert read_rows(tmp_path / "absent.jsonl") == []
 
 
 def test_reading_and_tabulating_load_no_torch():

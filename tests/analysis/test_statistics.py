@@ -1,7 +1,5 @@
 """Statistics and planning against SciPy, textbooks, cases counted by hand, and simulations."""
 
-import itertools
-
 import numpy as np
 import pytest
 import scipy.stats
@@ -11,7 +9,6 @@ from gsbench.analysis.planning import (
     Design,
     designs_like_these,
     estimate_components,
-    fewest_seeds,
     power_like_these,
     seeds_needed,
     sweep_designs,
@@ -215,17 +212,6 @@ def test_power_is_the_share_of_simulated_sweeps_that_see_the_difference(like_ask
         seen = habits.p_values(values)[1] < 0.05
     power = power_like_these if like_asked else sweep_power
     assert power(design, effect, KNOWN) == pytest.approx(np.mean(seen), abs=0.03)
-
-
-def test_planned_designs_for_scenes_like_these_have_the_fewest_seeds_that_suffice():
-    found = fewest_seeds(lambda one: power_like_these(one, 0.35, KNOWN), range(1, 31))
-    designs = sorted(found, key=lambda one: one.scenes)
-    for one in designs:
-        assert power_like_these(one, 0.35, KNOWN) >= 0.8
-        fewer = Design(one.scenes, one.seeds - 1)
-        assert one.seeds == 2 or power_like_these(fewer, 0.35, KNOWN) < 0.8
-    assert all(b.scenes > a.scenes and b.seeds < a.seeds for a, b in itertools.pairwise(designs))
-    assert min(one.scenes for one in designs) >= 6
 
 
 def test_seeds_do_not_replace_scenes():

@@ -204,6 +204,19 @@ def flip_a_bit(file):
     file.write_bytes(bytes(data))
 
 
+TRIAL = "courtyard/sfm-adc/c0ffee00-seed0"
+OUTSIDE = (
+    "../up/tuning.json",
+    "exp/x/config.yaml",
+    f"exp/{TRIAL}/renders/../../x.png",
+    "exp/../../x/renders/a.png",
+    f"other/{TRIAL}/renders/a.png",
+    f"exp/{TRIAL}/other/a.png",
+    f"exp/{TRIAL}/renders/",
+    "a.png",
+)
+
+
 @pytest.mark.parametrize(
     "damage, message",
     [
@@ -235,9 +248,8 @@ def flip_a_bit(file):
         (of_trial("config.yaml", b"seed: 0", b"seed: 1"), "says seed 1, its results 0"),
         (of_trial("per_view.csv", b"view000,", b"view009,2"), "per_view.csv"),
         (edit("archive.json", b"{", b"[" * 200_000), "not JSON"),
-        (added("../up/tuning.json", {}), "cannot be a file of an archive"),
         (added("up/tuning.json", search_record([]) | {"points": 3}), "points is 3"),
-        (added("exp/x/config.yaml", {}), "cannot be a file of an archive"),
+        *((added(place, {}), "cannot be a file of an archive") for place in OUTSIDE),
         (
             edit("archive.json", b'"experiment": "exp"', b'"experiment": "../up"'),
             "cannot be the name of an experiment",

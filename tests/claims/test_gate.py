@@ -182,51 +182,55 @@ def test_bad_input_of_gate_is_refused(runs, tmp_path, refused, words, message):
     assert message in refused("gate", *split(words))
 
 
+@pytest.fixture
+def gated(runs, tmp_path, monkeypatch):
+    """Run the verb against an archive of four trials; ``write`` stands for a training.
+
+    As without weights, trials lack a metric: they are done only if what can be computed now is not
+    asked for.
+    """
+
+    def lacking(files, values, unavailable_now=None):
+        return "" if unavailable_now else "it lacks flip"
+
+    def run_gate(words, write):
+        trained = []
+
+        def train(planned, asks):
+            for trial in planned:
+                trained.append(trial.values["seed"])
+                write(trial)
+            return 0
+
+        monkeypatch.setattr("gsbench.verbs.gate.run_trials", train)
+        monkeypatch.setattr("gsbench.runs.trial_folder.TrialFolder.why_not_done", lacking)
+        trials(tmp_path / "old", 0, 0.01, scenes=("courtyard",))
+        write_archive(load_experiment(tmp_path / "old", "gate"), tmp_path / "exp.zip")
+        return run(split(f"gate exp.zip init=sfm densify=adc {words}")), trained
+
+    return run_gate
+
+
 @pytest.mark.parametrize(
     "effect, code, words", [(-1.0, 1, "worse in PSNR"), (1.0, 0, "passed: better in PSNR")]
 )
-def test_the_exit_code_of_gate_is_its_result(
-    runs, tmp_path, monkeypatch, capsys, effect, code, words
-):
-    trained = []
+def test_the_exit_code_of_gate_is_its_result(gated, capsys, effect, code, words):
+    def write(trial):
+        write_as(trial, psnr=26 + effect + 0.001 * trial.values["seed"])
 
-    def train(planned, asks):
-        for trial in planned:
-            trained.append(trial.values["seed"])
-            write_as(trial, psnr=26 + effect + 0.001 * trained[-1])
-        return 0
-
-    monkeypatch.setattr("gsbench.verbs.gate.run_trials", train)
-    # As without weights: trials lack a metric, and whether it can be computed now is asked for.
-    lacking = lambda files, values, unavailable_now=None: "" if unavailable_now else "it lacks flip"  # noqa: E731
-    monkeypatch.setattr("gsbench.runs.trial_folder.TrialFolder.why_not_done", lacking)
-    old = trials(tmp_path / "old", 0, 0.01, scenes=("courtyard",))
-    write_archive(load_experiment(tmp_path / "old", "gate"), tmp_path / "exp.zip")
-    assert run(split("gate exp.zip scene=courtyard init=sfm densify=adc --seeds 3")) == code
+    # the first look decides
+    assert gated("scene=courtyard --seeds 3", write) == (code, [0, 1])
     assert words in capsys.readouterr().out
-    assert trained == [0, 1]  # the first look decides
-    assert len(old) == 4
 
 
-def test_one_training_shows_that_the_sides_cannot_be_compared(runs, tmp_path, monkeypatch, capsys):
-    trained = []
+def test_one_training_shows_that_the_sides_cannot_be_compared(gated, capsys):
+    def write(trial):
+        write_as(trial, psnr=26, _resolution=[640, 480])
 
-    def train(planned, asks):
-        trained.extend(planned)
-        for trial in planned:
-            write_as(trial, psnr=26, _resolution=[640, 480])
-        return 0
-
-    monkeypatch.setattr("gsbench.verbs.gate.run_trials", train)
-    done = lambda *_: ""  # noqa: E731
-    monkeypatch.setattr("gsbench.runs.trial_folder.TrialFolder.why_not_done", done)
-    trials(tmp_path / "old", 0, 0.01, scenes=("courtyard",))
-    write_archive(load_experiment(tmp_path / "old", "gate"), tmp_path / "exp.zip")
-    assert run(split("gate exp.zip scene=courtyard init=sfm densify=adc")) == 2
+    assert gated("scene=courtyard", write) == (2, [0])
     said = capsys.readouterr().err
     assert "courtyard: the arms differ in resolution" in said
     assert "cannot be read" not in said  # of the folder that the gate makes itself
-    assert len(trained) == 1
 
 
 @pytest.mark.parametrize(
@@ -242,17 +246,10 @@ def test_one_training_shows_that_the_sides_cannot_be_compared(runs, tmp_path, mo
         ("scene=courtyard --sees 3", 1.0, 128),
     ],
 )
-def test_exit_codes_under_git_bisect_run(runs, tmp_path, monkeypatch, words, effect, code):
-    def train(planned, asks):
+def test_exit_codes_under_git_bisect_run(gated, words, effect, code):
+    def write(trial):
         if effect is None:
             raise InputError("densify._target_=mine.Mine cannot be imported")
-        for trial in planned:
-            write_as(trial, psnr=26 + effect + 0.01 * trial.values["seed"])
-        return 0
+        write_as(trial, psnr=26 + effect + 0.01 * trial.values["seed"])
 
-    monkeypatch.setattr("gsbench.verbs.gate.run_trials", train)
-    lacking = lambda files, values, unavailable_now=None: "" if unavailable_now else "it lacks flip"  # noqa: E731
-    monkeypatch.setattr("gsbench.runs.trial_folder.TrialFolder.why_not_done", lacking)
-    trials(tmp_path / "old", 0, 0.01, scenes=("courtyard",))
-    write_archive(load_experiment(tmp_path / "old", "gate"), tmp_path / "exp.zip")
-    assert run(split(f"gate exp.zip init=sfm densify=adc {words} --bisect")) == code
+    assert gated(f"{words} --bisect", write)[0] == code

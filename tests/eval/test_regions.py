@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gsbench.eval.evaluator import Evaluator, summarize
+from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.options import EvalConfig
 from gsbench.eval.protocol import STANDARD
 from gsbench.eval.regions import depths_of_points, regions_by_distance
@@ -60,12 +60,6 @@ def test_metrics_in_a_region_are_those_of_its_pixels():
     assert {key for key in values if "@" in key} == {"psnr@left", "ssim@left", "flip@left"}
     alone = evaluator.evaluate_view(image, truth, mask)
     assert alone == {key: value for key, value in values.items() if "@" not in key}
-
-
-def test_the_mean_in_a_region_is_over_the_views_that_show_it():
-    views = {"a": {"psnr": 20.0, "psnr@far": 10.0}, "b": {"psnr": 30.0}}
-    assert summarize(views, {}) == {"psnr": 25.0, "psnr@far": 10.0}
-    assert summarize(views, {"psnr": "weights"}) == {}
 
 
 @pytest.mark.parametrize(

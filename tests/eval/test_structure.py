@@ -66,7 +66,7 @@ def test_identical_images_have_the_best_value_and_more_distortion_is_worse(key, 
 
 @pytest.mark.parametrize("key", STRUCTURAL)
 def test_views_that_are_too_small_are_unavailable(key, with_piq):
-    smallest, rng = STRUCTURAL[key].min_side, np.random.default_rng(0)
+    smallest, rng = STRUCTURAL[key][1], np.random.default_rng(0)
     for side, there in ((smallest, True), (smallest - 1, False)):
         evaluator = Evaluator(PAPER, lpips=[], flip=False, more=[key])
         render, truth = rng.integers(0, 256, (2, side, 170, 3), dtype=np.uint8)

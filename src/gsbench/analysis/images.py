@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from gsbench.analysis.regions import region_errors
 from gsbench.analysis.results import TrialPair, TrialResult
 from gsbench.errors import InputError
 from gsbench.parsing import Number, Record, read_if_sound
 from gsbench.runs.layout import FROM_PIXELS, GROUND_TRUTH, MASKS, REGIONS, RENDERS
+from gsbench.scene.beside import read_mask
 from gsbench.scene.images import read_image
-from gsbench.scene.masks import read_mask
 
+SIDE = 32  # px, of a region
 TEXTURE_SIGMA = 2.0  # px: the Gaussian over which the squared gradient is averaged
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709
 TEXTURED_SHARE = 0.2  # share of a photograph's pixels that count as textured
@@ -39,10 +39,19 @@ def texture_energy(image: Pixels) -> Array:
     return gaussian(rows**2 + columns**2, TEXTURE_SIGMA, mode="reflect", preserve_range=True)
 
 
-def read_counted(trial: TrialResult, view: str, shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """The pixels [H, W] of a test view that count: those that its mask keeps, or all."""
-    path = trial.path / MASKS / f"{view}.png"
-    return read_mask(path) if path.is_file() else np.ones(shape, dtype=bool)
+def read_view(trial: TrialResult, view: str) -> tuple[Pixels, Pixels, NDArray[np.bool_]]:
+    """A test view's render and photograph, and the pixels [H, W] that count.
+
+    These are those that its mask keeps, or all. Raises InputError if the sizes differ.
+    """
+    render, truth = (
+        read_image(trial.path / kind / f"{view}.png") for kind in (RENDERS, GROUND_TRUTH)
+    )
+    if render.shape != truth.shape:
+        raise InputError(f"{trial.label}: {view} has different sizes")
+    mask = trial.path / MASKS / f"{view}.png"
+    counted = read_mask(mask) if mask.is_file() else np.ones(truth.shape[:2], dtype=bool)
+    return render, truth, counted
 
 
 def absolute_error(render: Pixels, truth: Pixels) -> Array:
@@ -67,18 +76,27 @@ def textured_error(trial: TrialResult) -> float:
         return float(stored.error_textured)
     errors = []
     for view in view_names(trial):
-        truth = read_image(trial.path / GROUND_TRUTH / f"{view}.png")
+        render, truth, counted = read_view(trial, view)
         texture = texture_energy(truth)  # [H, W]
-        counted = read_counted(trial, view, texture.shape)
         inside = counted & (texture >= np.quantile(texture[counted], 1 - TEXTURED_SHARE))
-        errors.append(
-            float(
-                absolute_error(read_image(trial.path / RENDERS / f"{view}.png"), truth)[
-                    inside
-                ].mean()
-            )
-        )
+        errors.append(absolute_error(render, truth)[inside].mean())
     return float(np.mean(errors))
+
+
+def region_errors(render: Pixels, truth: Pixels) -> Array:
+    """The mean squared error [R, C] in the regions of two 8-bit images [H, W, 3], in levels².
+
+    Regions at the right and lower border are smaller if 32 does not divide the sides; narrower
+    than half a region, they belong to their neighbour.
+    """
+    # whole numbers, since reports read hundreds of pictures
+    squared = (render.astype(np.int32) - truth) ** 2
+    error = squared.sum(axis=-1) / squared.shape[-1]  # [H, W]
+    starts = [np.arange(max(1, round(size / SIDE))) * SIDE for size in error.shape]
+    sums, counts = error, np.ones_like(error)
+    for axis, first in enumerate(starts):
+        sums, counts = (np.add.reduceat(each, first, axis) for each in (sums, counts))
+    return sums / counts
 
 
 class RegionErrors(Record):
@@ -97,11 +115,7 @@ def regions_of(trial: TrialResult) -> Mapping[str, Array]:
         return {view: np.array(rows, dtype=float) for view, rows in stored.views.items()}
     errors = {}
     for view in view_names(trial):
-        truth = read_image(trial.path / GROUND_TRUTH / f"{view}.png")
-        render = read_image(trial.path / RENDERS / f"{view}.png")
-        if render.shape != truth.shape:
-            raise InputError(f"{trial.label}: {view} has different sizes")
-        counted = read_counted(trial, view, truth.shape[:2])
+        render, truth, counted = read_view(trial, view)
         errors[view] = region_errors(np.where(counted[..., None], render, truth), truth)
     return errors
 
@@ -224,12 +238,10 @@ def read_compared(one: TrialResult, other: TrialResult, view: str) -> list[Pixel
     Ignored pixels have the same stripes in all three, so they show no error. Raises InputError
     if the sizes differ.
     """
-    first = read_image(one.path / RENDERS / f"{view}.png")
+    first, truth, counted = read_view(one, view)
     second = read_image(other.path / RENDERS / f"{view}.png")
-    truth = read_image(one.path / GROUND_TRUTH / f"{view}.png")
-    if not first.shape == second.shape == truth.shape:
+    if second.shape != truth.shape:
         raise InputError(f"{one.label} and {other.label}: {view} has different sizes")
-    counted = read_counted(one, view, truth.shape[:2])
     rows, columns = np.indices(counted.shape)
     is_first = (rows + columns) % (2 * STRIPE) < STRIPE  # [H, W]
     stripes = np.where(is_first, *STRIPES).astype(np.uint8)  # [H, W]

@@ -31,8 +31,7 @@ SIDE_BY_SIDE = ("scene.split", "scene.sector")
 FIRST_NAMED = ("train.iterations", *SIDE_BY_SIDE)  # settings that stand for others
 
 Labels = tuple[str, ...]
-# of a cell: the labels of its row, those of its column, and the quantity's key
-Position = tuple[Labels, Labels, str]
+Position = tuple[Labels, Labels, Quantity]  # of a cell: the labels of its row and column
 
 
 def build_table(
@@ -84,14 +83,14 @@ def build_table(
     cells: dict[Position, Cell] = {}
     for row, quantity, column in itertools.product(row_labels, quantities, column_labels):
         own_scenes = scenes if scene_index is None else [(*row, *column)[scene_index]]
-        cells[row, column, quantity.key] = make_cell(
+        cells[row, column, quantity] = make_cell(
             groups.get((*row, *column), []), quantity, own_scenes, expected
         )
     paths = {trial.path for trial in trials}
     varied = [trial for trial in comparison.trials if trial.path in paths]
     shown_best = winners(comparison)
-    bold = _best(cells, quantities, shown_best, varied)
-    shown, notes = _rows(cells, bold, quantities), list[Note]()
+    bold = _best(cells, shown_best, varied)
+    shown, notes = _rows(cells, bold), list[Note]()
     has_means = "scene" in rows and len(scenes) > 1
     # scenes of an arm may have different conditions or versions of the code
     if has_means and any(
@@ -102,16 +101,16 @@ def build_table(
     elif has_means:
         place = list(rows).index("scene")
         means = _means(groups, place, row_labels, column_labels, quantities, scenes, expected)
-        best = _best(means, quantities, shown_best, varied)
+        best = _best(means, shown_best, varied)
         bold |= best
-        shown += _rows(means, best, quantities, ruled=True)
+        shown += _rows(means, best, ruled=True)
     headings = []
     for quantity, column in itertools.product(quantities, column_labels):
         above, text = "", quantity.heading
         if columns:
             above, text = text, " + ".join(names.get(value, value) for value in column)
         headings.append(Column(above, text, (quantity.key, "+".join(column))))
-    notes += _reading_notes(cells, quantities, expected, scene_index is not None, bool(bold))
+    notes += _reading_notes(cells, expected, scene_index is not None, bool(bold))
     notes += [Note.of("folded", shown=key, others=own) for key, own in folded.items() if own]
     notes += between_scenes_notes(varied)
     notes += trials_notes(comparison, trials)
@@ -156,24 +155,18 @@ def format_cell(cell: Cell, quantity: Quantity) -> str:
     return text if cell.count == cell.expected else f"{text} ({cell.count}/{cell.expected})"
 
 
-def _rows(
-    cells: Mapping[Position, Cell],
-    bold: set[Position],
-    quantities: Sequence[Quantity],
-    ruled: bool = False,
-) -> list[Row]:
+def _rows(cells: Mapping[Position, Cell], bold: set[Position], ruled: bool = False) -> list[Row]:
     """The cells row by row; if ``ruled``, the first row is below a rule.
 
     A cell over fewer scenes than the others says how many.
     """
-    quantity_of = {quantity.key: quantity for quantity in quantities}
     most_scenes = max((cell.scenes for cell in cells.values()), default=0)
     rows: list[Row] = []
     for labels, positions in group_by(cells, lambda position: position[0]).items():
         entries = []
         for position in positions:
             cell = cells[position]
-            text = format_cell(cell, quantity_of[position[2]]) if cell.scenes else "n/a"
+            text = format_cell(cell, position[2]) if cell.scenes else "n/a"
             text += f" [{counted(cell.scenes, 'scene')}]" if 0 < cell.scenes != most_scenes else ""
             entries.append(TableEntry(text, position in bold, cell))
         # a setting that an arm does not have, or has unset
@@ -184,7 +177,6 @@ def _rows(
 
 def _best(
     cells: Mapping[Position, Cell],
-    quantities: Sequence[Quantity],
     winners: Mapping[tuple[str, frozenset[str]], set[Arm]],
     trials: Sequence[TrialResult],
 ) -> set[Position]:
@@ -193,21 +185,20 @@ def _best(
     ``winners`` are such arms by metric and scenes; ``trials`` have their variants.
     """
     arms = {trial.path: trial.arm for trial in trials}
-    direction = {quantity.key: quantity.direction for quantity in quantities}
 
-    def rivals(place: Position) -> tuple[str, frozenset[str]]:
+    def rivals(place: Position) -> tuple[Quantity, frozenset[str]]:
         return place[2], frozenset(trial.scene for trial in cells[place].trials)
 
     bold: set[Position] = set()
-    for key, places in group_by(cells, rivals).items():
+    for (quantity, scenes), places in group_by(cells, rivals).items():
         merits = {
-            place: direction[key[0]] * mean
+            place: quantity.direction * mean
             for place in places
             if (mean := cells[place].mean) is not None
         }
         for place, merit in merits.items():
             own = {arms[trial.path] for trial in cells[place].trials}
-            if merit == max(merits.values()) and own <= winners.get(key, set()):
+            if merit == max(merits.values()) and own <= winners.get((quantity.key, scenes), set()):
                 bold.add(place)
     return bold
 
@@ -239,21 +230,20 @@ def _means(
             for row, column in itertools.product(mean_rows, column_labels)
         )
 
-    shared = {one.key: [scene for scene in scenes if have(scene, one)] for one in quantities}
+    shared = {one: [scene for scene in scenes if have(scene, one)] for one in quantities}
     most_scenes = max(map(len, shared.values()))
     label = f"mean of {counted(most_scenes, 'scene')}"
     cells: dict[Position, Cell] = {}
     for row, quantity, column in itertools.product(mean_rows, quantities, column_labels):
-        own_scenes = shared[quantity.key]
+        own_scenes = shared[quantity]
         averaged = list(itertools.chain(*(trials(row, column, scene) for scene in own_scenes)))
         labels = (*row[:scene_index], label, *row[scene_index:])
-        cells[labels, column, quantity.key] = make_cell(averaged, quantity, own_scenes, expected)
+        cells[labels, column, quantity] = make_cell(averaged, quantity, own_scenes, expected)
     return cells if most_scenes else {}
 
 
 def _reading_notes(
     cells: Mapping[Position, Cell],
-    quantities: Sequence[Quantity],
     expected: int,
     by_scene: bool,
     has_bold: bool,
@@ -271,9 +261,8 @@ def _reading_notes(
         notes = [Note.of("mean", trials=expected, spread=spread, **facts)]
     if any(0 < cell.count < expected or not cell.trials for cell in cells.values()):
         notes.append(Note.of("few values", trials=expected))
-    for one in quantities:
-        own = [cell for position, cell in cells.items() if position[2] == one.key]
-        reasons = {cell.reason for cell in own if cell.trials and cell.reason}
+    for one, places in group_by(cells, lambda position: position[2]).items():
+        reasons = {cells[place].reason for place in places if cells[place].trials} - {""}
         notes += [Note.of("not available", metric=one.name, reason=why) for why in sorted(reasons)]
     return notes
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from numbers import Real
 from pathlib import Path
@@ -34,7 +34,13 @@ from gsbench.eval.images import (
     replace_ignored,
 )
 from gsbench.eval.lpips import Lpips, load_lpips
-from gsbench.eval.metric import MaskedMetric, Measure, Metric, UnavailableError
+from gsbench.eval.metric import (
+    MaskedMetric,
+    Measure,
+    Metric,
+    UnavailableError,
+    require_size,
+)
 from gsbench.eval.more import STRUCTURAL, after_correction, load_structural
 from gsbench.eval.protocol import Protocol
 from gsbench.eval.regions import LEAST_SHARE, Regions
@@ -95,7 +101,7 @@ def measure_gsbench(key: str, evaluator: Evaluator) -> Measure:
     if key.startswith(LPIPS):
         net, _, raw = key.removeprefix(LPIPS).partition("_")
         return partial(_lpips, evaluator.network(net), bool(raw))
-    return partial(_structural, load_structural(key), STRUCTURAL[key].min_side)
+    return load_structural(key)
 
 
 def _flip(ppd: float, image: Tensor, truth: Tensor, mask: Tensor | None) -> float:
@@ -106,30 +112,11 @@ def _flip(ppd: float, image: Tensor, truth: Tensor, mask: Tensor | None) -> floa
 
 def _lpips(network: Lpips, raw: bool, image: Tensor, truth: Tensor, mask: Tensor | None) -> float:
     """LPIPS by one network, fed [-1, 1] as it is defined, or [0, 1] if ``raw``."""
-    _require_size(image, network.backbone.min_size)
+    require_size(image, network.backbone.min_size)
     first, second = as_batch(image), as_batch(truth)  # [1, 3, H, W] each
     if not raw:
         first, second = 2 * first - 1, 2 * second - 1
     return float(network(first, second, mask))
-
-
-def _structural(
-    function: Callable[[Tensor, Tensor], float],
-    min_side: int,
-    image: Tensor,
-    truth: Tensor,
-    mask: Tensor | None,
-) -> float:
-    """A structural metric by its authors' definition, which is the same in all protocols."""
-    _require_size(image, min_side)
-    return function(in_double_precision(image), in_double_precision(truth))
-
-
-def _require_size(image: Tensor, min_side: int) -> None:
-    """Raise UnavailableError for a view [H, W, 3] with a side below ``min_side`` px."""
-    height, width = image.shape[:2]
-    if min(height, width) < min_side:
-        raise UnavailableError(f"a view is {width}x{height} px, below {min_side} px a side")
 
 
 def measure_own(name: str, metric: Metric) -> Measure:

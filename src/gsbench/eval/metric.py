@@ -67,3 +67,10 @@ class UnavailableError(Exception):
     def __init__(self, reason: str, awaited: bool = False) -> None:
         super().__init__(reason)
         self.awaited = awaited
+
+
+def require_size(image: Tensor, min_side: int) -> None:
+    """Raise UnavailableError for a view [H, W, 3] with a side below ``min_side`` px."""
+    height, width = image.shape[:2]
+    if min(height, width) < min_side:
+        raise UnavailableError(f"a view is {width}x{height} px, below {min_side} px a side")

@@ -9,39 +9,31 @@ of the render's colours to those of the photograph.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from gsbench.eval.images import as_batch, in_double_precision
-from gsbench.eval.metric import Measure, UnavailableError
+from gsbench.eval.metric import Measure, UnavailableError, require_size
 
-
-@dataclass(frozen=True)
-class Structural:
-    """A metric of piq: its function there, and the shortest side of an image that it measures."""
-
-    function: str
-    min_side: int  # px
-
-
-# Five scales leave the window of 11 px inside 161 px. FSIM's limit is ours: phases mean little in
-# an image that holds few of the shortest waves.
+# Metrics of piq: the function there, and the shortest side (px) of an image that it measures. Five
+# scales leave the window of 11 px inside 161 px. FSIM's limit is ours: phases mean little in an
+# image that holds few of the shortest waves.
 STRUCTURAL = {
-    "ms_ssim": Structural("multi_scale_ssim", 161),
-    "iw_ssim": Structural("information_weighted_ssim", 161),
-    "fsim": Structural("fsim", 16),
-    "gmsd": Structural("gmsd", 2),
+    "ms_ssim": ("multi_scale_ssim", 161),
+    "iw_ssim": ("information_weighted_ssim", 161),
+    "fsim": ("fsim", 16),
+    "gmsd": ("gmsd", 2),
 }
 
 
-def load_structural(key: str) -> Callable[[Tensor, Tensor], float]:
-    """piq's metric ``key`` of two images [H, W, 3] in [0, 1], in their precision.
+def load_structural(key: str) -> Measure:
+    """piq's metric ``key`` by its authors' definition, the same in all protocols; knows no masks.
 
     Raises UnavailableError, with the reason in one line, if piq cannot be imported.
     """
+    name, min_side = STRUCTURAL[key]
     try:
         import piq
     # torchvision, which piq needs, raises RuntimeError if it was made for another torch
@@ -50,11 +42,13 @@ def load_structural(key: str) -> Callable[[Tensor, Tensor], float]:
         raise UnavailableError(
             f"it needs the package piq: pip install 'gsbench-3dgs[piq]' ({why})", awaited=True
         ) from error
-    function: Callable[..., Any] = getattr(piq, STRUCTURAL[key].function)
+    function: Callable[..., Any] = getattr(piq, name)
 
-    def measure(image: Tensor, truth: Tensor) -> float:
+    def measure(image: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
+        require_size(image, min_side)
+        pair = (as_batch(in_double_precision(one)) for one in (image, truth))
         try:
-            return float(function(as_batch(image), as_batch(truth), data_range=1.0))
+            return float(function(*pair, data_range=1.0))
         except RuntimeError as error:  # IW-SSIM inverts a matrix that is singular for a flat view
             if "singular" not in str(error):
                 raise

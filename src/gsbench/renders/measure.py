@@ -24,7 +24,7 @@ from gsbench.renders.imported import Measured, check_destination, find_destinati
 from gsbench.renders.sources import (
     ReferenceImages,
     find_reference_images,
-    opened_renders,
+    find_renders,
     picture_names,
     pictures_in,
     reference_images_of,
@@ -35,12 +35,6 @@ from gsbench.system.device import select_device
 from gsbench.system.programs import allow_modules
 from gsbench.system.resources import available_threads
 from gsbench.words import counted, some_of
-
-
-def measure_renders(options: argparse.Namespace, runs: Path) -> None:
-    """Measure the renders that the ``options`` of the verb name, and print the values."""
-    with opened_renders(Path(options.renders).expanduser()) as (renders, photographs):
-        _measure(options, renders, photographs, runs)
 
 
 def measure_folders(
@@ -69,10 +63,9 @@ def measure_folders(
     return rows
 
 
-def _measure(
-    options: argparse.Namespace, renders: Path, photographs: Path | None, runs: Path
-) -> None:
-    """Measure the pictures in ``renders``; ``photographs`` are used if the command names none."""
+def measure_renders(options: argparse.Namespace, runs: Path) -> None:
+    """Measure the renders that the ``options`` of the verb name, and print the values."""
+    renders, photographs = find_renders(Path(options.renders).expanduser())
     primary = _asked_metric(options)
     if options.truth is not None:
         truth = _reference_images(options, runs)

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsbench.scene.masks import resize_mask
+from gsbench.scene.beside import resize_mask
 from gsbench.scene.types import Camera, View
 from gsbench.train.options import TrainConfig
 from gsbench.train.views import Targets

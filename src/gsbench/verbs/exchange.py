@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 DONE, LEFT_OUT = 0, 1
-PAGE = ".html"
 
 log = logging.getLogger(__name__)
 
@@ -58,18 +57,14 @@ def export(argv: Sequence[str], runs: Path) -> int:
 
 
 def export_model(trial: TrialResult, out: Path, is_init: bool) -> None:
-    """Write the trained model as a PLY file or a page, or the initial model as a folder."""
-    from gsbench.view.page import write_page
+    """Write the trained model as a PLY file, or the initial model as a folder."""
     from gsbench.view.trials import model_file, model_folder
 
-    is_page = out.suffix.lower() == PAGE
-    if not is_init and not is_page:
+    if not is_init:
         check_form(out)
     with writable_output(out):
         if is_init:
             export_init(model_folder(trial), out, trial.record.to_training)
-        elif is_page:
-            write_page(trial, out)
         else:
             with atomic(out, sync=False) as temporary:
                 shutil.copyfile(model_file(trial), temporary)
@@ -102,8 +97,7 @@ def check_form(out: Path) -> None:
     if not out.name.lower().endswith(".ply") or out.name.lower().endswith(".compressed.ply"):
         raise InputError(
             f"--out {out}: name a file that ends in .ply, the 3DGS form, which every viewer and "
-            "trainer reads, or in .html, a page for browsers (docs/other_models.md says what makes "
-            "other forms)"
+            "trainer reads (docs/other_models.md says what makes other forms, and a page)"
         )
 
 
