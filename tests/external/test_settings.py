@@ -5,7 +5,7 @@ import re
 import pytest
 
 from gsbench.external.settings import External
-from tests.helpers import refusal
+from tests.helpers import refusal, table
 
 
 def external(result, **options):
@@ -14,13 +14,7 @@ def external(result, **options):
 
 @pytest.mark.parametrize(
     "options, said",
-    [
-        ({"lr": "???"}, "densify.options.lr is not set: give it a value"),
-        ({"seed": 1}, "densify.options.seed: an option is one value with a name of its own"),
-        ({"two words": 1}, "densify.options.two words: an option is one value"),
-        ({"lr": [1, 2]}, "densify.options.lr: an option is one value"),
-        ({"lr": {"a": 1}}, "densify.options.lr: an option is one value"),
-    ],
+    table(__file__, "an_option_is_one_value_with_a_name_of_its_own"),
 )
 def test_an_option_is_one_value_with_a_name_of_its_own(options, said):
     with refusal(re.escape(said)):

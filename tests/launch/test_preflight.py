@@ -16,7 +16,7 @@ from gsbench.launch.batch import (
 )
 from gsbench.launch.outcomes import Outcome
 from gsbench.runs.commands import read_history
-from tests.helpers import refusal
+from tests.helpers import refusal, table
 from tests.launch.test_jobs import SLURM, nothing
 from tests.trials import LOCAL, bare_trial, write_results
 
@@ -143,19 +143,7 @@ def test_each_missing_folder_is_named_once_with_the_way_to_get_it(tmp_path, monk
 
 @pytest.mark.parametrize(
     "word, free",
-    [
-        ("seed=3", True),
-        ("densify=adc", True),
-        ("+densify=adc", True),
-        ("densify=mine", False),
-        ("densify.start=4", False),
-        ("~densify.cap", False),
-        ("init/options=a", False),
-        ("raster@x=cpu", False),
-        ("train.iterations=3", False),
-        ("hydra.job.name=a", True),
-        ("hydra.searchpath=[a]", False),
-    ],
+    table(__file__, "shipped_choices_alone_need_no_check"),
 )
 def test_shipped_choices_alone_need_no_check(word, free):
     trials = [SimpleNamespace(overrides=words) for words in (("name=x",), ("seed=1", word))]

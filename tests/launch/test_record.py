@@ -18,7 +18,7 @@ from gsbench.runs.commands import (
 )
 from gsbench.runs.experiments import Arm
 from tests.end_to_end.conftest import SMALL
-from tests.helpers import refusal
+from tests.helpers import refusal, table
 from tests.trials import bare_trial, write_trial
 
 # later words win: a trial of seconds
@@ -201,15 +201,7 @@ def test_a_question_may_be_about_some_scenes_alone(tmp_path):
 
 @pytest.mark.parametrize(
     "entry, said",
-    [
-        ({"baseline": "adc"}, r"questions\[1\] must be a mapping with idea"),
-        ({"idea": "nothing"}, "nothing names no arm of this sweep"),
-        ({"idea": "mine", "least": 0}, r"questions\[1\]\.least must be a number above 0"),
-        ({"idea": "mine", "metric": "psn"}, "psn"),
-        ({"idea": "mine", "metric": "gaussians", "direction": "same"}, "least is needed"),
-        ({"idea": "mine", "metric": "gaussians", "least": 0.1}, "must be a part, such as 10%"),
-        ({"idea": "mine", "sez": "x"}, "sez"),
-    ],
+    table(__file__, "a_wrong_question_is_refused_in_one_line_before_anything_is_written"),
 )
 def test_a_wrong_question_is_refused_in_one_line_before_anything_is_written(tmp_path, entry, said):
     with refusal(said):

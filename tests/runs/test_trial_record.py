@@ -8,6 +8,7 @@ import pytest
 from gsbench.parsing import DamagedError, parse_typed
 from gsbench.runs.trial_files import Failure, Histogram, read_rows, whole_lines
 from gsbench.runs.trial_record import MetricRecord, UnfinishedError, record_from, split_text
+from tests.helpers import table
 from tests.trials import results_of, trial_values
 
 PATH = Path("results.json")
@@ -55,18 +56,7 @@ def test_omitted_facts_of_a_metric_or_a_failure_have_defaults():
 
 @pytest.mark.parametrize(
     "settings, text",
-    [
-        ({"split": "every_nth", "sectors": 8}, "every_nth"),
-        ({"split": "every_nth", "sectors": 8, "match_views": True}, "every_nth, matched with 8"),
-        ({"split": "sector", "sector": 0, "sectors": 8}, "sector 0 of 8"),
-        (
-            {"split": "sector", "sector": 0, "sectors": 8, "match_views": True},
-            "sector 0 of 8, matched",
-        ),
-        ({"split": "every_nth", "train_list": "a.txt"}, "list"),
-        ({"split": "every_nth", "test_list": "a.txt", "match_views": True}, "list"),
-        ({"split": "every_nth", "validation": True}, "every_nth, validation"),
-    ],
+    table(__file__, "the_rule_of_a_split_has_a_short_text"),
 )
 def test_the_rule_of_a_split_has_a_short_text(settings, text):
     assert split_text({f"scene.{name}": value for name, value in settings.items()}) == text
@@ -94,14 +84,7 @@ def test_a_row_has_an_iteration_and_numbers(row, sound, tmp_path):
 
 @pytest.mark.parametrize(
     "edges, counts, sound",
-    [
-        ([-300, 300], [1], True),
-        ([-300.5, 300], [1], False),
-        ([-300, 300.5], [1], False),
-        ([0, 1, 2], [1, 0], True),
-        ([0, 1], [1, 0], False),
-        ([0, 1, 2, 3], [1, 0], False),
-    ],
+    table(__file__, "a_histogram_has_one_edge_more_than_counts"),
 )
 def test_a_histogram_has_one_edge_more_than_counts(edges, counts, sound, tmp_path):
     path = tmp_path / "volume_histograms.jsonl"

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from gsbench.system.device import free_bytes, select_device
-from tests.helpers import refusal
+from tests.helpers import refusal, table
 
 
 @pytest.fixture
@@ -21,16 +21,7 @@ def rounding():
 
 @pytest.mark.parametrize(
     "name, gpus, answer",
-    [
-        ("auto", 0, "cpu"),
-        ("auto", 2, "cuda"),
-        ("cpu", 2, "cpu"),
-        ("cuda", 1, "cuda"),
-        ("cuda:1", 2, "cuda:1"),
-        ("cuda:2", 2, "there are 2 CUDA devices"),
-        ("cuda", 0, "torch finds no CUDA device here"),
-        ("gpu", 1, "is not known to torch"),
-    ],
+    table(__file__, "a_device_is_chosen_or_refused"),
 )
 def test_a_device_is_chosen_or_refused(rounding, name, gpus, answer, monkeypatch):
     pretend(monkeypatch, gpus)

@@ -12,7 +12,7 @@ from numpy.testing import assert_array_equal
 
 from gsbench.system import isolate
 from gsbench.system.isolate import CrashError, run_isolated
-from tests.helpers import refusal
+from tests.helpers import refusal, table
 
 FUNCTIONS = """
 import logging, os, sys
@@ -145,14 +145,7 @@ def test_only_the_end_of_a_long_output_is_read(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     "code, said",
-    [
-        (-9, "crashed (SIGKILL, perhaps out of memory)"),
-        (-11, "crashed (SIGSEGV)"),
-        (139, "crashed (SIGSEGV)"),
-        (255, "ended early (exit code 255)"),
-        (0, "ended early (exit code 0)"),
-        (7, "ended early (exit code 7)"),
-    ],
+    table(__file__, "the_end_of_a_process_is_described"),
 )
 def test_the_end_of_a_process_is_described(code, said):
     assert isolate.describe_exit(code) == said

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from gsbench.system import install, programs, resources
-from tests.helpers import write
+from tests.helpers import table, write
 from tests.processes import completed
 
 SRC = Path(programs.__file__).parents[1]
@@ -119,21 +119,7 @@ def test_nobody_starts_a_process_by_another_name():
 
 @pytest.mark.parametrize(
     "line, seen",
-    [
-        ("import subprocess\nsubprocess.run([])", 1),
-        ("start = subprocess.Popen", 1),
-        ("async def f(): await asyncio.create_subprocess_exec('a')", 1),
-        ("def f(run=subprocess.check_output): ...", 1),
-        ("print(subprocess.run([]).stdout)", 1),
-        ("os.execv('a', [])", 1),
-        ("subprocess.PIPE, os.environ, torch.tensor, psutil.Process()", 0),
-        ("from subprocess import run", "run"),
-        ("from os import posix_spawn as go", "posix_spawn"),
-        ("import subprocess as sp", "sp"),
-        ("from multiprocessing import Process", "Process"),
-        ("import_module('subprocess')", "subprocess"),
-        ("from subprocess import PIPE", 0),
-    ],
+    table(__file__, "a_start_of_a_process_is_seen_however_it_is_written"),
 )
 def test_a_start_of_a_process_is_seen_however_it_is_written(line, seen):
     count = len(starts_of(line))
