@@ -183,3 +183,29 @@ def balance_tiles(starts, shards, bounds, tile_shard):
             tile_shard[tile] = shard
             tile += 1
         bounds[shard + 1] = tile
+
+
+@inlined
+def shards_of(record_ints, base, tile_shard, tiles_x):
+    """The shards of the first and of the last tile that the record at ``base`` can touch."""
+    spans_x, spans_y = record_ints[base + at.TILES_X], record_ints[base + at.TILES_Y]
+    first = tile_shard[(spans_y & 0xFFFF) * tiles_x + (spans_x & 0xFFFF)]
+    last = tile_shard[((spans_y >> 16) - 1) * tiles_x + (spans_x >> 16) - 1]
+    return np.int64(first), np.int64(last)
+
+
+@kernel
+def place_rows(begins, visible, record_ints, tile_shard, tiles_x):
+    """Write `layout.FIRST_ROW` of all records; return the number of rows.
+
+    Shard s has ``visible[s]`` records from ``begins[s]`` on. The rows of a record are adjacent, and
+    follow those of the record before. Its row of a shard of tiles is ``FIRST_ROW`` + shard.
+    """
+    row = 0
+    for shard in range(len(begins)):
+        for record in range(begins[shard], begins[shard] + visible[shard]):
+            base = record * at.RECORD
+            first, last = shards_of(record_ints, base, tile_shard, tiles_x)
+            record_ints[base + at.FIRST_ROW] = row - first
+            row += last - first + 1
+    return row

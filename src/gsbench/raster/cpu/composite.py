@@ -335,8 +335,8 @@ def place_in_tile(x, y):
 
 
 @kernel
-def composite_backward_tiles(first, past, memory, frame, g_image, g_alpha, all_rows, want_absolute):
-    """Add the gradient sums of the shards ``first`` to ``past``, back to front, to ``all_rows``.
+def composite_backward_tiles(first, past, memory, frame, g_image, g_alpha, rows, want_absolute):
+    """Add the gradient sums of the shards ``first`` to ``past``, back to front, to ``rows``.
 
     c is the colour of a record, g the gradient of the pixel, T the transmittance before the record.
     U is the sum over the later records and the background of (c . g) alpha T, divided by the
@@ -345,17 +345,18 @@ def composite_backward_tiles(first, past, memory, frame, g_image, g_alpha, all_r
     of weighted means that starts with the background: nothing cancels, and the only division per
     record is that for T.
 
-    Each shard of tiles has its rows in ``all_rows`` [shards, N * 16]. If ``g_alpha`` is empty, the
-    gradient by alpha is 0. ``want_absolute`` is True or None, so that numba removes its branch at
-    compilation.
+    Each record has one of the ``rows`` [rows * 16] for each shard of tiles (`layout`). If
+    ``g_alpha`` is empty, the gradient by alpha is 0. ``want_absolute`` is True or None, so that
+    numba removes its branch at compilation.
     """
     entries, masks, records = frame.entries, frame.masks, frame.records
+    record_ints = frame.record_ints
     floats = memory[0][first]
     planes = _planes(floats)  # the gradient of the image
     # U, and T behind the current record
     behind, through = floats[3 * at.TILE_PIXELS :], floats[4 * at.TILE_PIXELS :]
     for tile in range(frame.bounds[first], frame.bounds[past]):
-        rows = all_rows[frame.tile_shard[tile]]
+        shard = np.int64(frame.tile_shard[tile])
         left, top = _origin(tile, frame.camera.tiles_x)
         tile_x, tile_y = np.float32(left), np.float32(top)
         state = tile * at.TILE_PIXELS
@@ -364,11 +365,14 @@ def composite_backward_tiles(first, past, memory, frame, g_image, g_alpha, all_r
             continue
         _start_backward(left, top, state, frame, g_image, g_alpha, planes, behind, through)
         for entry in range(end - 1, begin - 1, -1):
-            ahead = max(entry - AHEAD, begin)
             # An entry that touches no block is skipped below, so its record is not needed.
+            ahead = max(entry - 2 * AHEAD, begin)
             if masks[ahead] != 0:
                 prefetch(records, entries[ahead] * at.RECORD)
-                prefetch(rows, entries[ahead] * at.ROW)
+            ahead = max(entry - AHEAD, begin)
+            if masks[ahead] != 0:
+                row = record_ints[entries[ahead] * at.RECORD + at.FIRST_ROW] + shard
+                prefetch(rows, row * at.ROW)
             todo = np.uint64(masks[entry])
             if todo == 0:
                 continue
@@ -403,7 +407,8 @@ def composite_backward_tiles(first, past, memory, frame, g_image, g_alpha, all_r
             else:
                 total = lane_sums(sums)
             # No atomics: a shard of tiles is run by one thread, which alone writes to these rows.
-            store(rows, base, load(rows, base) + total)
+            row = (record_ints[base + at.FIRST_ROW] + shard) * at.ROW
+            store(rows, row, load(rows, row) + total)
 
 
 @inlined

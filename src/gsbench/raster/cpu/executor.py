@@ -17,6 +17,7 @@ from gsbench.raster.cpu.binning import (
     balance_tiles,
     fill_shards,
     pair_shards,
+    place_rows,
     sort_by_depth,
     start_tiles,
 )
@@ -42,8 +43,7 @@ from gsbench.scene.types import Camera
 from gsbench.system.resources import available_cores
 
 # Fixed numbers, so that results have the same bits for any number of threads. Each shard of tiles
-# sums gradients in its own rows (64 bytes per Gaussian); other numbers of shards would change the
-# order of additions.
+# sums gradients in its own rows; other numbers of shards would change the order of additions.
 GAUSSIAN_SHARDS = 16
 TILE_SHARDS = 8
 
@@ -215,13 +215,16 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         lifetime = Lifetime()
         arena = self._scratch.lease(lifetime)
         count, take = len(gaussians), self._tensors.empty
-        rows = arena.take("rows", (TILE_SHARDS, count * at.ROW), np.float32, zero=True)
+        edges, frame = _edges(count), passed.frame
+        placing = frame.record_ints, frame.tile_shard, frame.camera.tiles_x
+        number = place_rows(edges[:-1], passed.visible, *placing)
+        rows = arena.take("rows", (number * at.ROW,), np.float32, zero=True)
         g_image, g_alpha = (
             np.empty(0, np.float32) if given is None else given.numpy().reshape(-1)
             for given in g_pixels
         )
         want_absolute = None if request.absolute is None else True
-        composited = passed.frame, g_image, g_alpha, rows, want_absolute
+        composited = frame, g_image, g_alpha, rows, want_absolute
         g_screen = take((count, 2))
         shape = self.extras[request.extra] if request.extra else ()
         g_extra = take((count, *shape)) if shape else None
@@ -231,18 +234,18 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
             _rows_or_none(g_extra, math.prod(shape)),
         )
         inputs = (
-            _edges(count),
+            edges,
             passed.visible,
             parameter_arrays(gaussians),
             request.degree,
-            passed.frame,
+            frame,
         )
         own = (
             at.new_parameters(GAUSSIAN_SHARDS * at.CHUNK)
             if gradients is None
             else parameter_arrays(gradients)
         )
-        outputs = rows.reshape(-1), (own, *of_pixels), adam
+        outputs = rows, (own, *of_pixels), adam
         try:
             memory = at.kernel_memory(TILE_SHARDS)
             self._runner.run(TILE_SHARDS, composite_backward_tiles, memory, *composited)

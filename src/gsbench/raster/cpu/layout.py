@@ -27,13 +27,14 @@ RED, GREEN, BLUE = 6, 7, 8
 SLOPE = 9  # -b / c: dy / dx of the highest point of a vertical line
 RIGHTMOST_Y = 10  # px; dy of the rightmost point of the contour alpha = 1/255
 DEPTH = 11  # view z
+FIRST_ROW = 11  # in its place for the backward pass: see `binning.place_rows`
 # The remaining entries are int32.
 TILES_X, TILES_Y = 12, 13  # tiles that the contour can touch: first + 65536 past-the-last
 INDEX = 14  # of the Gaussian
 CLAMPED = 15  # bit c: colour channel c was below 0
 
 # A row has the gradient sums of one Gaussian over the pixels of one shard of tiles, with h = d loss
-# / d log(alpha).
+# / d log(alpha). A record has rows for the shards from that of its first tile to that of its last.
 ROW = LANES
 SUM_H, SUM_H_T, SUM_H_Y, SUM_H_TT, SUM_H_TY, SUM_H_YY = SUM_LANES[:6]
 SUM_RED, SUM_GREEN, SUM_BLUE = SUM_LANES[6:9]

@@ -11,6 +11,7 @@ import numpy as np
 from gsbench.raster.base import CONSTANTS
 from gsbench.raster.cpu import layout as at
 from gsbench.raster.cpu.adam import step_all
+from gsbench.raster.cpu.binning import shards_of
 from gsbench.raster.cpu.geometry import (
     F0,
     LOG2_E,
@@ -63,7 +64,6 @@ from gsbench.raster.cpu.simd import (
     mask_bits,
     maximum,
     minimum,
-    prefetch,
     prefetch_far,
     scatter,
     select,
@@ -79,7 +79,6 @@ ALPHA_MIN, LOG2_ALPHA_MIN = CONSTANTS.alpha_min, math.log2(CONSTANTS.alpha_min)
 MAX_CENTER, MAX_VARIANCE = CONSTANTS.max_center, CONSTANTS.max_variance
 ZERO, HALF, ONE, TWO, FOUR = (np.float32(value) for value in (0, 0.5, 1, 2, 4))
 
-AHEAD = 16  # records ahead that the backward pass prefetches
 FAR = 64  # Gaussians ahead whose harmonics are prefetched
 ALL_LANES = np.uint64((1 << LANES) - 1)
 # entries of a shard's flags: number of visible Gaussians; 1 if a value is bad
@@ -263,14 +262,7 @@ def _row_sums(array, place):
 
 
 @inlined
-def _first_shard(record_ints, base, v, tile_shard):
-    """The shard of the first tile that the record at ``base`` can touch."""
-    column, row = record_ints[base + at.TILES_X] & 0xFFFF, record_ints[base + at.TILES_Y] & 0xFFFF
-    return tile_shard[row * v.tiles_x + column]
-
-
-@inlined
-def _take_rows(record, count, past, v, record_ints, tile_shard, rows, indices, sums):
+def _take_rows(record, count, v, record_ints, tile_shard, rows, indices, sums):
     """Sum the gradient rows of ``count`` records over their shards, and clear the rows.
 
     ``sums`` [16 * 16] gets one row per entry of a gradient row; ``indices`` [16] gets the
@@ -278,21 +270,15 @@ def _take_rows(record, count, past, v, record_ints, tile_shard, rows, indices, s
     """
     # Rows are cleared here, while they are in the cache; clearing them before the backward pass
     # would load them again.
-    shard_rows = len(record_ints)  # a row is as long as a record
-    for lane in range(count):
-        ahead = min(record + lane + AHEAD, past - 1) * at.RECORD
-        prefetch(rows, _first_shard(record_ints, ahead, v, tile_shard) * shard_rows + ahead)
-        prefetch(record_ints, min(record + lane + 3 * AHEAD, past - 1) * at.RECORD)
     for lane in range(count):
         base = (record + lane) * at.RECORD
         indices[lane] = record_ints[base + at.INDEX]
-        past_x, past_y = record_ints[base + at.TILES_X] >> 16, record_ints[base + at.TILES_Y] >> 16
-        last = tile_shard[(past_y - 1) * v.tiles_x + past_x - 1]
+        first, last = shards_of(record_ints, base, tile_shard, v.tiles_x)
+        own = record_ints[base + at.FIRST_ROW]
         total = splat(ZERO)
-        for shard in range(_first_shard(record_ints, base, v, tile_shard), last + 1):
-            row = shard * shard_rows + base
-            total += load(rows, row)
-            store(rows, row, splat(ZERO))
+        for row in range(own + np.int64(first), own + np.int64(last) + 1):
+            total += load(rows, row * at.ROW)
+            store(rows, row * at.ROW, splat(ZERO))
         store(sums, lane * LANES, total)
     for lane in range(count, LANES):
         indices[lane] = indices[count - 1]
@@ -307,7 +293,7 @@ def backproject_shards(
     """Write the gradients of the shards ``first`` to ``past`` and clear their ``rows``.
 
     Shard s has the Gaussians from ``edges[s]`` to ``edges[s + 1]``, of which ``visible[s]`` have
-    records. ``rows`` is [shards of tiles * N * 16]. ``outputs`` are the gradients by the
+    records. ``rows`` is [rows * 16]. ``outputs`` are the gradients by the
     parameters, by the screen points [N, 2], the absolute ones [N, 2] and the extra output
     [N, C]; the last two are empty if not requested.
 
@@ -389,7 +375,7 @@ def _backproject(memory, record, past, origin, gaussians, degree, frame, rows, o
     own = indices[LANES:]  # rows of the gradients by the parameters
     sums, colors = floats[:MATRIX], floats[3 * MATRIX :]
     count = min(LANES, past - record)
-    _take_rows(record, count, past, v, record_ints, frame.tile_shard, rows, indices, sums)
+    _take_rows(record, count, v, record_ints, frame.tile_shard, rows, indices, sums)
     for lane in range(LANES):
         own[lane] = indices[lane] - origin
     mean = gather_vectors(gaussians.means, indices)
