@@ -160,7 +160,7 @@ def test_a_speed_that_is_measured_can_be_declared(base):
     assert checked(base, "eval.primary=fps", "eval.fps=[640,480]")["eval"]["primary"] == "fps"
 
 
-@pytest.mark.parametrize("place", ["densify", "eval.extra.edges"])
+@pytest.mark.parametrize("place", ["densify", "raster", "eval.extra.edges"])
 def test_hash_follows_the_source_of_a_users_class(base, place, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(tmp_path))
     own = [f"{place}._target_=own_class.Mine", "allow_targets=[own_class]"]
