@@ -26,7 +26,7 @@ from gsbench.words import did_you_mean
 PACKAGE = "gsbench"
 # groups that name one class each; `eval.extra` names any number
 COMPONENTS = ("init", "densify", "raster", "tracking")
-# what any configuration may do
+# lists of all that needs no permission
 ALLOWED: dict[str, list[str]] = table_beside(__file__, "allowed.yaml")
 UNQUOTED = re.compile(r"[\w./:+-]+")  # a name that needs no quotes in a list on the command line
 
