@@ -2,11 +2,13 @@
 
 import json
 from contextlib import contextmanager
+from pathlib import Path
 from shlex import split
 
 import pytest
 
 from gsbench.errors import InputError
+from gsbench.parsing import table_beside
 
 
 @contextmanager
@@ -21,6 +23,11 @@ def refusal(pattern):
     with pytest.raises(InputError, match=pattern) as caught:
         yield caught
     assert "\n" not in str(caught.value)
+
+
+def table(test, name):
+    """The cases ``name`` in the YAML file beside a test's file, which has its name."""
+    return table_beside(test, f"{Path(test).stem}.yaml")[name]
 
 
 def write(path, content):

@@ -11,7 +11,8 @@ import pytest
 from gsbench import __version__, cli
 from gsbench.errors import GsbenchError, InputError
 from gsbench.system.stopping import Stopped
-from gsbench.verbs import load_verb
+from gsbench.verbs import VERBS, load_verb
+from tests.helpers import table
 from tests.processes import completed
 
 pytestmark = pytest.mark.usefixtures("runs")
@@ -19,7 +20,7 @@ pytestmark = pytest.mark.usefixtures("runs")
 # ---- the frame
 
 
-@pytest.mark.parametrize("verb", list(cli.VERBS))
+@pytest.mark.parametrize("verb", list(VERBS))
 def test_every_verb_has_help_without_torch(verb, tmp_path):
     with pytest.raises(SystemExit) as done:
         load_verb(verb)(["--help"], tmp_path)
@@ -63,29 +64,19 @@ def test_errors_become_a_line_and_an_exit_code(error, code, text, monkeypatch, c
 
 @pytest.mark.parametrize(
     "words, asked",
-    [
-        ("status x", ("verb", ["x"], "runs")),
-        ("status --help", ("verb", ["--help"], "runs")),
-        ("help", ("help", [])),
-        ("--help seed=1 -h", ("help", ["seed=1"])),
-        ("seed=1 -h", ("help", ["seed=1"])),
-        *((word, ("trials", [word])) for word in ("seed=1", "+a", "~a", "-m", "status=1")),
-        ("--version seed=1", ("trials", ["--version", "seed=1"])),
-        ("", ("trials", [])),
-    ],
+    table(__file__, "first"),
 )
 def test_the_first_word_tells_what_is_asked(words, asked, monkeypatch):
     found = []
     monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
     monkeypatch.setattr(
-        cli,
-        "load_verb",
+        "gsbench.verbs.load_verb",
         lambda name: lambda argv, runs: found.append(("verb", argv, runs.name)) or 7,
     )
     monkeypatch.setattr(cli, "_help", lambda argv: found.append(("help", argv)) or 7)
     monkeypatch.setattr(cli, "_trials", lambda argv: found.append(("trials", argv)) or 7)
     assert cli.run(words.split()) == 7
-    assert found == [asked]
+    assert [list(one) for one in found] == [asked]
     assert os.environ["PYTHONSAFEPATH"] == "gsbench"
 
 
@@ -112,7 +103,7 @@ def test_an_error_stays_a_line_whatever_it_quotes(monkeypatch, capfd):
     def write(argv, runs):
         raise OSError(errno.ENOSPC, "full")
 
-    monkeypatch.setattr(cli, "load_verb", lambda name: write)
+    monkeypatch.setattr("gsbench.verbs.load_verb", lambda name: write)
     assert cli.run(["status"]) == 1
     assert " is full: free some space" in capfd.readouterr().err
 
@@ -146,7 +137,7 @@ def test_help_lists_verbs_and_choices_also_of_the_users_folders(tmp_path, said):
     (tmp_path / "own/densify/calm.yaml").touch()
     shown = said("--config-dir own --help")
     assert shown.startswith(cli.USAGE)
-    assert [name for name in cli.VERBS if f"\n  {name} " not in shown] == []
+    assert [name for name in VERBS if f"\n  {name} " not in shown] == []
     assert "calm" in shown
 
 

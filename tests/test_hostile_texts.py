@@ -13,7 +13,7 @@ from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import LockHolder
 from gsbench.tracking.trial import TrackedTrial
 from gsbench.words import markdown_code, markdown_text
-from tests.helpers import change_json, read_json, write, write_lines
+from tests.helpers import change_json, read_json, table, write, write_lines
 from tests.trials import write_runs
 
 BEGIN = "FORGED"  # no line of an output may begin with it
@@ -21,39 +21,7 @@ HOSTILE = f"a\n{BEGIN}: better in PSNR\x1b[31m`![p](http://e)` <img src=x>\\<img
 # texts that name the trial's folder, or are one of a few words: others are refused
 FIXED = ("status", "experiment", "scene", "init", "densify", "evaluated_from")
 RECORDS = ("trained_by", "initial_cloud", "twins", "budget", "code", "raster_proof")
-FULL = {
-    "trained_by": {"program": "p", "version": "1", "said": "s", "command": ["c"]},
-    "metric_facts": {"sharp": {"label": "Sharp", "direction": 1, "unit": "u"}},
-    "metrics": {"psnr": 20.0, "ssim": 0.8, "sharp": 1.0},
-    "unavailable": {"lpips_alex": "no weights"},
-    "awaited": ["lpips_alex"],
-    "initial_cloud": {
-        "seen": 1.0,
-        "color_agreement": 0.5,
-        "identical": 0.0,
-        "far": 0,
-        "spread": 1.0,
-        "warnings": ["few points"],
-    },
-    "twins": {"left_out": {"a.png": "b.png"}, "near": {"view000": "c.png"}},
-    "budget": {"max_gaussians": 5, "cap": "soft"},
-    "split": "every_nth",
-    "held_out": "every 8th view",
-    "init_report": {"notes": ["n"], "m": {"k": "v"}},
-    "renders": {"from": "folder"},
-    "code": {"sources": {"mine": "1"}, "packages": {"eval": "2"}, "commit": "abc", "edited": True},
-    "machine": {"cpu": "c", "gpu": "g"},
-    "raster_proof": {
-        "raster": "triton",
-        "device": "d",
-        "versions": {"torch": "1"},
-        "errors": {"image": 0.1},
-        "failures": ["f"],
-        "seconds": 1.0,
-    },
-    "raster_passed_over": ["triton: no GPU"],
-    "measured": "2026-01-01T00:00:00Z",
-}
+FULL = table(__file__, "full")
 COMMANDS = (
     "tables exp",
     "tables exp --format csv --out out/csv",

@@ -34,7 +34,7 @@ from gsbench.parsing import (
     without_byte_order_mark,
 )
 from gsbench.runs.trial_files import iterate_rows
-from tests.helpers import refusal, write
+from tests.helpers import refusal, table, write
 
 
 @pytest.mark.skipif(not Path("/proc/meminfo").exists(), reason="needs /proc")
@@ -218,23 +218,7 @@ class Row(Record):
 
 @pytest.mark.parametrize(
     "content, reason",
-    [
-        ("{", "is not JSON (EOF while parsing an object at line 1 column 1)"),
-        ("{}", "is damaged: it lacks 'amount'"),
-        ("3", "is damaged: Input should be an object"),
-        ('{"amount": "27"}', "is damaged: amount is '27' (input should be a valid number)"),
-        ('{"amount": -1}', "is damaged: amount is -1 (input should be greater than or equal to 0)"),
-        ('{"amount": 1e31}', "is damaged: amount is 1e+31 (input should be less than or equal"),
-        ('{"amount": NaN}', "is damaged: amount is nan (input should be a finite number)"),
-        ('{"amount": 1, "name": ""}', "is damaged: name is '' (string should have at least 1"),
-        ('{"amount": 1, "name": "wrong"}', "is damaged: Name is wrong"),
-        ('{"amount": 1, "counts": {"b": -1}}', "is damaged: counts.b is -1 ("),
-        ('{"amount": 1, "counts": {"b": 9223372036854775808}}', "is damaged: counts.b is "),
-        ('{"amount": 1, "whole": -9223372036854775808}', "is damaged: whole is "),
-        ('{"amount": 1, "whole": 9223372036854775808}', "is damaged: whole is "),
-        ('{"amount": 1, "number": -2e30}', "is damaged: number is -2e+30"),
-        ('{"amount": true}', "is damaged: amount is True"),
-    ],
+    table(__file__, "records"),
 )
 def test_a_record_that_does_not_fit_is_described(content, reason):
     with pytest.raises(DamagedError) as error:
@@ -256,16 +240,7 @@ def test_a_record_is_kept_without_its_defaults_and_unknown_keys_are_ignored(tmp_
 
 @pytest.mark.parametrize(
     "content, amounts, warned",
-    [
-        ('{"amount": 1}\n{"amount": 2}\n', [1, 2], ""),
-        ('{"amount": 1}\r\n{"amount": 2}', [1, 2], ""),
-        ("", [], ""),
-        ('{"amount": 1}\n{"amou', [1], ""),  # a killed process
-        ('{"amount": 1}\n{"amou\n', [1], "from line 2 on, which is not JSON"),
-        ('{"amount": 1}\n{"amou\n{"amount": 3}', [1], "from line 2 on, which is not JSON"),
-        ('{"amount": -1}\n{"amount": 2}\n', [], "from line 1 on, which is damaged: amount"),
-        ('{"amount": 1}, {"amount": 2}\n', [], "from line 1 on, which is not JSON"),
-    ],
+    table(__file__, "rows"),
 )
 def test_rows_are_read_up_to_the_first_damaged_one(content, amounts, warned, caplog):
     rows = list(iterate_rows(content.encode(), Row, Path("a.jsonl")))

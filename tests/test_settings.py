@@ -29,6 +29,7 @@ from gsbench.settings import (
     is_folder_name,
     unknown_setting,
 )
+from tests.helpers import table
 
 if TYPE_CHECKING:
     from decimal import Decimal
@@ -55,35 +56,7 @@ class Options:
 
 @pytest.mark.parametrize(
     "name, given, words",
-    [
-        ("count", 0, "options.count must be a whole number above 0, got 0"),
-        ("count", 1.5, "options.count must be a whole number above 0, got 1.5"),
-        ("count", True, "options.count must be a whole number above 0, got true"),
-        ("count", None, "options.count must be a whole number above 0, got null"),
-        ("count", [1], "options.count must be a whole number above 0, got [1]"),
-        ("rate", math.inf, "options.rate must be a number above 0, got inf"),
-        ("rate", math.nan, "options.rate must be a number above 0, got nan"),
-        ("rate", "fast", "options.rate must be a number above 0, got 'fast'"),
-        ("share", 1, "options.share must be a number in [0, 1), got 1"),
-        ("kind", "curve", "options.kind must be 'soft' or 'hard', got 'curve'"),
-        ("limit", 1, "options.limit must be a whole number of at least 2 or null, got 1"),
-        ("color", [0, 0], "options.color must be a list of 3, each a number, got [0, 0]"),
-        (
-            "color",
-            [0, 0, True],
-            "options.color must be a list of 3, each a number, got [0, 0, True]",
-        ),
-        (
-            "steps",
-            [3, -1],
-            "options.steps must be a list, each a whole number above 0, got [3, -1]",
-        ),
-        ("label", {"a": 1}, "options.label must be a text, got {'a': 1}"),
-        ("digits", "x", "options.digits must be digits only, got 'x'"),
-        ("flag", "maybe", "options.flag must be true or false, got 'maybe'"),
-        ("plain", "x", "options.plain must be a whole number, got 'x'"),
-        ("folder", 3.5, "options.folder must be of type Path, got 3.5"),
-    ],
+    table(__file__, "errors"),
 )
 def test_errors_state_the_key_the_rule_and_the_value(name, given, words):
     with pytest.raises(InputError) as error:

@@ -19,7 +19,6 @@ try:
     from gsbench.files import checked_runs_folder, storage_errors
     from gsbench.logs import OutputError, begin_command, open_streams, printable_output
     from gsbench.system.programs import protect_environment
-    from gsbench.verbs import VERBS, load_verb
     from gsbench.words import did_you_mean
 except KeyboardInterrupt:
     print("gsbench: stopped before it began", file=sys.stderr)
@@ -117,6 +116,8 @@ def _require_current_folder() -> None:
 
 
 def _verb(name: str, argv: list[str]) -> int:
+    from gsbench.verbs import VERBS, load_verb  # here, for a quick start
+
     if name not in VERBS:
         from gsbench.config.groups import hint_for
 
@@ -157,6 +158,7 @@ def _trials(argv: list[str]) -> int:
 
 def _help(words: list[str]) -> int:
     from gsbench.config.groups import options_text
+    from gsbench.verbs import VERBS
 
     folders: list[Path] = []
     if words:  # the choices in the user's folders are listed too
@@ -166,8 +168,8 @@ def _help(words: list[str]) -> int:
         folders = searched_folders(parse(words)[0])
     print(USAGE)
     print("Verbs (gsbench VERB --help):")
-    for name, (_, text) in VERBS.items():
-        print(f"  {name:<10} {text}")
+    for name, row in VERBS.items():
+        print(f"  {name:<10} {row['purpose']}")
     print("\n" + options_text(folders))
     return DONE
 

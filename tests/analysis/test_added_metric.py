@@ -4,7 +4,7 @@ import pytest
 
 from gsbench.analysis.cells import select_trials
 from gsbench.analysis.tables import build_table
-from tests.analysis.helpers import loaded, page_of, table_of
+from tests.analysis.helpers import loaded, table_of
 from tests.helpers import refusal
 from tests.trials import write_trial
 
@@ -29,10 +29,6 @@ def test_tables_show_trials_with_and_without_the_metric(runs):
     assert shown == {(arm, value) for arm in ("adc", "volumetric") for value in ("–", "mine.Mae")}
     assert len(select_trials(experiment.trials, {KEY: "mine.Mae"})) == 4
     assert len(select_trials(experiment.trials, {KEY: "None"})) == 4
-
-
-def test_the_report_names_the_added_metric(runs):
-    assert "mine.Mae" in page_of(runs)
 
 
 def test_a_null_setting_equals_a_missing_key(tmp_path):

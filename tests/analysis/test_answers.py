@@ -90,15 +90,6 @@ def test_another_baseline_that_is_chosen_later_is_not_tested(tmp_path):
     assert (str(answer.arm), answer.badge) == ("sfm-adc", "NOT TESTED")
 
 
-def test_a_look_after_each_seed_ends_at_ever_smaller_levels(tmp_path):
-    """Declare eight seeds, look after each: there is no verdict before all are done."""
-    write_runs(tmp_path, scenes=("garden",), seeds=range(8), **CLEAR)
-    ask_about(tmp_path)
-    for path in itertools.chain(*(tmp_path.glob(f"exp/*/*/*-seed{k}") for k in range(3, 8))):
-        (path / "results.json").unlink()
-    assert badges(tmp_path) == {"sfm-volumetric": "STOPPED 6/16"}
-
-
 def test_seeds_that_are_added_until_it_pleases_cost_level(tmp_path):
     write_runs(tmp_path, scenes=("garden",), seeds=range(6))
     levels = [

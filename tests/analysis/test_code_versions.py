@@ -54,13 +54,6 @@ def test_the_newest_code_counts_and_one_line_names_all_earlier_versions(tmp_path
     assert words not in explain_cell("exp:garden:psnr:other", tmp_path)
 
 
-def test_settings_that_were_last_trained_with_other_code_are_folded(tmp_path):
-    write_trial(tmp_path, 0, "aaaaaaaa", MINE | {"densify.views": 5}, psnr=27.0, _code=code(OLD))
-    write_trial(tmp_path, 0, "bbbbbbbb", MINE | {"densify.views": 8}, psnr=28.0, _code=code(NEW))
-    experiment = loaded(tmp_path)
-    assert (len(experiment.trials), len(experiment.older), len(experiment.warnings)) == (1, 1, 1)
-
-
 @pytest.mark.parametrize(
     "old, new, part",
     [

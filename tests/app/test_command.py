@@ -16,29 +16,12 @@ from gsbench.launch.record import record
 from gsbench.runs.commands import read_history
 from gsbench.runs.trial_folder import TrialFolder
 from tests.app.stand_ins import trial
-from tests.helpers import refusal, write
+from tests.helpers import refusal, table, write
 
 
 @pytest.mark.parametrize(
     "changes, multirun, said",
-    [
-        ({}, False, None),
-        ({"hydra.sweeper.params": {"seed": "0,1"}}, True, None),
-        ({"hydra.sweeper.params": {"seed": "0,1"}}, False, "lists values: add -m"),
-        ({"hydra.sweeper.grids": [1]}, False, "lists values: add -m"),
-        ({"hydra.sweeper.grids": [1], "hydra.mode": "RUN"}, False, None),
-        ({"hydra.sweeper.params": "x"}, True, "must map settings to values"),
-        ({"launch.stop_when_decided": True}, True, None),
-        ({"launch.stop_when_decided": True}, False, "adds seeds to a sweep"),
-        ({"hydra.runtime.choices.hydra/launcher": "joblib"}, True, None),
-        ({"hydra.runtime.choices.hydra/launcher": "joblib"}, False, "launches sweeps: add -m"),
-        (
-            {"hydra.runtime.choices.hydra/launcher": "joblib", "launch.name": "local"},
-            True,
-            "two launchers",
-        ),
-        ({"launch.name": "local"}, True, None),
-    ],
+    table(__file__, "settings"),
 )
 def test_settings_of_a_sweep_need_a_sweep(changes, multirun, said):
     runtime = {"choices": {"hydra/launcher": "gsbench"}}
@@ -58,16 +41,7 @@ CHANGE = "change what the lines above name, then give the command again"
 
 @pytest.mark.parametrize(
     "ends, code, advice",
-    [
-        ("dd", 0, "2 of 2 trials done; the table: gsbench tables x"),
-        ("d", 0, "1 of 1 trials done; the table: gsbench tables x; renders and model: "),
-        ("df", 1, "1 of 2 trials done; again: gsbench retry x"),
-        ("bf", 1, "0 of 2 trials done; again: gsbench retry x"),
-        ("bb", 2, f"0 of 2 trials done; {CHANGE}"),
-        ("fr", 1, f"0 of 2 trials done; {CHANGE}"),
-        ("dq", 0, "1 of 2 trials done; how far the others are: gsbench status x"),
-        ("bq", 1, "0 of 2 trials done; how far the others are: gsbench status x"),
-    ],
+    table(__file__, "ends"),
 )
 def test_the_end_of_a_command_tells_what_to_do_next(tmp_path, caplog, capsys, ends, code, advice):
     caplog.set_level(logging.INFO, "gsbench")

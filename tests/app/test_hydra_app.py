@@ -17,7 +17,7 @@ from gsbench.app.hydra_main import words_for_files, words_for_new_folder
 from gsbench.errors import GsbenchError, InputError
 from gsbench.launch.outcomes import Outcome
 from tests.app.stand_ins import done, trial
-from tests.helpers import refusal
+from tests.helpers import refusal, table
 from tests.trials import write_results
 
 GRID = "hydra._internal.core_plugins.basic_sweeper.BasicSweeper"
@@ -166,16 +166,7 @@ def test_a_single_trial_with_hydras_log_runs_where_the_command_was_given(ran, ca
 
 @pytest.mark.parametrize(
     "sweeper, sign",
-    [
-        ({"direction": "maximize"}, 1),
-        ({"direction": "MAXIMIZE"}, 1),
-        ({"direction": "minimize"}, -1),
-        ({}, -1),
-        ({"optim": {"maximize": True}}, 1),
-        ({"optim": {"maximize": False}}, -1),
-        ({"ax_config": {"experiment": {"minimize": False}}}, 1),
-        ({"ax_config": {"experiment": {"minimize": True}}}, -1),
-    ],
+    table(__file__, "sweepers"),
 )
 def test_another_sweeper_gets_the_mean_over_the_seeds_towards_its_end(
     tmp_path, monkeypatch, sweeper, sign
@@ -245,18 +236,7 @@ OF_JOBS = "hydra.run.dir=${runs}/.hydra hydra.sweep.subdir=${hydra.job.num}"
 
 @pytest.mark.parametrize(
     "changes, typed, multirun, launch, added",
-    [
-        ({}, [], True, "serial", []),
-        ({"run": {"dir": "here"}}, [], False, "serial", OF_A_TRIAL.split()),
-        ({"output_subdir": "x", "job_logging": {"root": 1}}, [], True, "serial", OF_JOBS.split()),
-        (
-            {"sweep": {"dir": "a", "subdir": "b"}, "run": {"dir": "here"}},
-            ["hydra.output_subdir=null", "hydra/job_logging=none"],
-            True,
-            "local",
-            [],
-        ),
-    ],
+    table(__file__, "files"),
 )
 def test_hydra_writes_its_files_if_one_is_asked_for(
     monkeypatch, caplog, changes, typed, multirun, launch, added

@@ -6,7 +6,7 @@ import pytest
 
 from gsbench import cli
 from gsbench.app.command import compose_trials
-from tests.helpers import write
+from tests.helpers import table, write
 
 pytestmark = pytest.mark.usefixtures("runs")
 
@@ -28,31 +28,7 @@ def test_now_is_the_same_in_all_trials_of_a_sweep():
 
 @pytest.mark.parametrize(
     "words, text",
-    [
-        (
-            "+hydra.job.env_set.OMP_NUM_THREADS=1",
-            "hydra.job.env_set can change what runs",
-        ),
-        ("densify.interval=1000000000000000000000", "whole number of 64 bits"),
-        ("-m densify.interval=50,-1000000000000000000000", "whole number of 64 bits"),
-        ("'densify.interval=\"1000000000000000000000\"'", "whole numbers lie between"),
-        ("eval.at=[1000000000000000000000]", "whole number of 64 bits"),
-        (
-            "'+densify.x=[{a: 1000000000000000000000}]'",
-            "densify.x.0.a=1000000000000000000000 is not a whole number of 64 bits",
-        ),
-        ("-m seed=range(0,1000000000000000000000)", "lists more than 1,000,000 values"),
-        (
-            "-m +hydra.sweeper.tune.ranges=1 seed=0,1",
-            "hydra.sweeper.tune.ranges is not a setting",
-        ),
-        ("-m hydra/sweeper=basic hydra.sweeper.params=3 seed=0,1", "hydra.sweeper.params"),
-        ("-m +experiment=threshold hydra/sweeper=basic", "gsbench's own sweeper alone joins grids"),
-        ("hydra.sweeper.grids=[{seed:1}]", "add -m"),
-        ("-m densify=glob([av]*)", """'densify=glob("[av]*")'"""),
-        ("-m densify=choice([av,b)", "is not a setting like key=value"),
-        ("-m hydra/launcher=joblib seed=0,1 hydra.launcher.jobs=3", "n_jobs"),
-    ],
+    table(__file__, "impossible"),
 )
 def test_impossible_settings_are_refused_in_one_line(words, text, refused):
     if "hydra/launcher=joblib" in words:

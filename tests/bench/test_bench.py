@@ -249,8 +249,3 @@ def test_kernels_are_timed_and_put_back_when_a_step_fails():
         "similarity_rows",
     } <= times.keys()
     assert min(times.values()) >= 0
-
-
-def test_an_unknown_rasterizer_is_refused():
-    with refusal("nosuch"):
-        bench(split("--raster nosuch --no-memory"))

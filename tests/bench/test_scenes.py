@@ -8,14 +8,12 @@ from numpy.testing import assert_allclose, assert_array_equal
 from gsbench.bench.scenes import (
     SCENES,
     camera_before,
-    crowded_gaussians,
     frontal_camera,
     make_scene,
-    skewed_gaussians,
     trained_like_gaussians,
 )
 from gsbench.gaussians.ply import write_ply
-from gsbench.raster.reference import ReferenceRasterizer, project
+from gsbench.raster.reference import ReferenceRasterizer
 from tests.gaussians.helpers import random_gaussians
 
 
@@ -58,44 +56,6 @@ def test_scenes_do_not_change(kind, sums):
     """Measurements of different versions compare times of the same Gaussians."""
     found = [tensor.double().abs().sum().item() for tensor in SCENES[kind](500).tensors().values()]
     assert found == pytest.approx(sums, rel=1e-6)
-
-
-def longest_list(scene):
-    """The longest list of a tile over the mean one; a Gaussian counts in the tile of its mean."""
-    camera = frontal_camera(500, 375)
-    tile = (project(scene, camera).means.double() + 0.5).div(16).floor().long()  # [M, 2]
-    inside = (tile >= 0).all(-1) & (tile[:, 0] < 500 // 16) & (tile[:, 1] < 375 // 16)
-    lists = (tile[inside, 1] * 32 + tile[inside, 0]).bincount().double()
-    return (lists.max() / lists[lists > 0].mean()).item()
-
-
-def test_the_skewed_scene_has_the_skew_of_a_trained_model():
-    """A trained courtyard has 1,054 entries per block at most, and 117 on average."""
-    skewed, trained = skewed_gaussians(50_000), trained_like_gaussians(50_000)
-    assert longest_list(skewed) == pytest.approx(1054 / 117, rel=0.25)
-    assert longest_list(trained) < 2
-    moved = (skewed.means != trained.means).any(-1)
-    assert moved.float().mean() == pytest.approx(0.5, abs=0.01)
-    assert torch.equal(skewed.means[:, 2], trained.means[:, 2])
-    slopes = skewed.means[moved, :2] / skewed.means[moved, 2:]
-    # the spots' field, and two standard deviations beyond an outermost spot
-    inside = slopes.abs() < torch.tensor([0.5, 0.35]) + 2 * 0.05
-    assert inside.float().mean(0).min() > 0.97
-
-
-def test_a_twentieth_of_the_crowded_scene_is_over_one_tile():
-    camera = frontal_camera(1600, 1060)
-    crowded, trained = crowded_gaussians(50_000), trained_like_gaussians(50_000)
-    tiles = [
-        (project(scene, camera).means.double() + 0.5)
-        .div(16)
-        .floor()
-        .unique(dim=0, return_counts=True)
-        for scene in (crowded, trained)
-    ]
-    (places, lists), (_, others) = tiles
-    assert lists.max() > 0.045 * 50_000 > 100 * others.double().mean()
-    assert places[lists.argmax()].tolist() == [50, 33]  # the middle of the picture
 
 
 def test_a_scene_for_timing_has_two_views_of_noise(tmp_path):

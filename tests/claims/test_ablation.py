@@ -13,7 +13,7 @@ from gsbench.config.groups import options
 from gsbench.densify.volumetric import Volumetric
 from gsbench.runs.config_hash import config_hash
 from gsbench.settings import Switch
-from gsbench.verbs.ablate import (
+from gsbench.verbs.planning import (
     choose_switches,
     declared_switches,
     effective_run,

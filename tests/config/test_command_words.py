@@ -19,7 +19,7 @@ from gsbench.config.command_words import (
 from gsbench.config.groups import hint_for, options
 from gsbench.config.overrides import is_sweep, key_of, parse_word, value_text
 from gsbench.config.search_path import check_search_path, search_path, searched_folders
-from tests.helpers import refusal
+from tests.helpers import refusal, table
 
 
 def test_options_and_words_may_come_in_any_order(tmp_path):
@@ -41,21 +41,8 @@ def test_options_and_words_may_come_in_any_order(tmp_path):
 
 @pytest.mark.parametrize(
     "words, said",
-    [
-        ("--config-name mine", "--config-name: gsbench's main configuration is its own: write "
-            "yours to FOLDER/experiment/mine.yaml"),
-        ("-cn=mine", "give --config-dir FOLDER +experiment=mine"),
-        ("-cp here", "+experiment=NAME"),
-        ("--config-path=here", "+experiment=NAME"),
-        ("--config-name", "+experiment=NAME"),
-        ("--scene.path=x", "a setting has no dashes: scene.path=…"),
-        ("--mutlirun", "did you mean --multirun?"),
-        ("--config-dir . -cd .", "names one folder"),
-        ("--config-dir . hydra.searchpath=[a]", "names one folder"),
-        ("--config-dir", "--config-dir needs a folder"),
-        ("--config-dir /nowhere", "--config-dir /nowhere: no such folder"),
-    ],
-)  # fmt: skip
+    table(__file__, "options"),
+)
 def test_options_that_do_not_exist_are_explained(words, said):
     with refusal(re.escape(said)):
         parse(split(words))
@@ -63,27 +50,7 @@ def test_options_that_do_not_exist_are_explained(words, said):
 
 @pytest.mark.parametrize(
     "words, said",
-    [
-        (["scene=courtyard", "+densify.x=1", "~densify.x", "~raster.x", "init={a:1}"], None),
-        (["densify=adc,mcmc", "+experiment=demo", "hydra.job.name=a", "seed=range(3)"], None),
-        (["~seed"], "a setting cannot be removed"),
-        (["~densify"], "a setting cannot be removed"),
-        (["~train.x"], "a setting cannot be removed"),
-        (["hydra.job.name=a,b"], "apply to all trials"),
-        (["hydra/launcher=a,b"], "apply to all trials"),
-        (["scene@x=courtyard"], "leave out the @"),
-        (["densify=[a]"], "choose one by its name: densify=absgrad, "),
-        (["densify=null"], "choose one by its name"),
-        (["experiment=demo"], "write +experiment=NAME (choose: budget, "),
-        (["+experiment=null"], "write +experiment=NAME"),
-        (["experiment/x=demo"], "write +experiment=NAME"),
-        (["experiment=[a,b]"], "write +experiment=NAME"),
-        (["+experiment=a,b"], "two experiments are two sweeps"),
-        (["+experiment=[a,b]"], "two experiments are two sweeps"),
-        (["+experiment=a", "seed=1", "+experiment=b"], "+experiment=a +experiment=b: two"),
-        (["tracking.uri=1e3"], "read as the number 1000.0"),
-        (["a=" + "[" * 41 + "]" * 41], "opens more than 40 brackets"),
-    ],
+    table(__file__, "words"),
 )
 def test_words_without_effect_are_refused(words, said):
     with refusal(said and re.escape(said)):
@@ -101,24 +68,8 @@ def test_brackets_are_counted_while_they_are_open():
 
 @pytest.mark.parametrize(
     "word, said",
-    [
-        ("hydra.searchpath=[file:///,/,pkg://gsbench.config,pkg://json/tool]", None),
-        ("hydra.searchpath=[file:///nosuch]", "names /nosuch: no such folder"),
-        ("hydra.searchpath=[pkg://json/nosuch]", r"names json\.nosuch: no such package"),
-        ("hydra.searchpath=[pkg://other]", r"imports a package; if you trust it, add "
-            r"allow_targets=\[json,other\]"),
-        ("hydra.searchpath=[pkg://jsonfield.a]", r"allow_targets=\[json,jsonfield\]"),
-        ("hydra.searchpath=[http://a]", "neither a folder .file://…. nor a package"),
-        *(
-            # Hydra 1.3 knows one of these spellings, 1.4 all
-            (f"{key}={value}", r"allow_targets=\[json,strange\]|is not a setting")
-            for key in ("hydra.searchpath", "hydra[searchpath]")
-            for value in ("[pkg://strange]", "extend_list('pkg://strange')")
-        ),
-        ("hydra.other=[pkg://other]", None),
-        ("hydra.searchpath=[pkg://a],[pkg://b]", None),  # refused as a list of values
-    ],
-)  # fmt: skip
+    table(__file__, "packages"),
+)
 def test_packages_of_settings_need_permission(word, said):
     with refusal(said):
         check_search_path(["a=1", word], ["json"])

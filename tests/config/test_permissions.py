@@ -16,67 +16,22 @@ from gsbench.config.build import build
 from gsbench.config.command_words import typed_permissions
 from gsbench.config.compose import Trial, compose_one
 from gsbench.config.overrides import value_text
-from gsbench.config.permissions import permission_advice
-from gsbench.config.trust import ADDRESS_VARIABLES, check_permissions, foreign_address
+from gsbench.config.permissions import ALLOWED, permission_advice
+from gsbench.config.trust import check_permissions, foreign_address
 from gsbench.errors import InputError
 from gsbench.launch.record import record
 from gsbench.runs.commands import Idea, Ledger, append, command_now
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.install import conf_dir
-from tests.helpers import read_json, refusal, write
+from tests.helpers import read_json, refusal, table, write
 from tests.processes import completed
 from tests.strange import experiment, nested, no_trial
 from tests.strange import place as place
 
 pytestmark = pytest.mark.usefixtures("place")
 
-# settings that only a file names, and a part of the line that refuses them
-ADDRESS, DATABASE = "http://127.0.0.1:9", "sqlite:////tmp/theirs.db"
-PROGRAM_OF_A_FILE = {
-    "+densify.command": ["bash", "x"],
-    "+densify.version": "a",
-    "+densify.result": "x.ply",
-}
-STRANGE = {
-    "an address": ({"tracking.uri": ADDRESS}, f"add allow_targets=[{ADDRESS}]"),
-    "a database": ({"tracking.uri": DATABASE}, f"add allow_targets=[{DATABASE}]"),
-    "an address of W&B": (
-        {"tracking._target_": "gsbench.tracking.WandB", "tracking.uri": ADDRESS},
-        f"add allow_targets=[{ADDRESS}]",
-    ),
-    "a class": ({"densify._target_": "bomb.Bomb"}, "add allow_targets=[bomb]"),
-    "an initialiser": ({"init._target_": "bomb.Bomb"}, "add allow_targets=[bomb]"),
-    "a rasterizer": ({"+raster._target_": "bomb.Bomb"}, "add allow_targets=[bomb]"),
-    "a metric": ({"+eval.extra.x._target_": "bomb.Bomb"}, "add allow_targets=[bomb]"),
-    "a class inside a class": ({"+densify.x._target_": "os.mkdir"}, "add allow_targets=[os]"),
-    "a class and its permission": (
-        {"allow_targets": ["bomb"], "densify._target_": "bomb.Bomb"},
-        "allow_targets=[",
-    ),
-    "a tracker": ({"tracking._target_": "bomb.Bomb"}, "add allow_targets=[bomb]"),
-    "a reader": (
-        {"scene.kind": "reader", "scene._target_": "bomb.Bomb", "scene.path": "photos"},
-        "add allow_targets=[bomb]",
-    ),
-    "a program": (
-        {"densify._target_": "gsbench.densify.External", **PROGRAM_OF_A_FILE},
-        "add allow_targets=[bash]",
-    ),
-    "a program by another path": (
-        {"densify._target_": "gsbench.external.settings.External", **PROGRAM_OF_A_FILE},
-        "add allow_targets=[bash]",
-    ),
-    "a shell": ({"launch.setup": ["touch exploded"]}, "add allow_targets=[bash]"),
-    "an option of Slurm": ({"launch.sbatch.export": "ALL"}, "add allow_targets=[sbatch]"),
-    "a package of settings": ({"hydra.searchpath": ["pkg://bombs"]}, "add allow_targets=[bombs]"),
-    "a variable": ({"+hydra.job.env_set.PATH": "."}, "set variables in the shell"),
-    "a callback": ({"+hydra.callbacks.x._target_": "os.mkdir"}, "add allow_targets=[os]"),
-    "a launcher": ({"hydra.launcher._target_": "bomb.Bomb"}, "add allow_targets=[bomb]"),
-    "a folder to write": ({"runs": "theirs"}, "runs"),
-    "Hydra's folder": ({"hydra.run.dir": "theirs"}, "hydra.run.dir=theirs, a place to write"),
-    "Hydra's files": ({"hydra.output_subdir": "."}, "hydra.output_subdir=., a place to write"),
-    "a log": ({"hydra.job.name": "theirs"}, "hydra.job.name=theirs, a place to write"),
-}
+ADDRESS = "http://127.0.0.1:9"
+STRANGE = table(__file__, "strange")
 
 
 def strange_runs(settings):
@@ -162,7 +117,7 @@ KINDS += ("a class and its permission", "a folder to write", "a variable")
 def test_no_file_of_a_stranger_decides_what_runs_and_where_results_go(
     file, case, monkeypatch, refused
 ):
-    for variable in ADDRESS_VARIABLES:
+    for variable in ALLOWED["addresses"]:
         monkeypatch.delenv(variable, raising=False)
     settings, said = STRANGE[case]
     for function in ("verbs.ledger.run_trials", "app.command.run_batch"):
@@ -277,21 +232,7 @@ PROGRAM = [
 
 @pytest.mark.parametrize(
     "words, missing",
-    [
-        ([], "python"),
-        (["densify.version_command=[curl,strange]"], "python,curl"),
-        (["densify.version_command='bash -c true'"], "python,bash"),
-        (["+densify.environment.PATH=/strange"], "python,PATH"),
-        (
-            ["+densify.environment.LD_PRELOAD=/strange.so", "densify.version_command=[git]"],
-            "python,git,LD_PRELOAD",
-        ),
-        (["densify._target_=gsbench.external.settings.External"], "python"),
-        (
-            ["densify.command=['{p}','{data}']", "+densify.options.p=/strange/python"],
-            "/strange/python",
-        ),
-    ],
+    table(__file__, "programs"),
 )
 def test_every_program_and_variable_of_another_trainer_needs_permission(words, missing):
     with refusal(re.escape(f"add allow_targets=[{missing}] to the command")):
@@ -329,7 +270,7 @@ def test_a_version_command_cannot_use_values_that_are_known_later():
 
 def test_an_address_counts_if_it_is_typed_or_in_the_environment(place, monkeypatch, refused):
     """It counts as typed if a typed choice of a tracker has it, not if another file changes it."""
-    for variable in ADDRESS_VARIABLES:
+    for variable in ALLOWED["addresses"]:
         monkeypatch.delenv(variable, raising=False)
     began = []
     monkeypatch.setattr("gsbench.app.command.run_trials", lambda trials: began.extend(trials) or 0)
@@ -349,19 +290,10 @@ def test_an_address_counts_if_it_is_typed_or_in_the_environment(place, monkeypat
 
 @pytest.mark.parametrize(
     "tracking, allowed, found",
-    [
-        ({"uri": None}, [], ""),
-        ({"uri": "http://a"}, [], "http://a"),
-        ({"uri": "databricks"}, [], "databricks"),
-        ({"uri": "http://a", "enabled": False}, [], "http://a"),  # it counts for `sync`
-        ({"uri": "http://a"}, ["http://a"], ""),
-        ({"uri": "http://a"}, ["http://a/"], "http://a"),
-        ({"host": "http://a"}, [], "http://a"),  # an option of a user's own tracker
-        ({"hosts": ["http://a"]}, [], "['http://a']"),
-    ],
+    table(__file__, "addresses"),
 )
 def test_addresses_of_any_tracker_are_found(tracking, allowed, found, monkeypatch):
-    for variable in ADDRESS_VARIABLES:
+    for variable in ALLOWED["addresses"]:
         monkeypatch.delenv(variable, raising=False)
     assert foreign_address(tracking, allowed) == found
 

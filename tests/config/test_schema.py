@@ -21,7 +21,7 @@ from gsbench.pipeline.parts import build_metrics
 from gsbench.runs.config_hash import config_hash
 from gsbench.system.install import conf_dir
 from gsbench.train.options import STEPS
-from tests.helpers import refusal
+from tests.helpers import refusal, table
 
 GROUPS = ("scene", "init", "densify", "raster", "train", "eval", "tracking", "launch")
 
@@ -108,28 +108,7 @@ def test_the_demo_downloads_little_and_declares_what_it_measures():
 
 @pytest.mark.parametrize(
     "words, said",
-    [
-        ("scene.test_every=1", "scene.test_every"),
-        ("train.iterations=-1", "train.iterations must be a whole number of at least 0"),
-        ("eval.protocol=best", "eval.protocol"),
-        *((f"threads={n}", "whole number in [1, 4096] or 'auto'") for n in ("0", "4097", "1" * 13)),
-        ("name=a/b", "name"),
-        ("train.background=[0,0,2]", "train.background"),
-        ("eval.primary=lpips_vg", "did you mean lpips_vgg? (known are psnr, ssim, "),
-        ("eval.primary=sharpness", "is not a metric"),
-        ("eval.primary=lpips_alex eval.lpips=[vgg]", "is not measured: add alex to eval.lpips"),
-        ("eval.primary=flip eval.flip=false", "eval.flip=false"),
-        ("eval.more=[psnr]", "eval.more"),
-        ("eval.more=[gmsd,gmsd]", "at most once"),
-        ("eval.primary=gmsd", "add gmsd to eval.more"),
-        ("eval.primary=fps", "add eval.fps=[1920,1080]"),
-        ("eval.fps=[640]", "eval.fps must be two sides in px"),
-        ("eval.extra.fps._target_=mine.Mine allow_targets=[mine]", "none of"),
-        *(
-            (f"eval.extra.{name}._target_=mine.X allow_targets=[mine]", f"{name}: name your metric")
-            for name in split("psnr lpips view Edges a-b")
-        ),
-    ],
+    table(__file__, "errors"),
 )
 def test_errors_name_the_key(base, words, said):
     with refusal(re.escape(said)):
@@ -181,7 +160,7 @@ def test_a_speed_that_is_measured_can_be_declared(base):
     assert checked(base, "eval.primary=fps", "eval.fps=[640,480]")["eval"]["primary"] == "fps"
 
 
-@pytest.mark.parametrize("place", ["densify", "eval.extra.edges"])
+@pytest.mark.parametrize("place", ["densify", "raster", "eval.extra.edges"])
 def test_hash_follows_the_source_of_a_users_class(base, place, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(tmp_path))
     own = [f"{place}._target_=own_class.Mine", "allow_targets=[own_class]"]
@@ -195,42 +174,8 @@ def test_hash_follows_the_source_of_a_users_class(base, place, tmp_path, monkeyp
 
 @pytest.mark.parametrize(
     "changes, said",
-    [
-        ({"scene.transparent": "white", "train.background": [1, 1, 1]}, None),
-        ({"scene.transparent": "white", "train.background": [0, 0, 0]}, "background=[1,1,1]"),
-        ({"scene.transparent": "white", "train.background": [1, 1, 0]}, "background=[1,1,1]"),
-        ({"train.background": [0, 0, 0]}, None),
-        ({"train.iterations": 10, "eval.at": [3, 10]}, None),
-        ({"train.iterations": 10, "eval.at": [11]}, "names iteration 11, and train.iterations is 10"),
-        ({"train.iterations": 0}, "add densify=none"),
-        ({"train.iterations": 0, "densify._target_": "gsbench.densify.NoDensifier"}, None),
-        ({"densify.max_gaussians": 2**63 - 1, "densify.x": -(2**63) + 1}, None),
-        ({"densify.max_gaussians": 2**63}, "densify.max_gaussians=9223372036854775808 is not"),
-        ({"densify.x": {"y": -(2**63)}}, "densify.x.y=-9223372036854775808 is not"),
-        ({"init": None}, "init must be chosen, as init=NAME"),
-        ({"tracking": "none"}, "tracking must be chosen, as tracking=NAME"),
-        ({"densify._target_": None}, "densify._target_ must be the import path of a class"),
-        ({"init.name": "a/b"}, "init.name must be a plain folder name"),
-        ({"name": "Store"}, "name must be a plain folder name of at most 100 bytes, and none of store"),
-        ({"seed": 2**63 - 1, "device": "cuda:17", "threads": 4096}, None),
-        ({"device": "cuda:1234"}, "device must be auto, cpu, cuda or cuda:1"),
-        ({"launch.wait": False}, "needs launch=slurm, not serial"),
-        ({"launch.name": "slurm", "launch.wait": False}, None),
-        ({"launch.name": "slurm", "launch.wait": False, "launch.stop_when_decided": True}, "must be true"),
-        ({"launch.name": "slurm", "launch.timeout_min": 2, "launch.signal_seconds": 119}, None),
-        ({"launch.name": "slurm", "launch.timeout_min": 2, "launch.signal_seconds": 120}, "must be below"),
-        ({"launch.name": "local", "launch.timeout_min": 2, "launch.signal_seconds": 120}, None),
-        *(
-            ({"densify._target_": "gsbench.densify.External", key: value}, said)
-            for key, value, said in (
-                ("densify.x", 1, None),
-                ("eval.at", [3], "eval.at: another program"),
-                ("train.max_seconds", 5, "train.max_seconds: another program"),
-                ("train.resolution_schedule", "pictures", "another program has its own sizes"),
-            )
-        ),
-    ],
-)  # fmt: skip
+    table(__file__, "rules"),
+)
 def test_rules_between_settings(base, changes, said):
     with refusal(said and re.escape(said)):
         values = changed(base, changes)

@@ -12,7 +12,7 @@ import pytest
 
 from gsbench import cli
 from gsbench.config.compose import compose_one
-from tests.helpers import refusal, write
+from tests.helpers import refusal, table, write
 from tests.strange import ask, no_trial
 from tests.strange import place as place
 
@@ -20,36 +20,9 @@ pytestmark = pytest.mark.usefixtures("place")
 READ = "${oc.env:KEY}"
 SECRET = "sesame-q7xk"
 OUTSIDE = "Parent traversal ('..')"
-PLACE = "must name a group or a file"
 
 # the text of experiment/e.yaml, and what refuses it
-ENTRIES = {
-    "optional choice": ('[{optional /leak: "%s"}]', "which may be secret"),
-    "choice": ('[{/leak: "%s"}]', "which may be secret"),
-    "choice of gsbench's": ('[{/densify@x: "%s"}]', "which may be secret"),
-    "choice in a package": ('[{optional /leak@foo: "%s"}]', "which may be secret"),
-    "override": ('[{override /densify: "%s"}]', "which may be secret"),
-    "override of Hydra's": ('[{override /hydra/launcher: "%s"}]', "which may be secret"),
-    "list of choices": ('[{optional /leak: [a, "%s"]}]', "which may be secret"),
-    "part of a choice": ('[{optional /leak: "a_%s_b"}]', "which may be secret"),
-    "file": ('["%s"]', "which may be secret"),
-    "package": ('["/leak@%s"]', "which may be secret"),
-    "group": ('[{"optional /%s": a}]', "which may be secret"),
-    "nested": ('[{optional /leak: "${oc.select:no,%s}"}]', "which may be secret"),
-    "name in parts": ('[{optional /leak: "${oc.env:K${oc.env:USER}}"}]', "which may be secret"),
-    "written with escapes": (
-        r'[{optional /leak: "\x24{oc.env:KEY}"}]',
-        "which may be secret",
-    ),
-    "another resolver": ('[{optional /leak: "${oc.decode:KEY}"}]', "is not resolved here"),
-    "parent": ("[{/scene: ../../outside}]", OUTSIDE),
-    "parent in parts": ('[{optional /leak: .}, {/scene: "${leak}${leak}/x"}]', OUTSIDE),
-    "parent of a resolver": ('[{/scene: "${now:..}/x"}]', OUTSIDE),
-    "absolute choice": ("[{/scene: /outside}]", OUTSIDE),
-    "absolute file": ("[//outside]", PLACE),
-    "group with a parent": ("[{/../x: a}]", PLACE),
-    "file in parts": ('["/${scene}/x"]', PLACE),
-}
+ENTRIES = table(__file__, "entries")
 
 
 def said_of(words, capsys, monkeypatch):
@@ -160,12 +133,14 @@ def test_what_is_allowed_is_resolved_in_a_defaults_list(capsys, monkeypatch):
     [
         ("a: " + "[" * 3000 + "]" * 3000, "more than 40 levels"),
         ("a: " + "9" * 100_000, "a word of 100,000 characters"),
-        ("a: &a [" + "x," * 300 + "]\nb: &b [" + "*a," * 300 + "]\nc: [" + "*b," * 300 + "]",
-         "more than 100,000 values"),
+        (
+            "a: &a [" + "x," * 300 + "]\nb: &b [" + "*a," * 300 + "]\nc: [" + "*b," * 300 + "]",
+            "more than 100,000 values",
+        ),
         ("a: [", "is not YAML"),
         ("a: !!python/name:os.mkdir", "has the tag"),
     ],
-)  # fmt: skip
+)
 def test_a_file_that_cannot_be_read_is_named(text, said, capsys, monkeypatch):
     write(Path("conf/experiment/e.yaml"), text)
     line = said_of(["+experiment=e"], capsys, monkeypatch)

@@ -14,32 +14,10 @@ from gsbench.config.compose import compose_one
 from gsbench.config.explain import explained
 from gsbench.config.overrides import parse_word
 from gsbench.launch.jobs import TrialJob
-from tests.helpers import refusal
+from tests.helpers import refusal, table
 
 ARMS = "densify=adc,volumetric"
-SWEEPS = {  # words, and how often Hydra composes for them
-    "seeds": ([ARMS, "seed=0,1,2"], 3),
-    "values": (
-        [ARMS, "densify.max_gaussians=1000,2000", "train.iterations=100,1e3", "seed=0,1"],
-        3,
-    ),
-    "texts": (["scene=colmap", "scene.path=/a,/b,'/c d'", "seed=3,4"], 1),
-    "values for a name alike": (["scene.views=10,20", "scene.width=40,80"], 1),
-    "a value made of the seed": (["scene=colmap", "scene.path='/x/${seed}'", "seed=0,1,2"], 1),
-    "a value made of another": (
-        ["scene.width='${scene.height}','1${scene.height}'", "scene.height=30,40"],
-        1,
-    ),
-    "a name that is made": (
-        ["scene=colmap", "scene.path='/${${name}}'", "name=seed,device", "seed=1,2"],
-        1,
-    ),
-    "added": ([ARMS, "+densify.growth_cap=3,4", "seed=0,1"], 3),
-    "null": (["densify.max_gaussians=null,5", "seed=0,1"], 1),
-    "lists": (["eval.at=[],[3]", "train.iterations=10,20"], 1),
-    "a choice after its values": (["densify.max_gaussians=7,8", ARMS], 3),
-    "quotes": (['name="1"', "train.iterations=8,'9'", "seed=0,1"], 1),
-}
+SWEEPS = table(__file__, "sweeps")
 
 
 @pytest.fixture
@@ -93,23 +71,7 @@ def test_only_a_plain_seed_is_set_apart(words, others, seed):
 
 @pytest.mark.parametrize(
     "word, found",
-    [
-        ("a.b=2", {"a": {"b": 2, "c": [1]}}),
-        ("+a.d=2", {"a": {"b": 1, "c": [1], "d": 2}}),
-        ("++a.b=2", {"a": {"b": 2, "c": [1]}}),
-        ("++a.d={e: 2}", {"a": {"b": 1, "c": [1], "d": {"e": 2}}}),
-        ("+a.c=[2]", {"a": {"b": 1, "c": [2]}}),
-        ("a.c.0=2", {"a": {"b": 1, "c": [2]}}),
-        ("a={b: 2}", {"a": {"b": 2, "c": [1]}}),
-        ("~a.b", {"a": {"c": [1]}}),
-        ("~a.b=1", {"a": {"c": [1]}}),
-        ("~a.b=2", "there is no a.b=2"),
-        ("~a.d", "there is no a.d"),
-        ("+a.b=2", "a.b has a value already: leave out the plus"),
-        ("a.d=2", "a.d is not a setting"),
-        ("a={d: 2}", "a.d is not a setting"),
-        ("e=2", "e is not a setting"),
-    ],
+    table(__file__, "values"),
 )
 def test_a_value_is_set_added_or_removed_as_by_hydra(word, found):
     config, hydras = (OmegaConf.create({"a": {"b": 1, "c": [1]}}) for _ in range(2))

@@ -16,191 +16,18 @@ from gsbench.app.command import compose_trials
 from gsbench.config.build import build
 from gsbench.config.command_words import typed_permissions
 from gsbench.config.compose import compose_one
-from gsbench.config.permissions import SBATCH_RESOURCES, foreign_variables, load_class
+from gsbench.config.permissions import ALLOWED, foreign_variables, load_class
 from gsbench.runs.user_code import module_digest
 from gsbench.system.programs import allow_modules
-from tests.helpers import refusal, write
+from tests.helpers import refusal, table, write
 from tests.strange import BOMB, ask, experiment
 from tests.strange import place as place
 
 pytestmark = pytest.mark.usefixtures("place")
-MKDIR = {"_target_": "os.mkdir", "path": "exploded"}
-LOG_CALLBACK = "hydra.experimental.callbacks.LogJobReturnCallback"
-
-
-def calls(**settings):
-    """Settings of one of Hydra's own callbacks, with a stranger's further ``settings``."""
-    return {"hydra.callbacks.x": {"_target_": LOG_CALLBACK} | settings}
 
 
 # settings of a file, and a part of the line that refuses them
-STRANGE = {
-    "a callback": ({"hydra.callbacks.x": MKDIR}, "allow_targets=[os]"),
-    "below a callback": (calls(inner=MKDIR), "allow_targets=[os]"),
-    "in a list below a callback": (calls(inner=[{"a": [[MKDIR]]}]), "callbacks.x.inner.0.a.0.0."),
-    "among positional arguments": (calls(_args_=[MKDIR]), "_args_: gsbench makes no"),
-    "a module of the folder": (calls(inner={"_target_": "bomb.Bomb"}), "allow_targets=[bomb]"),
-    "beside Hydra's callbacks": (
-        calls(_target_="hydra.experimental.callbacks.pickle.loads"),
-        "allow_targets=[hydra]",
-    ),
-    "what gsbench's modules import": (
-        calls(_target_="gsbench.files.os.mkdir", path="exploded"),
-        "is not a class for hydra.callbacks.x",
-    ),
-    "a class of gsbench in a strange place": (
-        calls(_target_="gsbench.logs._QuietHandler", filename="exploded"),
-        "is not a class for hydra.callbacks.x",
-    ),
-    "a copy for a callback": ({"hydra.callbacks.x": "${densify}"}, "write the settings"),
-    "a copy in a callback": (calls(inner="${hydra.launcher}"), "write the settings"),
-    "all callbacks as a copy": ({"hydra.callbacks": "${train}"}, "hydra.callbacks"),
-    "a callback that allows itself": (
-        {"allow_targets": ["os"], "hydra.callbacks.x": MKDIR},
-        "no file can allow it",
-    ),
-    "below the sweeper": (
-        {"hydra": {"mode": "MULTIRUN", "sweeper": {"params": {"in": MKDIR}}}},
-        "sweeper.params.in._target_=os.mkdir",
-    ),
-    "beside the sweeper's settings": (
-        {"hydra.sweeper.grids": [MKDIR]},
-        "hydra.sweeper.grids.0",
-    ),
-    "a sweeper": (
-        {"hydra.sweeper._target_": "hydra_plugins.bomb.Bomb"},
-        "allow_targets=[hydra_plugins]",
-    ),
-    "an installed sweeper in another's place": (
-        {
-            "hydra.sweeper._target_": "hydra_plugins.hydra_optuna_sweeper.optuna_sweeper.OptunaSweeper"
-        },
-        "hydra.sweeper._target_=",
-    ),
-    "a text of a sweeper": (
-        {"hydra.sweeper.custom_search_space": "bomb.Bomb"},
-        "allow_targets=[hydra.sweeper]",
-    ),
-    "below a sweeper": (
-        {"defaults": [{"override /hydra/sweeper": "basic"}], "hydra.sweeper.max_batch_size": MKDIR},
-        "max_batch_size",
-    ),
-    "a launcher": (
-        {"hydra.launcher._target_": "hydra_plugins.gsbench.os.mkdir"},
-        "allow_targets=[hydra_plugins]",
-    ),
-    "lines of a launcher's shell": (
-        {
-            "defaults": [{"override /hydra/launcher": "joblib"}],
-            "hydra.launcher.temp_folder": "/strange",
-        },
-        "allow_targets=[hydra.launcher]",
-    ),
-    "beside the launcher": ({"hydra.launcher.in": MKDIR}, "hydra.launcher"),
-    "a copy for the launcher": ({"hydra.launcher": "${densify}"}, "hydra.launcher"),
-    "a launcher that hands lines to a shell": (
-        {
-            "hydra.launcher._target_": "hydra_plugins.hydra_submitit_launcher.submitit_launcher.SlurmLauncher"
-        },
-        "allow_targets=[hydra_plugins]",
-    ),
-    "a name in parts": (
-        {"name": "mkdir", "densify": {"_target_": "os.${name}", "path": "exploded"}},
-        "write the name itself",
-    ),
-    "made of a text": (
-        {"densify.inner": "${oc.create:{_target_:os.mkdir,path:exploded}}"},
-        "${oc.create:…} is not resolved",
-    ),
-    "decoded from a text": (
-        {"hydra.job.name": "${oc.decode:'1'}"},
-        "${oc.decode:…} is not resolved",
-    ),
-    "a resolver with a made name": (
-        {"hydra.job.name": "${oc.${name}:1}"},
-        "is not resolved",
-    ),
-    "a copy for the sweeper": (
-        {"hydra.sweeper.tune": "${densify}"},
-        "write the settings",
-    ),
-    "a copy in the sweeper": (
-        {"hydra.sweeper.tune.metric": "${densify}"},
-        "write the settings",
-    ),
-    "a partial object": ({"densify._partial_": True}, "_partial_: gsbench makes no"),
-    "partial objects of a sweep": (
-        {
-            "hydra.mode": "MULTIRUN",
-            "hydra.sweeper.params": {"+densify.sub": "{_partial_: true},{_args_: [1]}"},
-        },
-        "_: gsbench makes no",
-    ),
-    "a copy for logging": ({"hydra.job_logging": "${train}"}, "write the settings"),
-    "help": ({"hydra.help._target_": "bomb.Bomb"}, "_target_ is not a setting"),
-    "logging": (
-        {
-            "hydra.job_logging": {
-                "handlers": {"x": {"class": "bomb.Bomb"}},
-                "root": {"handlers": ["x"]},
-            }
-        },
-        "job_logging.handlers.x.class=bomb.Bomb",
-    ),
-    "logging by a factory": (
-        {"hydra.hydra_logging.formatters.x.()": "bomb.Bomb"},
-        "allow_targets=[bomb]",
-    ),
-    "logging that imports a text": (
-        {"hydra.job_logging.root.level": "ext://bomb.Bomb"},
-        "allow_targets=[hydra.job_logging]",
-    ),
-    "logging to another file": (
-        {
-            "defaults": [{"override /hydra/job_logging": "default"}],
-            "hydra.job_logging.handlers.file.filename": "exploded",
-        },
-        "allow_targets=[hydra.job_logging]",
-    ),
-    "a package": ({"densify._target_": "bombs.Bomb"}, "allow_targets=[bombs]"),
-    "a module of a package": ({"densify._target_": "bombs.one.Bomb"}, "allow_targets=[bombs]"),
-    "a densifier that allows itself": (
-        {"allow_targets": ["bomb"], "densify._target_": "bomb.Bomb"},
-        "no file can allow it",
-    ),
-    "below a densifier": (
-        {"densify.inner": [{"_target_": "bomb.Bomb"}]},
-        "densify.inner.0._target_=bomb.Bomb",
-    ),
-    "another group's class": (
-        {"densify._target_": "gsbench.init.Random"},
-        "is not a class for densify",
-    ),
-    "an import of a densifier's module": (
-        {"densify._target_": "gsbench.densify.adc.torch.load"},
-        "cannot be imported",
-    ),
-    "below a metric": (
-        {"eval.extra.mine": {"_target_": "gsbench.eval.X", "in": {"_target_": "bomb.Bomb"}}},
-        "[bomb]",
-    ),
-    "a place that nobody reads": (
-        {"launch.sbatch._target_": "bomb.Bomb"},
-        "allow_targets=[bomb]",
-    ),
-    "a line break for sbatch": (
-        {"launch": {"name": "slurm", "qos": "x\ntouch exploded\n"}},
-        "must be one line",
-    ),
-    "a line break in an option": (
-        {"launch": {"name": "slurm", "sbatch": {"comment": "x\ntouch exploded\n"}}},
-        "must be one line",
-    ),
-    "a line break in a name": (
-        {"launch": {"name": "slurm", "sbatch": {"x\ntouch exploded\n": 1}}},
-        "launch.sbatch",
-    ),
-}
+STRANGE = table(__file__, "strange")
 MODES = {
     "run": [],
     "dry run": ["--dry-run"],
@@ -222,17 +49,7 @@ def test_code_that_a_file_names_is_not_run(case, mode, capsys, monkeypatch):
     assert not Path("exploded").exists()
 
 
-JOBS = {  # the words that a file's sweep gives its jobs
-    "a callback": ({"+hydra.callbacks.x._target_": "os.mkdir"}, "cannot differ from job to job"),
-    "a search path": ({"hydra.searchpath": "[pkg://bombs]"}, "cannot differ from job to job"),
-    "a variable": ({"+hydra.job.env_set.PYTHONPATH": "/strange"}, "cannot differ from job to job"),
-    "a class": ({"densify._target_": "bomb.Bomb"}, "allow_targets=[bomb]"),
-    "a permission": (
-        {"allow_targets": "[bomb]", "densify._target_": "bomb.Bomb"},
-        "no file can allow it",
-    ),
-    "a resolver": ({"densify.name": "${oc.decode:x}"}, "is not resolved"),
-}
+JOBS = table(__file__, "jobs")
 
 
 @pytest.mark.parametrize("place_of_words", ["params", "grids"])
@@ -491,7 +308,7 @@ def test_looking_for_a_users_source_imports_nothing(place):
 
 
 def test_options_of_slurm_that_choose_resources_need_no_permission():
-    assert not SBATCH_RESOURCES & {
+    assert not set(ALLOWED["sbatch"]) & {
         "wrap",
         "export",
         "export_file",

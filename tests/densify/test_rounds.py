@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from torch.testing import assert_close
 
 from gsbench.densify import ADC, MCMC, MRNF, DensifyContext, Volumetric
 from gsbench.train.options import TrainConfig
@@ -170,17 +169,6 @@ def test_the_optimizer_skips_the_step_after_a_refinement_and_takes_the_next():
     trainable.optimizer_step()
     assert not torch.equal(before.means, trainable.values.means)
     assert float(trainable.adam["means"].step) == 3
-
-
-def test_opacity_reset_zeroes_the_opacity_moments_only():
-    densifier = ADC(start=5000, stop=20_000)
-    trainable, _ = prepared(densifier, 1)
-    before = trainable.values.detach().map(torch.clone)
-    assert densifier.refine(3000, trainable, generator()).opacity_reset
-    assert_close(trainable.values.opacities, before.opacities.clamp_max(0.01))
-    assert torch.equal(trainable.values.means, before.means)
-    assert not trainable.adam["opacity_logits"].first.any()
-    assert trainable.adam["means"].first.all()
 
 
 def test_adc_refines_and_resets_at_the_iterations_of_3dgs():

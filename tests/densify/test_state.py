@@ -90,20 +90,6 @@ def test_a_subclass_adds_to_the_statistics_of_its_base():
     assert Volumetric.STATISTICS == ADC.STATISTICS
 
 
-@pytest.mark.parametrize("order, place", [("before_adc", 0), ("after_adc", 1), ("after_prune", 2)])
-def test_the_order_of_the_volumetric_rule_is_its_place_in_the_round(order, place):
-    densifier = Volumetric(volume_order=order)
-    refinement = started(densifier, 3)
-    names = ["grow_by_gradient", "prune", "reset_statistics"]
-    names.insert(place, "split_by_volume")
-    refinement.step = 600
-    assert [rule.__name__ for rule in densifier.rules(refinement)] == names
-    refinement.step = 3000
-    assert [rule.__name__ for rule in densifier.rules(refinement)] == [*names, "reset_opacity"]
-    refinement.step = 601
-    assert densifier.rules(refinement) == []
-
-
 def test_every_cause_has_its_own_words_and_colour():
     assert [cause.value for cause in Cause] == list(range(len(Cause)))  # lineage.npz indexes by it
     for first, second in combinations(Cause, 2):

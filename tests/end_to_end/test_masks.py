@@ -13,9 +13,9 @@ from PIL import Image
 from gsbench.files import file_sha256
 from gsbench.init import Dim, Sfm
 from gsbench.init.base import MODEL_FOLDER
+from gsbench.scene.beside import read_mask
 from gsbench.scene.colmap import read_model
 from gsbench.scene.courtyard.render import render_courtyard
-from gsbench.scene.masks import read_mask
 from tests.end_to_end.conftest import trial_of
 from tests.helpers import read_json
 from tests.scene.captures import read_colmap
@@ -137,7 +137,7 @@ def test_no_keypoint_lies_on_an_ignored_pixel(captures, tmp_path, make, request)
     if make is Dim:
         words |= {"extractor": "aliked", "matcher": "mutual_nearest", "aliked_model": "t16"}
         words |= {"download": False, "weights": request.getfixturevalue("shared") / "weights"}
-    capture = read_colmap("masked", captures[0], masks="masks")
+    capture = read_colmap(captures[0], masks="masks")
     work = tmp_path / "work"
     try:
         make(threads=1, **words).run(capture, tmp_path / "out", work_dir=work)

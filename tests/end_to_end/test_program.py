@@ -9,36 +9,15 @@ import pytest
 
 from gsbench.verbs import VERBS
 from tests.conftest import ROOT
-from tests.end_to_end.conftest import FINISHED, SMALL
+from tests.end_to_end.conftest import SMALL
+from tests.helpers import table
 from tests.processes import completed
 
 pytestmark = pytest.mark.slow
 
 
 # The words of each verb that reads results or shows characters beyond ASCII, after its name.
-IN_ASCII = {
-    "tables": f"{FINISHED} --format latex",
-    "report": f"{FINISHED} --out report.html",
-    "explain": f"{FINISHED}:courtyard:psnr:adc",
-    "status": FINISHED,
-    "plan": FINISHED,
-    "retry": FINISHED,
-    "sync": FINISHED,
-    "export": f"--results {FINISHED} --out a.zip",
-    "site": "a.zip --out site",
-    "ledger": f"show {FINISHED}",
-    "judge": "é.csv --baseline adc",
-    "declare": "--help",
-    "gate": "a.zip densify=nothing",
-    "ablate": "--help",
-    "evaluate": "nowhere --truth é",
-    "view": "é",
-    "fetch": "é",
-    "bench": "--raster é",
-    "clean": "",
-    "ui": "é",
-    "doctor": "",
-}
+IN_ASCII = table(__file__, "words")
 
 
 def test_every_verb_speaks_where_python_knows_only_ascii(gsbench, runs, tmp_path):

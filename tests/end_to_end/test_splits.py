@@ -34,9 +34,7 @@ def captures(tmp_path_factory):
     folder = tmp_path_factory.mktemp("captures")
     clean, noisy = folder / "clean", folder / "noisy"
     render_courtyard(clean, views=12, width=192, height=144)
-    Sfm(threads=1, first_octave=0, max_num_features=1500).run(
-        read_colmap("courtyard", clean), folder / "sfm"
-    )
+    Sfm(threads=1, first_octave=0, max_num_features=1500).run(read_colmap(clean), folder / "sfm")
     shutil.rmtree(clean / "sparse")
     shutil.copytree(folder / f"sfm/{MODEL_FOLDER}", clean / "sparse/0")
     shutil.copytree(clean, noisy)

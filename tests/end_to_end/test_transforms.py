@@ -67,7 +67,7 @@ def scene(tmp_path_factory):
     folder = tmp_path_factory.mktemp("transforms") / "yard"
     render_courtyard(folder, views=10, width=192, height=144)
     sfm = Sfm(threads=1, first_octave=0, max_num_features=1500, two_view_tracks=True)
-    sfm.run(read_colmap("courtyard", folder), folder.parent / "sfm")
+    sfm.run(read_colmap(folder), folder.parent / "sfm")
     shutil.rmtree(folder / "sparse")
     shutil.copytree(folder.parent / f"sfm/{MODEL_FOLDER}", folder / "sparse/0")
     as_nerfstudio(pycolmap.Reconstruction(folder / "sparse/0"), folder)
@@ -117,7 +117,7 @@ def test_distorted_photographs_give_the_same_scene(shared, tmp_path):
     (tmp_path / "made").mkdir()
     captured.step.build(tmp_path / "made")
     read = _scene(captured.read(tmp_path / "made"), tmp_path / "cache")
-    first = _scene(read_colmap("church", source, max_images=6), tmp_path / "cache")
+    first = _scene(read_colmap(source, max_images=6), tmp_path / "cache")
     assert len(read.train) == len(first.train) == 5
     for one, other in zip(first.train, read.train, strict=True):
         assert other.name == f"images/{one.name}"

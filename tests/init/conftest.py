@@ -16,7 +16,7 @@ def courtyard(tmp_path_factory):
     """Eight views of the courtyard with their exact poses."""
     folder = tmp_path_factory.mktemp("courtyard")
     render_courtyard(folder, views=VIEWS, width=WIDTH, height=HEIGHT)
-    return replace(read_colmap("courtyard", folder), exact_poses=True)
+    return replace(read_colmap(folder), exact_poses=True)
 
 
 @pytest.fixture(scope="session")

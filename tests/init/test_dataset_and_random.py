@@ -11,11 +11,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.init import MODEL_FOLDER, Dataset, Ply, Random, read_cloud
-from gsbench.init.base import GAUSSIANS_FILE
+from gsbench.init.base import GAUSSIANS_FILE, REPORT_FILE, TrainingPoints
 from gsbench.scene.types import Capture
 from tests.gaussians.helpers import random_gaussians
-from tests.helpers import refusal
-from tests.init.models import add_point
+from tests.helpers import read_json, refusal
+from tests.init.models import add_point, model_with
 from tests.init.test_report import CENTERS, NAMES, model_of
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -25,15 +25,10 @@ def add_points(model_dir, target, count):
     """A copy of the model with points that the first three images see."""
     model = pycolmap.Reconstruction(model_dir)
     points = np.random.default_rng(0).uniform(-1, 1, (count, 3))
-    copy = pycolmap.Reconstruction()
-    for camera in model.cameras.values():
-        copy.add_camera_with_trivial_rig(camera)
-    for image in model.images.values():
-        projected = np.array([image.project_point(point) for point in points])
-        new = pycolmap.Image(
-            name=image.name, keypoints=projected, camera_id=image.camera_id, image_id=image.image_id
-        )
-        copy.add_image_with_trivial_frame(new, image.cam_from_world())
+    images = [image for _, image in sorted(model.images.items())]
+    seen = {image.name: np.array([*map(image.project_point, points)]) for image in images}
+    poses = {image.name: image.cam_from_world() for image in images}
+    copy = model_with(poses, seen, model.cameras[1])
     for index, point in enumerate(points):
         add_point(copy, point, (index, 2 * index, 255 - index), dict.fromkeys((1, 2, 3), index))
     target.mkdir(parents=True)
@@ -50,6 +45,20 @@ def test_dataset_keeps_the_cloud_of_the_model(courtyard, tmp_path):
     assert report.num_points == 20
     assert report.mean_track_length == 3.0
     assert any("only 20 points" in odd.line for odd in report.oddities)
+
+
+def test_the_dataset_s_points_may_come_from_training_views_alone(courtyard, tmp_path):
+    """The first of the three images that see all points is a test view."""
+    add_points(courtyard.model, tmp_path / "model", 20)
+    capture, out = replace(courtyard, model=tmp_path / "model"), tmp_path / "out"
+    report = Dataset(points_from="train").run(capture, out)
+    assert report.training_points == TrainingPoints("train", 20, 20, 0.0)
+    assert report.mean_track_length == 2.0
+    assert read_json(out / REPORT_FILE)["training_points"]["kept"] == 20
+    assert {path.name for path in out.iterdir()} == {"sparse", REPORT_FILE}
+    few = replace(capture, test_names=capture.image_names[:2])
+    with refusal("init.points_from=train: no point is left that two training views see"):
+        Dataset(points_from="train").run(few, out)
 
 
 @pytest.mark.parametrize("seen_by", [1, 3])

@@ -186,33 +186,21 @@ def test_disk_is_loaded_from_its_published_layout(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "extractor, threshold, radius, file",
-    [
-        ("superpoint", 0.0005, 3, "superpoint.safetensors"),
-        ("aliked", 0.2, 2, "aliked-n16.pth"),
-        ("disk", 0.0, 2, "depth-save.pth"),
-    ],
+    "extractor, threshold, radius", [("superpoint", 0.0005, 3), ("aliked", 0.2, 2), ("disk", 0, 2)]
 )
-def test_detection_settings_are_the_extractors_own_unless_given(
-    extractor, threshold, radius, file, tmp_path, monkeypatch
-):
+def test_detection_settings_are_the_extractors_own_unless_given(extractor, threshold, radius):
     """The defaults are those of deep-image-matching and the authors."""
-    own = Dim(extractor=extractor, matcher="mutual_nearest", weights=tmp_path, download=False)
-    monkeypatch.setattr(
-        "gsbench.init.dim.find_all_weights",
-        lambda files, folder, download: [f.names[0] for f in files],
-    )
-    assert own.find_weights() == [file]
-    light = replace(own, matcher="lightglue")
-    assert light.find_weights() == [file, f"{extractor}_lightglue_v0-1_arxiv-pth"]
+    own = Dim(extractor=extractor)
+    found = own.extraction["keypoint_threshold"], own.extraction["nms_radius"]
+    assert found == (threshold, radius)
+    given = {"keypoint_threshold": 0.0, "nms_radius": 7}
     # features depend on exactly these settings
-    expected = {"extractor": extractor, "max_image_size": 1600, "max_keypoints": 2048}
-    expected |= {"aliked_model": "n16"} if extractor == "aliked" else {}
-    assert own.extraction == {**expected, "keypoint_threshold": threshold, "nms_radius": radius}
-    given = replace(own, keypoint_threshold=0.0, nms_radius=7).extraction
-    assert given == {**expected, "keypoint_threshold": 0.0, "nms_radius": 7}
-    assert own.matching == {"matcher": "mutual_nearest", "max_ratio": 0.95}
-    assert light.matching == {"matcher": "lightglue", "filter_threshold": 0.1}
+    more = {"aliked_model": "n16"} if extractor == "aliked" else {}
+    rest = {"extractor": extractor, "max_image_size": 1600, "max_keypoints": 2048} | more
+    assert replace(own, **given).extraction == rest | given
+    assert own.matching == {"matcher": "lightglue", "filter_threshold": 0.1}
+    nearest = {"matcher": "mutual_nearest", "max_ratio": 0.95}
+    assert replace(own, **nearest).matching == nearest
 
 
 @pytest.mark.parametrize(

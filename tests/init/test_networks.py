@@ -15,7 +15,7 @@ from gsbench.init.colmap import database, matches
 from gsbench.init.colmap.database import DatabaseTask
 from gsbench.init.networks import features, models
 from gsbench.init.networks.features import Features, FeatureStore
-from gsbench.init.reconstruction import Job
+from gsbench.init.sfm import Job
 from tests.helpers import refusal, write
 
 NAMES = ("a.png", "b.png", "c.png")
@@ -163,34 +163,19 @@ def test_pairs_that_the_preview_leaves_out_are_counted(networks, job, monkeypatc
     assert (facts["counts"]["pairs_selected"], facts["counts"]["pairs_left_out"]) == (1, 2)
 
 
-def test_the_weights_are_named_by_their_digests_and_tell_stored_files_apart(
-    networks, job, tmp_path
-):
-    run(job)
-    weights = tmp_path / "w.pth"
-    weights.write_bytes(b"weights")
-    networks.weights[1] = weights
-    assert run(job)[2]["settings"]["weights_sha256"] == {
-        file.name: file_sha256(file) for file in networks.weights
-    }
-    assert (len(networks.extracted), len(networks.matched)) == (6, 6)
-    networks.weights[0] = weights
-    run(job)
-    assert (len(networks.extracted), len(networks.matched)) == (9, 9)
-
-
-def test_other_settings_images_or_masks_have_other_files(networks, job):
+def test_other_settings_images_masks_or_weights_have_other_files(networks, job):
     run(job)
     Image.new("L", (8, 8), 255).save(mask := job.work_dir / "mask.png")
-    changed = replace(job.capture, masks={"c.png": mask})
-    for count, options, capture in (
-        (3, job.options, job.capture),
-        (6, replace(job.options, max_keypoints=9), job.capture),
-        (9, replace(job.options, filter_threshold=0.5), job.capture),
-        (12, job.options, changed),
-    ):
-        run(replace(job, options=options, capture=capture))
-        assert (len(networks.extracted), len(networks.matched)) == (count, count)
+    masked = replace(job.capture, masks={"c.png": mask})
+    changes = [{}, {"options": Dim(threads=1, max_keypoints=9)}, {"capture": masked}]
+    for number, change in enumerate([*changes, {"options": Dim(threads=1, filter_threshold=0.5)}]):
+        run(replace(job, **change))
+        assert len(networks.extracted) == len(networks.matched) == 3 * number + 3
     Image.new("L", (8, 8), 9).save(job.capture.images / "a.png")
     run(job)
     assert len(networks.extracted) == 15
+    for number, file in enumerate(networks.weights):
+        file.write_text("others")
+        digests = {file.name: file_sha256(file) for file in networks.weights}
+        assert run(job)[2]["settings"]["weights_sha256"] == digests
+        assert len(networks.extracted) == 18 + 3 * number

@@ -16,6 +16,7 @@ from gsbench.init.point_files import read_points
 from gsbench.scene.images import read_image
 from tests.helpers import refusal
 from tests.init.models import camera_at, model_with
+from tests.init.tables import TABLES
 from tests.init.test_report import CENTERS, model_of
 
 RNG = np.random.default_rng(0)
@@ -35,16 +36,7 @@ def write(path, properties, values, text, order):
 @pytest.mark.parametrize("order", ["<", ">"])
 @pytest.mark.parametrize(
     "names, kind, scale",
-    [
-        (("red", "green", "blue"), "u1", 1),
-        (("r", "g", "b"), "f4", 1 / 255),
-        (("red", "green", "blue"), "u2", 257),
-        (("Red", "Green", "Blue"), "u1", 1),
-        (("scalar_R", "scalar_G", "scalar_B"), "f4", 1),
-        (("color_red", "color_green", "color_blue"), "u1", 1),
-        (("ambient_red", "ambient_green", "ambient_blue"), "u1", 1),
-        (("red", "green", "blue"), "f4", 1.001 / 255),  # fractions that go beyond 1
-    ],
+    TABLES["colours of PLY files"],
 )
 def test_ply_properties_may_have_any_order_and_type(tmp_path, text, order, names, kind, scale):
     red, green, blue = ((name, kind) for name in names)
@@ -60,36 +52,20 @@ def rows(*columns, between=" "):
     return "".join(between.join(f"{value:.17g}" for value in row) + "\n" for row in table)
 
 
-INTENSITY = np.arange(len(XYZ)) - 1200.0
+COLUMNS = {"XYZ": XYZ, "ZYX": XYZ[:, ::-1], "RGB": RGB, "FRACTIONS": RGB / 255}
+COLUMNS |= {"NUMBER": np.arange(40), "INTENSITY": np.arange(40) - 1200.0, "ALPHA": np.full(40, 255)}
+TEXTS = [
+    ("a.pts", f"3\n{rows(XYZ[:3], RGB[:3])}37\n{rows(XYZ[3:], RGB[3:])}", True),
+    ("a.csv", "\ufeff" + rows(XYZ, between=",").replace("\n", "\r\n"), False),
+    ("a.csv", '"x","y","z"\n' + re.sub(r"[^,\n]+", r'"\g<0>"', rows(XYZ, between=",")), False),
+    ("a.csv", rows(XYZ, RGB, between=",").replace("\n", ",\n"), True),
+]
+for name, head, columns, between, colored in TABLES["tables of points"]:
+    table = rows(*map(COLUMNS.get, columns.split()), between=between)
+    TEXTS.append((name, head + table, colored))
 
-ALPHA = np.full(len(XYZ), 255)
-COUNTED = rows(np.arange(len(XYZ)), XYZ, RGB, between=",")
-WITH_FIELDS = rows(XYZ, RGB, INTENSITY, ALPHA, between=",")
 
-
-@pytest.mark.parametrize(
-    "name, text, colored",
-    [
-        ("a.pts", f"{len(XYZ)}\n{rows(XYZ, INTENSITY, RGB)}", True),
-        ("a.pts", f"{len(XYZ)}\n{rows(XYZ, INTENSITY)}", False),
-        ("a.pts", f"3\n{rows(XYZ[:3], RGB[:3])}{len(XYZ) - 3}\n{rows(XYZ[3:], RGB[3:])}", True),
-        ("a.csv", f"X,Y,Z,Intensity,R,G,B\n{rows(XYZ, INTENSITY, RGB, between=',')}", True),
-        ("a.csv", f"r;g;b;z;y;x\n{rows(RGB, XYZ[:, ::-1], between=';')}", True),
-        ("a.csv", f'"x [m]", "y [m]", "z [m]"\n{rows(XYZ, between=", ")}', False),
-        ("a.txt", f"//X Y Z Rf Gf Bf\n{rows(XYZ, RGB / 255)}", True),
-        ("a.asc", f"# a scan\n# x y z\n{rows(XYZ)}", False),
-        ("a.txt", f"3D points of 2024-05-01\nx y z\n{rows(XYZ)}", False),
-        ("a.txt", f"#\tz\ty\tx\n{rows(XYZ[:, ::-1], between=chr(9))}", False),
-        ("a.xyz", rows(XYZ, between="\t"), False),
-        ("a.xyz", rows(XYZ, RGB), True),
-        ("a.csv", "\ufeff" + rows(XYZ, between=",").replace("\n", "\r\n"), False),
-        ("a.csv", f"n,pos_x,pos_y,pos_z,Color R,Color G,Color B\n{COUNTED}", True),
-        ("a.csv", f"x,y,z,r,g,b,Scalar field,Cloud index\n{WITH_FIELDS}", True),
-        ("a.csv", '"x","y","z"\n' + re.sub(r"[^,\n]+", r'"\g<0>"', rows(XYZ, between=",")), False),
-        ("a.csv", rows(XYZ, RGB, between=",").replace("\n", ",\n"), True),
-        ("a.csv", f"x,y,z,rgb_r,rgb_g,rgb_b\n{rows(XYZ, RGB, between=',')}", True),
-    ],
-)
+@pytest.mark.parametrize("name, text, colored", TEXTS)
 def test_tables_of_scanners_and_other_programs_are_read(tmp_path, name, text, colored):
     (tmp_path / name).write_bytes(text.encode())
     points, colors = read_points(tmp_path / name)
@@ -99,22 +75,7 @@ def test_tables_of_scanners_and_other_programs_are_read(tmp_path, name, text, co
 
 @pytest.mark.parametrize(
     "name, text, message",
-    [
-        ("a.csv", "lat,lon,alt\n47.1,8.5,400\n", "it has no column x, y, z"),
-        ("a.csv", "X;Y;Z;R\n1,5;2,5;3,5;7\n", "with decimal points"),
-        ("a.txt", "1,5\t2,5\t3\n", "with decimal points"),
-        ("a.xyz", "1 2 3 #ff8000\n4 5 6 #00ff00\n", "save it so, or as PLY"),
-        ("a.txt", "#   POINT3D_ID, X, Y, Z, R, G, B\n1 2 3 4 5 6 7 8\n", "init=dataset reads its"),
-        ("a.xyz", "1.0D+00 2.0D+00 3.0D+00\n", "save it so, or as PLY with"),
-        ("a.las", "LASF", "convert it to PLY, for example with CloudCompare"),
-        ("a.splat", "x", "in the format splat: unpack it with npx"),
-        ("points3D.bin", "x", "belongs to a COLMAP model: init=dataset"),
-        ("a.xyz", "1 2 3 0xff8000\n", "save it so, or as PLY with CloudCompare"),
-        ("a.xyz", "1 2 3 4 5 6 7\n", "it has 7 columns without names"),
-        ("a.pts", "2\n1 2 3\n1 2 3 4\n", "Expected 3 fields"),
-        ("a.xyz", "2\na title\nC 1 2 3\n", "save it so, or as PLY"),
-        ("a.ply", "version https://git-lfs.github.com/spec/v1\n", "a pointer of Git LFS"),
-    ],
+    TABLES["clouds refused"],
 )
 def test_tables_that_would_be_read_wrong_are_refused_with_the_remedy(tmp_path, name, text, message):
     (tmp_path / name).write_text(text)

@@ -10,13 +10,14 @@ import pytest
 from numpy.testing import assert_array_equal
 from PIL import Image
 
-from gsbench.init import MODEL_FOLDER, Sfm, SfmDense, read_cloud, reconstruction
+from gsbench.init import MODEL_FOLDER, Sfm, SfmDense, read_cloud, sfm
 from gsbench.init.base import REPORT_FILE, WORK_FOLDER, Timer, UnplacedError
-from gsbench.init.reconstruction import Job
+from gsbench.init.sfm import Job
 from gsbench.logs import no_progress
 from gsbench.scene.types import Capture
 from tests.helpers import read_json, refusal
 from tests.init.models import camera_at, digest, model_with
+from tests.init.tables import TABLES
 from tests.scene.courtyard.surfaces import surface_distance
 
 
@@ -90,13 +91,7 @@ def test_the_progress_of_each_phase_is_reported_from_start_to_end(shared, told):
 
 @pytest.mark.parametrize(
     "poses, intrinsics, points_from, names, needed",
-    [
-        ("shared", "estimate", "all", "bcd", False),
-        ("shared", "reference", "all", "bcd", True),
-        ("shared", "estimate", "train", "cd", False),
-        ("own", "reference", "train", "bcd", True),
-        ("own", "estimate", "train", "abcd", False),
-    ],
+    TABLES["images and references"],
 )
 def test_poses_and_points_from_choose_the_photographs_and_the_need_for_a_reference(
     poses, intrinsics, points_from, names, needed
@@ -150,12 +145,6 @@ def test_webp_photos_give_the_same_points_as_png_photos(courtyard, tmp_path):
     assert_array_equal(first.colors, second.colors)
 
 
-@pytest.mark.slow
-def test_keypoints_found_at_a_smaller_size_are_scaled_back_to_the_file(courtyard, tmp_path):
-    Sfm(max_image_size=200).run(courtyard, tmp_path)
-    assert np.median(surface_distance(read_cloud(tmp_path / MODEL_FOLDER).points)) < 0.06
-
-
 @pytest.mark.parametrize(
     "pixels, said",
     [
@@ -175,17 +164,7 @@ def test_photos_that_cannot_be_matched_are_refused(tmp_path, pixels, said):
 
 @pytest.mark.parametrize(
     "pairs, count, auto, every, poses, kept",
-    [
-        ("auto", 40, 35, 40, "own", "exhaustive"),
-        ("auto", 40, 35, 35, "own", "auto"),
-        ("auto", 40, 35, None, "own", "auto"),
-        ("auto", 40, None, 4, "own", "exhaustive"),
-        ("auto", 40, None, None, "own", None),
-        ("auto", 40, 36, 40, "own", "auto"),  # nine of ten are enough
-        ("auto", 40, 35, 40, "shared", "auto"),  # other pairs place no further cameras
-        ("auto", 30, 10, 30, "own", "auto"),  # these were all pairs
-        ("sequential", 40, 10, 40, "own", "sequential"),
-    ],
+    TABLES["pairs"],
 )
 def test_all_pairs_are_matched_if_those_of_auto_place_few_images(
     monkeypatch, caplog, pairs, count, auto, every, poses, kept
@@ -196,12 +175,12 @@ def test_all_pairs_are_matched_if_those_of_auto_place_few_images(
             raise UnplacedError("no pair")
         return job.options, SimpleNamespace(num_reg_images=lambda: placed), {"poses": poses}
 
-    monkeypatch.setattr(reconstruction, "_attempt", attempt)
+    monkeypatch.setattr(sfm, "_attempt", attempt)
     names = tuple(map(str, range(count)))
     capture = Capture("x", Path("x"), names, (), None, False, "0")
     job = Job(Sfm(pairs=pairs), capture, Path("x"), Path("x"), None)
     try:
-        options, *_ = reconstruction._best_attempt(job, None, Timer(), no_progress)
+        options, *_ = sfm._best_attempt(job, None, Timer(), no_progress)
     except UnplacedError:
         assert kept is None
     else:

@@ -12,7 +12,6 @@ import torch
 from gsbench.config.compose import compose_one
 from gsbench.pipeline.parts import Parts, build_own_rasterizer
 from gsbench.raster import create_rasterizer
-from gsbench.runs.config_hash import config_hash
 from gsbench.runs.keys import rasterizer_inputs
 from tests.config.test_schema import composed
 from tests.conftest import ROOT
@@ -65,13 +64,3 @@ def test_without_an_output_it_is_refused_for_a_densifier_that_needs_it(folder, a
         parts.check(on_this_machine=False)
     vars(parts.own_rasterizer).update(gives)
     parts.check(on_this_machine=False)
-
-
-def test_its_source_is_part_of_the_hash(folder):
-    own = config_hash(composed(*OWN))
-    assert own != config_hash(composed())
-    with (folder / "oversampled.py").open("a") as stream:
-        stream.write("# a comment makes no other version\n")
-    assert config_hash(composed(*OWN)) == own
-    (folder / "oversampled.py").write_text("changed = True\n")
-    assert config_hash(composed(*OWN)) != own

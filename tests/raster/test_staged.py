@@ -107,12 +107,6 @@ def test_the_footprint_stage_gets_the_frame_and_the_values():
     assert passed is values
 
 
-def test_errors_of_the_checks_are_raised():
-    for count, degree, said in ((1, 0, "one is too few"), (2, 4, "sh_degree")):
-        with pytest.raises(ValueError, match=said):
-            Recording().render(random_gaussians(count), camera(), degree, BLACK)
-
-
 TWO = random_gaussians(2)
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from gsbench.analysis.results import read_experiment
 from gsbench.errors import InputError
-from gsbench.files import remove_special_files, require_no_links
+from gsbench.files import require_no_links
 from gsbench.launch.record import remove
 from gsbench.launch.states import states_of_experiment
 from gsbench.logs import log_to
@@ -188,17 +188,6 @@ def test_a_folder_that_gsbench_could_not_have_made_is_no_trial(tmp_path, trial, 
     trial.parents[1].rename(trial.parents[2] / name)
     assert read_experiment(tmp_path / "runs/x").trials == ()
     assert "gsbench gives no folder such a name" in caplog.text
-
-
-def test_links_of_a_killed_build_are_removed_and_their_targets_stay(tmp_path, outside):
-    partial = tmp_path / "partial"
-    (partial / "work").mkdir(parents=True)
-    (partial / "work/images").symlink_to(outside)
-    (partial / "kept").write_text("")
-    remove_special_files(partial)
-    assert sorted(path.name for path in partial.iterdir()) == ["kept", "work"]
-    assert not list((partial / "work").iterdir())
-    assert (outside / "private").read_text() == SECRET
 
 
 def test_a_pipe_in_place_of_the_note_on_a_locks_holder_does_not_block(tmp_path):

@@ -1,5 +1,6 @@
 """Captures read as a trial reads them."""
 
+from functools import partial
 from pathlib import Path
 
 from gsbench.pipeline.steps.scene import CaptureSource
@@ -9,17 +10,12 @@ from gsbench.scene.options import SceneConfig
 from gsbench.scene.pipe import read_capture
 
 
-def read(kind, name, path, **settings):
+def read(kind, path, **settings):
     """The capture in ``path``, by the reader of its ``kind``."""
-    return read_capture(SceneConfig(kind=kind, name=name, path=str(path), **settings))
+    return read_capture(SceneConfig(kind=kind, name="toy", path=str(path), **settings))
 
 
-def read_colmap(name, path, **settings):
-    return read("colmap", name, path, **settings)
-
-
-def read_photos(name, path, **settings):
-    return read("photos", name, path, **settings)
+read_colmap, read_photos = partial(read, "colmap"), partial(read, "photos")
 
 
 def read_with_step(folder, work, reader=None, **settings):

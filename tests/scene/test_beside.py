@@ -100,13 +100,13 @@ def test_a_picture_of_another_shape_is_refused():
 
 
 def test_a_kind_that_no_photograph_has_is_refused(make_scene):
-    capture = read_colmap("x", make_scene())
+    capture = read_colmap(make_scene())
     with refusal("scene.beside=depth: no photograph .* there are: none"):
         files_beside(capture, ["depth"])
 
 
 def test_views_have_depth_in_the_units_of_the_training(make_scene, tmp_path):
-    capture = read_colmap("x", make_scene())
+    capture = read_colmap(make_scene())
     first, second = capture.image_names[:2]
     for name, value in ((first, 3000), (second, 5000)):
         path = tmp_path / f"{name}.png"
@@ -134,7 +134,7 @@ def test_views_have_depth_in_the_units_of_the_training(make_scene, tmp_path):
 
 
 def test_depth_that_no_view_knows_is_refused(make_scene, tmp_path, caplog):
-    capture = read_colmap("x", make_scene())
+    capture = read_colmap(make_scene())
     first = capture.image_names[0]
     np.save(tmp_path / "a.npy", np.full((30, 40), -1.0))
     capture = replace(capture, beside={"depth": {first: tmp_path / "a.npy"}})

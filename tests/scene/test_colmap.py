@@ -47,7 +47,7 @@ def reprojection_errors(model):
 def test_cameras_follow_smaller_files(make_scene, model, params):
     # 162/4 = 40.5, 121/4 = 30.25
     root = make_scene(size=(41, 30), camera_size=(162, 121), model=model, params=params)
-    fitted = read_reference(read_colmap("toy", root))
+    fitted = read_reference(read_colmap(root))
     camera = next(iter(fitted.cameras.values()))
     assert (camera.width, camera.height) == (41, 30)
     assert camera.focal_length_x == pytest.approx(160 * 41 / 162)
@@ -61,7 +61,7 @@ def test_cameras_follow_smaller_files(make_scene, model, params):
 
 
 def test_subset_drops_images_and_their_observations(make_scene, tmp_path):
-    fitted = read_reference(read_colmap("toy", make_scene(), max_images=3))
+    fitted = read_reference(read_colmap(make_scene(), max_images=3))
     assert sorted(image.name for image in fitted.images.values()) == ["00.png", "02.png", "04.png"]
     assert {point.track.length() for point in fitted.points3D.values()} == {3}
     assert max(reprojection_errors(fitted)) < 1e-9
@@ -79,14 +79,14 @@ def test_points_that_fewer_than_two_kept_images_see_are_dropped(make_scene):
     for image_id in (3, 4, 5, 6):
         model.delete_observation(image_id, 0)
     model.write_binary(root / "sparse/0")
-    fitted = read_reference(read_colmap("toy", root, max_images=3))
+    fitted = read_reference(read_colmap(root, max_images=3))
     assert sorted(fitted.points3D) == list(range(2, 10))
 
 
 def test_files_of_one_camera_get_a_camera_for_each_size(make_scene):
     root = make_scene(size=(40, 30))
     Image.fromarray(smooth_image(80, 60)).save(root / "images/02.png")
-    cameras = cameras_of(read_reference(read_colmap("toy", root)))
+    cameras = cameras_of(read_reference(read_colmap(root)))
     assert (cameras["02.png"].width, cameras["02.png"].fx) == (80, 100.0)
     assert (cameras["03.png"].width, cameras["03.png"].fx) == (40, 50.0)
 
@@ -95,17 +95,17 @@ def test_an_image_of_another_shape_than_its_camera_is_refused(make_scene):
     root = make_scene(size=(40, 30))
     Image.fromarray(smooth_image(40, 26)).save(root / "images/01.png")
     with refusal(r"01\.png: the image is 40x26 px but its camera in the COLMAP model 40x30"):
-        read_reference(read_colmap("toy", root))
+        read_reference(read_colmap(root))
     exif = Image.Exif()
     exif[0x0112] = 6
     Image.fromarray(smooth_image(30, 40)).save(root / "images/01.png", exif=exif)
     with refusal(r"01\.png.*on its side, and COLMAP ignores EXIF"):
-        read_reference(read_colmap("toy", root))
+        read_reference(read_colmap(root))
 
 
 def test_bare_photos_have_no_reference_model(make_scene):
     with refusal("no COLMAP model came with"):
-        read_reference(read_photos("toy", make_scene()))
+        read_reference(read_photos(make_scene()))
 
 
 def test_distorted_cameras_are_not_pinholes(make_scene):
@@ -242,7 +242,7 @@ def test_a_name_in_a_code_page_is_named(make_scene, text):
     with refusal(
         r"not UTF-8 .*\\xb0\\xa1\\xb3\\xaa.png.*: rename the photographs to ASCII"
     ) as caught:
-        read_colmap("toy", root)
+        read_colmap(root)
     assert "export it again" not in str(caught.value)
 
 

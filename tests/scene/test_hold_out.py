@@ -93,12 +93,12 @@ def test_validation_of_lists_takes_every_nth_of_the_training_list():
 def test_a_view_dropped_by_validation_is_not_in_the_capture(make_scene):
     root = make_scene(names=NAMES[:9])
     rules = [{"test_every": 3, "validation": judged} for judged in (False, True)]
-    plain, judged = (read_colmap("toy", root, **rule) for rule in rules)
+    plain, judged = (read_colmap(root, **rule) for rule in rules)
     assert plain.test_names == ("00.png", "03.png", "06.png")
     assert judged.image_names == tuple(name for name in NAMES[:9] if name not in plain.test_names)
     assert judged.test_names == ("01.png", "05.png")
     (root / "images" / "00.png").write_bytes((root / "images" / "01.png").read_bytes())
-    other, same = (read_colmap("toy", root, **rule) for rule in rules)
+    other, same = (read_colmap(root, **rule) for rule in rules)
     assert same.fingerprint == judged.fingerprint
     assert other.fingerprint != plain.fingerprint
 
@@ -107,7 +107,7 @@ def test_sectors_of_a_folder_use_its_cameras_under_other_file_names(make_scene):
     root = make_scene(names=NAMES[:8])
     for name in NAMES[:8]:
         (root / "images" / name).rename(root / "images" / f"{name[:2]}.jpg")
-    capture = read_colmap("toy", root, split="sector", sectors=4, sector=3)
+    capture = read_colmap(root, split="sector", sectors=4, sector=3)
     assert capture.test_names == ("06.jpg", "07.jpg")
     assert "one direction" in capture.held_out
 
@@ -115,16 +115,14 @@ def test_sectors_of_a_folder_use_its_cameras_under_other_file_names(make_scene):
 def test_lists_of_nerfbaselines_are_found_by_their_names(make_scene):
     root = make_scene(names=NAMES[:8])
     with refusal(r"neither train_list\.txt nor test_list\.txt"):
-        read_colmap("toy", root, split="list")
+        read_colmap(root, split="list")
     (root / "train_list.txt").write_text("\n".join(NAMES[2:7]) + "\n")
     (root / "test_list.txt").write_text("\n".join(NAMES[:2]))
     for read in (read_colmap, read_photos):
-        capture = read("toy", root, split="list")
+        capture = read(root, split="list")
         assert capture.test_names == tuple(NAMES[:2])
         assert capture.train_names == tuple(NAMES[2:7])
-    assert read_colmap("toy", root).test_names == ("00.png",), (
-        "lists that nobody named hold out nothing"
-    )
+    assert read_colmap(root).test_names == ("00.png",), "lists that nobody named hold out nothing"
 
 
 @pytest.mark.parametrize("settings, message", TABLES["settings that contradict each other"])
@@ -144,16 +142,14 @@ def test_a_setting_that_the_kind_of_scene_does_not_read_is_refused(kind, changes
         SceneConfig(name="a", kind=kind, path=path, **changes)
 
 
-def test_default_settings_are_those_of_the_paper():
-    config = SceneConfig(name="a", kind="courtyard")
-    assert (config.max_images, config.test_every, config.sectors, config.sector) == (200, 8, 8, 0)
-    assert (config.views, config.width, config.height, config.seed) == (48, 400, 300, 0)
-    assert (config.downscale, config.max_size) == (1, None)
-    for kind, path, said in (
-        ("colmap", None, "scene.path is not set"),
-        ("courtyard", "/a", "built-in courtyard"),
-    ):
-        with refusal(said):
-            SceneConfig(name="a", kind=kind, path=path)
-    with refusal("at least 16 px are needed"):
-        SceneConfig(name="a", kind="courtyard", downscale=20)
+@pytest.mark.parametrize(
+    "settings, said",
+    [
+        ({"kind": "colmap"}, "scene.path is not set"),
+        ({"kind": "courtyard", "path": "/a"}, "built-in courtyard"),
+        ({"kind": "courtyard", "downscale": 20}, "at least 16 px are needed"),
+    ],
+)
+def test_the_courtyard_alone_has_no_path_and_views_have_a_least_size(settings, said):
+    with refusal(said):
+        SceneConfig(name="a", **settings)

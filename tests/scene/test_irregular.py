@@ -73,7 +73,7 @@ READERS = [
     (".ply", check_ply),
     (".ply", read_points),
     (".txt", read_points),
-    (".txt", lambda path: read_photos("x", path.parent, test_list=str(path))),
+    (".txt", lambda path: read_photos(path.parent, test_list=str(path))),
 ]
 
 
@@ -87,7 +87,7 @@ def test_pipes_and_devices_are_refused(suffix, read, tmp_path, photos):
 def test_a_pipe_among_photographs_is_named(photos, tmp_path):
     os.mkfifo(photos / "d.png")
     with refusal(r"d\.png is not a regular file"):
-        read_photos("x", tmp_path)
+        read_photos(tmp_path)
 
 
 def test_a_pipe_is_not_read_as_a_model_file(tmp_path):
@@ -139,7 +139,7 @@ def test_a_pointer_of_git_lfs_is_named(photos):
 def test_a_dangling_link_is_named(photos, tmp_path):
     (photos / "d.png").symlink_to("nowhere.png")
     with refusal(r"d\.png"):
-        read_photos("x", tmp_path)
+        read_photos(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -174,7 +174,7 @@ def test_names_too_long_or_equal_as_pictures_are_refused(photos, tmp_path):
     long = "ä" * 120 + ".png"  # 244 bytes
     (photos / "a.png").rename(photos / long)
     with refusal("a name of more than 220 bytes"):
-        read_photos("x", tmp_path, test_every=2)
+        read_photos(tmp_path, test_every=2)
     with refusal(r"the pictures of a/b\.png and a__b\.jpg would both be a__b\.png"):
         check_picture_names(["a/b.png", "a__b.jpg"], photos)
     check_picture_names(["a/b.png", "a/c.png"], photos)

@@ -89,7 +89,7 @@ def test_a_point_is_seen_at_the_pixel_where_pycolmap_undistorts_it(
 ):
     """With tiny coefficients, perspective models keep their pixels."""
     camera = {"size": (WIDTH, HEIGHT), "model": name, "params": lens(name, amount).params}
-    capture = read_colmap("toy", make_scene(("0.png", "1.png", "2.png"), **camera))
+    capture = read_colmap(make_scene(("0.png", "1.png", "2.png"), **camera))
     scene = loaded(capture, tmp_path)
     model = pycolmap.Reconstruction(capture.model)
     source = model.cameras[1]
@@ -184,7 +184,7 @@ def test_images_are_prepared_sixteen_at_a_time_in_their_order(tmp_path):
 
 def test_views_without_changes_are_read_from_the_original_files(make_scene, tmp_path):
     root = make_scene()
-    capture = read_colmap("toy", root)
+    capture = read_colmap(root)
     scene = loaded(capture, tmp_path)
     assert [view.name for view in scene.test] == ["00.png"]
     assert len(scene.train) == 5
@@ -200,7 +200,7 @@ def test_downscaled_and_distorted_views_come_back_from_the_store(
     make_scene, tmp_path, monkeypatch, in_process
 ):
     root = make_scene(size=(81, 60), model="SIMPLE_RADIAL", params=[70, 40, 30, 0.05])
-    capture = read_colmap("toy", root)
+    capture = read_colmap(root)
     done = []
     options = {"downscale": 2, "progress": lambda *step: done.append(step)}
     cache = tmp_path / "cache"
@@ -239,7 +239,7 @@ def test_downscaled_and_distorted_views_come_back_from_the_store(
 
 
 def test_images_that_were_not_selected_are_not_prepared(make_scene, tmp_path):
-    capture = read_colmap("toy", make_scene(), max_images=3)
+    capture = read_colmap(make_scene(), max_images=3)
     loaded(capture, tmp_path, downscale=2)
     (file,) = (tmp_path / "cache").rglob("cameras.json")
     assert list(read_json(file)["views"]) == ["00.png", "02.png", "04.png"]
@@ -249,7 +249,7 @@ def test_images_that_were_not_selected_are_not_prepared(make_scene, tmp_path):
 
 
 def test_a_file_of_another_shape_than_its_camera_is_refused(make_scene, tmp_path):
-    capture = read_colmap("toy", make_scene())
+    capture = read_colmap(make_scene())
     Image.new("RGB", (40, 26)).save(capture.images / "01.png")
     with refusal(r"01\.png: the image is 40x26 px but its camera .* 40x30"):
         loaded(capture, tmp_path)
@@ -257,7 +257,7 @@ def test_a_file_of_another_shape_than_its_camera_is_refused(make_scene, tmp_path
 
 @pytest.mark.parametrize("name", ["cameras.json", "00000.png", "manifest.json"])
 def test_stored_views_that_were_changed_are_prepared_again(name, make_scene, tmp_path, caplog):
-    capture, store = read_colmap("toy", make_scene()), tmp_path / "cache"
+    capture, store = read_colmap(make_scene()), tmp_path / "cache"
     first = load_scene(capture, capture.model, Store(store), downscale=2)
     (file,) = store.rglob(name)
     file.write_bytes(file.read_bytes()[:100])
@@ -268,7 +268,7 @@ def test_stored_views_that_were_changed_are_prepared_again(name, make_scene, tmp
 
 
 def test_centred_moves_the_principal_point_only(make_scene, tmp_path):
-    capture = read_colmap("toy", make_scene(params=[50, 51, 18, 16]))
+    capture = read_colmap(make_scene(params=[50, 51, 18, 16]))
     used = loaded(capture, tmp_path)
     centred = loaded(capture, tmp_path, principal_point="centred")
     assert (used.train[0].camera.cx, used.train[0].camera.cy) == (18, 16)
@@ -278,7 +278,7 @@ def test_centred_moves_the_principal_point_only(make_scene, tmp_path):
 
 
 def test_views_without_pose_are_left_out_with_a_count(make_scene, tmp_path, caplog):
-    capture = read_colmap("toy", make_scene(), test_every=3)
+    capture = read_colmap(make_scene(), test_every=3)
     small = make_scene(names=("00.png", "01.png", "02.png", "04.png"), root="partial")
     with caplog.at_level(logging.WARNING):
         scene = load_scene(capture, small / "sparse/0", Store(tmp_path / "cache"))
@@ -300,7 +300,7 @@ def test_a_truncated_photo_is_named_and_leaves_no_cache(make_scene, tmp_path):
     root = make_scene(size=(80, 60))
     path = root / "images/03.png"
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    capture = read_colmap("toy", root)
+    capture = read_colmap(root)
     with refusal(r"03\.png: the image is damaged"):
         loaded(capture, tmp_path, downscale=2)
     assert not list((tmp_path / "cache").glob("views/[!.]*"))

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
-from gsbench.scene.masks import (
+from gsbench.scene.beside import (
     fill_ignored,
     find_masks,
     prepare_photograph,
@@ -19,6 +19,7 @@ from gsbench.scene.masks import (
 from gsbench.scene.types import Capture
 from tests.helpers import refusal
 from tests.scene.captures import loaded, read_colmap, read_photos
+from tests.scene.tables import TABLES
 
 
 def save(path, pixels, **options):
@@ -48,7 +49,7 @@ def with_masks(root):
 @pytest.mark.parametrize("read", [read_colmap, read_photos])
 def test_masks_are_found_by_the_names_of_colmap(make_scene, read):
     names = tuple(f"cam/{k}.jpg" for k in range(4))
-    capture = read("toy", with_masks(make_scene(names=names)), masks="masks")
+    capture = read(with_masks(make_scene(names=names)), masks="masks")
     root = capture.images.parent
     assert capture.masks == {name: root / "masks" / f"{name}.png" for name in names}
     assert capture.image_names == names
@@ -66,26 +67,26 @@ def test_colmaps_name_of_a_mask_comes_before_that_of_its_photograph(tmp_path):
 def test_masks_in_the_folder_of_bare_photographs_are_not_read_as_photographs(make_scene):
     root = with_masks(make_scene()) / "images"
     (root.parent / "masks").rename(root / "masks")
-    capture = read_photos("toy", root, masks="masks")
+    capture = read_photos(root, masks="masks")
     assert capture.image_names == tuple(f"{k:02d}.png" for k in range(6))
     with refusal("is the folder of the images"):
-        read_photos("toy", root, images=".", masks=".")
+        read_photos(root, images=".", masks=".")
 
 
 def test_a_missing_mask_and_a_missing_folder_are_named(make_scene):
     root = with_masks(make_scene())
     (root / "masks" / "03.png.png").unlink()
     with refusal(r"^[^\n]*no mask of 03\.png in .*masks: add 03\.png\.png \(all white[^\n]*$"):
-        read_colmap("toy", root, masks="masks")
+        read_colmap(root, masks="masks")
     with refusal(r"no such folder; set scene\.masks to one of: images, masks$"):
-        read_colmap("toy", root, masks="mask")
+        read_colmap(root, masks="mask")
 
 
 def test_a_mask_of_another_size_is_refused(make_scene):
     root = with_masks(make_scene())
     path = save(root / "masks" / "02.png.png", half(20, 15))
     with refusal(rf"{path}: the mask is 20x15 px and its image 02\.png 40x30"):
-        read_colmap("toy", root, masks="masks")
+        read_colmap(root, masks="masks")
 
 
 @pytest.mark.parametrize(
@@ -150,23 +151,12 @@ def test_filling_between_two_pixels_is_linear():
     assert fill_ignored(row.swapaxes(0, 1), counts.T)[:, 0, 2].tolist() == [0, 25, 75, 100]
 
 
-@pytest.mark.parametrize(
-    "mask, alpha, backdrop, copied",
-    [
-        (None, 255, "black", True),
-        (None, 9, "black", True),  # since reading blends it over black anyway
-        (None, 255, "white", True),
-        (None, 9, "white", False),
-        (np.full((6, 8), 255, np.uint8), 255, "black", True),
-        (np.full((6, 8), 255, np.uint8), 9, "white", False),
-        (half(8, 6), 255, "black", False),
-        (half(8, 6), 255, "white", False),
-    ],
-)
+@pytest.mark.parametrize("mask, alpha, backdrop, copied", TABLES["photographs copied"])
 def test_a_photograph_without_changes_is_copied(tmp_path, mask, alpha, backdrop, copied):
     pixels = np.full((6, 8, 4), (200, 100, 50, alpha), np.uint8)
     original = save(tmp_path / "in" / "a.png", pixels if alpha < 255 else pixels[..., :3])
-    masks = {} if mask is None else {"a.png": save(tmp_path / "a.png", mask)}
+    own = {"half": half(8, 6), "white": np.full((6, 8), 255, np.uint8)}
+    masks = {"a.png": save(tmp_path / "a.png", own[mask])} if mask else {}
     prepare_photograph(tmp_path / "out", tmp_path / "in", masks, "a.png", backdrop)
     made = tmp_path / "out" / "images" / "a.png"
     assert (made.read_bytes() == original.read_bytes()) == copied
@@ -200,7 +190,7 @@ def test_a_resized_pixel_counts_if_all_pixels_in_its_area_count(width, height):
 
 def prepared(root, folder, **options):
     """The capture with photographs and masks prepared as in the pipeline."""
-    capture = read_colmap("toy", root, masks="masks", **options)
+    capture = read_colmap(root, masks="masks", **options)
     for name in capture.image_names:
         prepare_photograph(folder, capture.images, capture.masks, name)
     masks = {name: prepared_mask(folder, name) for name in capture.masks}
@@ -226,7 +216,7 @@ def test_a_mask_is_undistorted_with_its_photograph(make_scene, tmp_path):
         disc = np.hypot(*np.mgrid[-45:45, -60:60]) > 20 + k
         save(path, np.repeat(disc[..., None] * np.uint8(255), 3, axis=2))
         save(root / "masks" / f"{path.name}.png", disc * np.uint8(255))
-    raw = read_colmap("toy", root, masks="masks")
+    raw = read_colmap(root, masks="masks")
     view = loaded(raw, tmp_path).train[0]
     assert view.mask.shape != (90, 120), "undistorting changes the size"
     assert_array_equal(view.mask, view.image[..., 0] == 255)
@@ -237,19 +227,19 @@ def test_a_mask_without_counted_pixels_at_the_final_size_is_named(make_scene, tm
     mask = np.zeros((240, 320), np.uint8)
     mask[100:103, 100:103] = 255
     save(root / "masks" / "04.png.png", mask)
-    capture = read_colmap("toy", root, masks="masks")
+    capture = read_colmap(root, masks="masks")
     with refusal(r"04\.png\.png: no pixel is left that counts at 32x24 px"):
         loaded(capture, tmp_path, downscale=10)
 
 
 def test_masks_change_the_fingerprint_only_if_they_are_used(make_scene):
     root = make_scene()
-    before = read_colmap("toy", root).fingerprint
+    before = read_colmap(root).fingerprint
     with_masks(root)
-    first = read_colmap("toy", root, masks="masks").fingerprint
+    first = read_colmap(root, masks="masks").fingerprint
     save(root / "masks" / "01.png.png", 255 - half())
-    assert len({before, first, read_colmap("toy", root, masks="masks").fingerprint}) == 3
-    assert read_colmap("toy", root).fingerprint == before
+    assert len({before, first, read_colmap(root, masks="masks").fingerprint}) == 3
+    assert read_colmap(root).fingerprint == before
 
 
 def test_colmap_reads_the_same_focal_length_from_a_prepared_photograph(tmp_path):

@@ -21,6 +21,7 @@ from gsbench.scene.colmap import read_model
 from gsbench.scene.options import SceneConfig
 from gsbench.scene.record import Photograph, RawCapture, read_own
 from gsbench.scene.types import CameraModel
+from tests.scene.tables import TABLES
 
 CAMERA = CameraModel("PINHOLE", 32, 24, (30.0, 31.0, 16.0, 12.0))
 POINTS = (np.arange(6.0).reshape(2, 3), np.zeros((2, 3), np.uint8))
@@ -53,6 +54,9 @@ class Reader:
 def one(name="0.png", **changes):
     """A photograph whose camera, rotation or translation is changed."""
     values = {"camera": CAMERA, "rotation": np.eye(3), "translation": np.zeros(3)} | changes
+    if isinstance(values["camera"], list):
+        model, params = values["camera"]
+        values["camera"] = CameraModel(model, 32, 24, tuple(params))
     return Photograph(name, Path(name), **values)
 
 
@@ -60,37 +64,20 @@ def raw(*photographs, **changes):
     return RawCapture(Path(), photographs, **({"points": POINTS} | changes))
 
 
-def camera(*params, name="PINHOLE"):
-    return raw(one(camera=CameraModel(name, 32, 24, params)))
+FAULTS = [
+    ({}, "read() must return gsbench.scene.record.RawCapture, got dict"),
+    (KeyError("w"), "Reader cannot read {folder} (KeyError: 'w')"),
+    (SystemExit(3), "Reader cannot read {folder} (SystemExit: 3)"),
+    (raw(None), "?: "),
+    (raw(points=([[1, 2]], POINTS[1])), "points must be finite numbers"),
+    (raw(points="a.ply"), "points must be positions and colours"),
+    (raw(points=(POINTS[0], POINTS[0])), "must be uint8 [P, 3]"),
+    *((raw(one(**changes)), said) for changes, said in TABLES["faults of photographs"]),
+]
 
 
-FAULTS = {
-    "nothing": ({}, "read() must return gsbench.scene.record.RawCapture, got dict"),
-    "an error": (KeyError("w"), "Reader cannot read {folder} (KeyError: 'w')"),
-    "an end": (SystemExit(3), "Reader cannot read {folder} (SystemExit: 3)"),
-    "a missing file": (raw(one("9.png")), "9.png: no such file in"),
-    "a file above": (raw(one("../0.png")), "../0.png: no such file"),
-    "an absolute path": (raw(one("/etc/passwd")), "no such file in"),
-    "no photograph": (raw(None), "?: "),
-    "no camera": (raw(one(camera=None)), "0.png: it has no camera and pose"),
-    "no model": (camera(30, 31, 16, 12, name="pinhole"), "'pinhole' is no camera model of"),
-    "no camera model": (raw(one(camera="PINHOLE")), "0.png: "),
-    "too few parameters": (camera(30, 16, 12), "is not a camera of COLMAP: it has fx, fy, cx, cy"),
-    "no focal length": (camera(0, 31, 16, 12), "is not a camera of COLMAP"),
-    "a parameter": (camera(np.nan, 31, 16, 12), "parameters must be finite"),
-    "a mirror": (raw(one(rotation=np.diag([1.0, 1, -1]))), "the rotation must only rotate"),
-    "a scale": (raw(one(rotation=2 * np.eye(3))), "the rotation must only rotate and move"),
-    "a matrix": (raw(one(rotation=np.eye(4))), "a rotation [3, 3] and a translation [3]"),
-    "a place": (raw(one(translation=[np.inf, 0, 0])), "the pose must be finite"),
-    "points": (raw(points=([[1, 2]], POINTS[1])), "points must be finite numbers"),
-    "a path of points": (raw(points="a.ply"), "points must be positions and colours"),
-    "colours": (raw(points=(POINTS[0], POINTS[0])), "must be uint8 [P, 3]"),
-}
-
-
-@pytest.mark.parametrize("fault", FAULTS)
-def test_a_fault_of_the_reader_is_named(fault, folder):
-    result, said = FAULTS[fault]
+@pytest.mark.parametrize("result, said", FAULTS)
+def test_a_fault_of_the_reader_is_named(result, said, folder):
     with pytest.raises(InputError) as error:
         read_own(Reader(result), folder)
     assert said.format(folder=folder) in str(error.value)
@@ -140,15 +127,7 @@ def test_results_are_stored_under_the_readers_code_its_settings_and_what_it_read
 
 @pytest.mark.parametrize(
     "settings, said",
-    [
-        ({"kind": "reader"}, "a reader of your own is scene=reader scene._target_=mine.MyReader"),
-        ({"kind": "colmap", "_target_": "mine.Reader"}, "a reader of your own is scene=reader"),
-        ({"kind": "reader", "_target_": "mine.Reader", "sparse": "0"}, "only by colmap"),
-        (
-            {"kind": "reader", "_target_": "mine.Reader", "images": "x"},
-            "scene.images=x is not read",
-        ),
-    ],
+    TABLES["kinds of readers"],
 )
 def test_a_reader_goes_with_its_kind_of_scene(settings, said):
     with pytest.raises(InputError, match=said):

@@ -24,7 +24,7 @@ from tests.scene.tables import TABLES
 @pytest.mark.parametrize("sparse", ["sparse/0", "sparse"])
 def test_a_colmap_folder_gives_photographs_and_model(make_scene, text, sparse):
     root = make_scene(text=text, sparse=sparse)
-    capture = read_colmap("toy", root, test_every=3)
+    capture = read_colmap(root, test_every=3)
     assert capture.image_names == tuple(f"{k:02d}.png" for k in range(6))
     assert capture.test_names == ("00.png", "03.png")
     assert capture.train_names == ("01.png", "02.png", "04.png", "05.png")
@@ -32,7 +32,7 @@ def test_a_colmap_folder_gives_photographs_and_model(make_scene, text, sparse):
     assert not capture.exact_poses
     for stem in ("rigs", "frames"):  # which older models lack
         next((root / sparse).glob(f"{stem}.*")).unlink()
-    assert read_colmap("toy", root).image_names == capture.image_names
+    assert read_colmap(root).image_names == capture.image_names
 
 
 def test_photos_are_found_in_images_or_in_the_folder_or_in_subfolders(make_scene):
@@ -41,10 +41,10 @@ def test_photos_are_found_in_images_or_in_the_folder_or_in_subfolders(make_scene
     (root / "images" / ".hidden.png").write_bytes(b"no image")
     (root / "images" / "notes.txt").write_text("no image")
     for path in (root, root / "images"):
-        capture = read_photos("toy", path)
+        capture = read_photos(path)
         assert capture.image_names == names
         assert capture.model is None
-    assert read_photos("toy", root, images="images/cam1/..").images == root / "images/cam1/.."
+    assert read_photos(root, images="images/cam1/..").images == root / "images/cam1/.."
 
 
 def test_files_with_another_extension_are_used_and_missing_ones_left_out(make_scene, caplog):
@@ -54,7 +54,7 @@ def test_files_with_another_extension_are_used_and_missing_ones_left_out(make_sc
     for k in range(5):
         Image.open(root / "images" / f"cam/{k}.JPG").resize((24, 18)).save(half / f"{k}.png")
     with caplog.at_level(logging.WARNING):
-        capture = read_colmap("toy", root, images="images_2")
+        capture = read_colmap(root, images="images_2")
     assert capture.image_names == tuple(f"cam/{k}.png" for k in range(5))
     assert "1 image with a camera but without a file: cam/5.JPG" in caplog.text
 
@@ -80,7 +80,7 @@ def test_names_in_other_folders_match_by_the_last_parts_of_their_paths(wanted, f
 
 @pytest.mark.parametrize("prefix", ["images/", "/home/x/images/", "C:\\data\\images\\", "./"])
 def test_a_model_whose_names_have_another_folder_gives_the_same_capture(make_scene, caplog, prefix):
-    plain = read_colmap("toy", make_scene(), max_images=4)
+    plain = read_colmap(make_scene(), max_images=4)
     root = make_scene(root="other")
     (root / "images/thumbs").mkdir()
     Image.new("RGB", (8, 6)).save(root / "images/thumbs/00.png")
@@ -88,7 +88,7 @@ def test_a_model_whose_names_have_another_folder_gives_the_same_capture(make_sce
     for image in model.images.values():
         image.name = f"{prefix}{image.name}"
     model.write_binary(root / "sparse/0")
-    capture = read_colmap("toy", root, max_images=4)
+    capture = read_colmap(root, max_images=4)
     assert (capture.image_names, capture.test_names) == (plain.image_names, plain.test_names)
     assert "found by the last part of their path" in caplog.text
     fitted = read_reference(capture)
@@ -103,7 +103,7 @@ def test_a_model_whose_names_have_another_folder_gives_the_same_capture(make_sce
 def test_the_model_with_the_most_images_is_read(make_scene, caplog, models, chosen, text):
     for sparse, count in models.items():
         root = make_scene(names=[f"{k}.png" for k in range(count)], sparse=sparse, text=text)
-    capture = read_colmap("toy", root)
+    capture = read_colmap(root)
     assert capture.model == root / chosen
     assert len(capture.image_names) == models[chosen]
     beside = [sparse for sparse in models if sparse.split("/")[0] == chosen.split("/")[0]]
@@ -111,7 +111,7 @@ def test_the_model_with_the_most_images_is_read(make_scene, caplog, models, chos
     assert ("scene.sparse chooses another" in caplog.text) is bool(others)
     assert (f"has {len(beside)} COLMAP models" in caplog.text) is bool(others)
     assert all(f"{other}: {models[other]} image" in caplog.text for other in others)
-    assert read_colmap("toy", root, sparse=chosen).model == root / chosen
+    assert read_colmap(root, sparse=chosen).model == root / chosen
     assert missing_model("toy", root, None) == ""
 
 
@@ -120,8 +120,8 @@ def test_a_model_beside_others_whose_images_cannot_be_counted_is_named(make_scen
     make_scene(sparse="sparse/1")
     (root / "sparse/0/images.bin").write_bytes(b"\1")
     with refusal(r"sparse/0/images\.bin: its images cannot be counted.*scene\.sparse"):
-        read_colmap("toy", root)
-    assert read_colmap("toy", root, sparse="sparse/1").model == root / "sparse/1"
+        read_colmap(root)
+    assert read_colmap(root, sparse="sparse/1").model == root / "sparse/1"
 
 
 @pytest.mark.parametrize("text", [False, True])
@@ -134,11 +134,11 @@ def test_names_with_blanks_are_read_whole_with_any_byte_order_mark_and_line_end(
     root = make_scene(names=names, text=text)
     for file in (root / "sparse/0").glob("*.txt"):
         file.write_bytes(mark + file.read_bytes().replace(b"\n", line_end))
-    assert list(read_colmap("toy", root).image_names) == names
+    assert list(read_colmap(root).image_names) == names
     model = read_model(root / "sparse/0")
     assert sorted(image.name for image in model.images.values()) == names
     (root / "tests.txt").write_bytes(mark + names[3].encode() + line_end)
-    assert read_colmap("toy", root, test_list="tests.txt").test_names == (names[3],)
+    assert read_colmap(root, test_list="tests.txt").test_names == (names[3],)
 
 
 @pytest.mark.parametrize(
@@ -160,7 +160,7 @@ def test_wrong_encodings_and_decimal_commas_of_a_text_model_are_named(
     file = root / f"sparse/0/{stem}.txt"
     file.write_bytes(change(file.read_text().replace(" 5 ", " 5.5 ")))
     with refusal(rf"{stem}\.txt: .*{said}"):
-        read_colmap("toy", root)
+        read_colmap(root)
 
 
 def test_selection_is_even_and_comes_before_the_split(make_scene):
@@ -171,7 +171,7 @@ def test_selection_is_even_and_comes_before_the_split(make_scene):
         gaps = {b - a for a, b in zip(chosen, [*chosen[1:], count], strict=True)}
         assert len(chosen) == most
         assert max(gaps) - min(gaps) <= 1
-    capture = read_colmap("toy", make_scene(), max_images=3, test_every=2)
+    capture = read_colmap(make_scene(), max_images=3, test_every=2)
     assert capture.image_names == ("00.png", "02.png", "04.png")
     assert capture.test_names == ("00.png", "04.png")
 
@@ -187,14 +187,7 @@ LISTS = {  # name of a file: what it lists
 
 @pytest.mark.parametrize(
     "train, test, trained_on, tested_on",
-    [
-        (None, "test", (0, 2, 4, 5), (1, 3)),
-        ("train", "test", (0, 2), (1, 3)),
-        ("train", None, (0, 2), (1, 3, 4, 5)),
-        (None, "bad", r"split lists name 99\.png", None),
-        ("first", "last", "2 images in the split lists, but at least 3 are needed", None),
-        ("train", "first", r"00\.png for training and for testing", None),
-    ],
+    TABLES["split lists"],
 )
 def test_lists_choose_the_training_and_test_views(make_scene, train, test, trained_on, tested_on):
     root = make_scene()
@@ -204,9 +197,9 @@ def test_lists_choose_the_training_and_test_views(make_scene, train, test, train
     lists = {"train_list": train, "test_list": test}
     if tested_on is None:
         with refusal(trained_on):
-            read_colmap("toy", root, **lists)
+            read_colmap(root, **lists)
         return
-    capture = read_colmap("toy", root, **lists)
+    capture = read_colmap(root, **lists)
     assert capture.train_names == tuple(f"{k:02d}.png" for k in trained_on)
     assert capture.test_names == tuple(f"{k:02d}.png" for k in tested_on)
 
@@ -214,34 +207,34 @@ def test_lists_choose_the_training_and_test_views(make_scene, train, test, train
 def test_fingerprint_depends_on_content_not_on_place(make_scene, tmp_path):
     root = make_scene()
     copy = Path(shutil.copytree(root, tmp_path / "elsewhere"))
-    first = read_colmap("toy", root)
-    assert read_colmap("other", copy).fingerprint == first.fingerprint
-    assert read_photos("toy", root).fingerprint != first.fingerprint
-    assert read_colmap("toy", root, max_images=5).fingerprint != first.fingerprint
+    first = read_colmap(root)
+    assert read_colmap(copy).fingerprint == first.fingerprint
+    assert read_photos(root).fingerprint != first.fingerprint
+    assert read_colmap(root, max_images=5).fingerprint != first.fingerprint
     with (copy / "images" / "03.png").open("ab") as stream:
         stream.write(b"x")
-    assert read_colmap("toy", copy).fingerprint != first.fingerprint
+    assert read_colmap(copy).fingerprint != first.fingerprint
 
 
 def test_missing_folders_images_and_models_are_named(make_scene, tmp_path):
     with refusal("does not exist"):
-        read_photos("toy", tmp_path / "nowhere")
+        read_photos(tmp_path / "nowhere")
     with refusal(r"scene\.path must be a path"):
-        read_photos("toy", "")
+        read_photos("")
     empty = tmp_path / "empty"
     empty.mkdir()
     with refusal("0 images"):
-        read_photos("toy", empty)
+        read_photos(empty)
     root = make_scene()
     with refusal(r"images_8: no such folder; set scene\.images to one of: images$"):
-        read_colmap("toy", root, images="images_8")
+        read_colmap(root, images="images_8")
     for name in list_images(root / "images")[2:]:
         (root / "images" / name).unlink()
     with refusal("2 images that the model"):
-        read_colmap("toy", root)
+        read_colmap(root)
     shutil.rmtree(root / "sparse")
     with refusal("no COLMAP model in sparse/0 or sparse"):
-        read_colmap("toy", root)
+        read_colmap(root)
 
 
 @pytest.mark.parametrize(
@@ -253,7 +246,7 @@ def test_an_error_says_where_a_model_lies(make_scene, place, given, remedy):
     if place.startswith("dense"):
         (root / "images").rename((root / place).parent / "images")
     with refusal(f"no COLMAP model in .*: .*{remedy.format(root)}$"):
-        read_colmap("toy", root / given)
+        read_colmap(root / given)
 
 
 def test_a_database_without_a_model_is_named(make_scene):
@@ -261,18 +254,18 @@ def test_a_database_without_a_model_is_named(make_scene):
     (root / "sparse").rename(root.parent / "elsewhere")
     (root / "database.db").touch()
     with refusal("a database holds no poses: make one with COLMAP"):
-        read_colmap("toy", root)
+        read_colmap(root)
 
 
 def test_what_is_not_read_of_a_folder_is_named(make_scene, caplog):
     """Photographs without a pose; but no masks, and no text model beside the binary one."""
     root = make_scene()
-    plain = read_colmap("toy", root)
+    plain = read_colmap(root)
     assert not caplog.records
     make_scene(names=[f"{k:02d}.png" for k in (0, 2, 4)], text=True)
     for name in ("00.jpg", "00.png.png", "00_mask.png", "thumbs/00.png", "new.png"):
         write(root / "images" / name, (root / "images/00.png").read_bytes())
-    capture = read_colmap("toy", root)
+    capture = read_colmap(root)
     assert (capture.image_names, capture.test_names) == (plain.image_names, plain.test_names)
     assert "1 photograph without a pose in the model: new.png" in caplog.text
 
@@ -290,7 +283,7 @@ def test_a_scene_is_named_after_its_folder_and_a_missing_model_is_reported(make_
 
 def test_a_missing_list_is_named(make_scene):
     with refusal(r"scene\.test_list: .*cannot be read \(No such file or directory\): name a"):
-        read_colmap("toy", make_scene(), test_list="\\n")
+        read_colmap(make_scene(), test_list="\\n")
 
 
 @pytest.mark.parametrize(
@@ -304,11 +297,11 @@ def test_a_model_without_one_of_its_files_is_named(make_scene, lacking, message)
     root = make_scene(text=True)
     (root / "sparse/0" / lacking).unlink()
     with refusal(message):
-        read_colmap("toy", root)
+        read_colmap(root)
 
 
 def test_a_list_in_a_code_page_names_its_line(make_scene):
     root = make_scene()
     (root / "test_list.txt").write_bytes(b"a.png\nK\xfcche.png\n")
     with refusal(r"line 2 is not UTF-8 \(K.xfcche.png\): save it as UTF-8"):
-        read_colmap("toy", root, split="list")
+        read_colmap(root, split="list")

@@ -25,9 +25,9 @@ def photographs(folder, pattern="{}.jpg", scale=1, seed=0, change=lambda picture
     TABLES["other files"],
 )
 def test_other_files_beside_photographs_change_no_capture(tmp_path, caplog, pattern, scale, named):
-    alone = read_photos("a", photographs(tmp_path / "alone"))
+    alone = read_photos(photographs(tmp_path / "alone"))
     caplog.clear()
-    beside = read_photos("a", photographs(photographs(tmp_path / "beside"), pattern, scale))
+    beside = read_photos(photographs(photographs(tmp_path / "beside"), pattern, scale))
     assert (beside.image_names, beside.fingerprint) == (alone.image_names, alone.fingerprint)
     assert named in caplog.text
     assert len(caplog.records) == bool(named)
@@ -40,7 +40,7 @@ def test_other_files_beside_photographs_change_no_capture(tmp_path, caplog, patt
 def test_of_folders_of_several_sizes_the_largest_is_read(tmp_path, caplog, patterns, kept):
     for pattern, scale in patterns.items():
         photographs(tmp_path, pattern, scale)
-    assert read_photos("a", tmp_path).image_names == tuple(kept.format(k) for k in range(COUNT))
+    assert read_photos(tmp_path).image_names == tuple(kept.format(k) for k in range(COUNT))
     assert "left out, no photographs" in caplog.text
 
 
@@ -51,7 +51,7 @@ def test_of_folders_of_several_sizes_the_largest_is_read(tmp_path, caplog, patte
 def test_photographs_in_folders_of_other_names_are_all_read(tmp_path, caplog, patterns):
     for number, pattern in enumerate(patterns):
         photographs(tmp_path, pattern, seed=COUNT * number)
-    assert len(read_photos("a", tmp_path).image_names) == COUNT * len(patterns)
+    assert len(read_photos(tmp_path).image_names) == COUNT * len(patterns)
     assert not caplog.records
 
 
@@ -60,13 +60,13 @@ def test_files_of_the_photographs_names_in_folders_beside_them_are_columns(tmp_p
     for place, ending in (("depth/cam", "npy"), ("normals/cam", "png"), ("masks", "png")):
         for k in range(3):
             write(tmp_path / place / f"{k}.{ending}", b"any")
-    capture = read_photos("a", tmp_path)
+    capture = read_photos(tmp_path)
     names = [f"cam/{k}.jpg" for k in range(3)]
     assert capture.beside == {
         "depth": {name: tmp_path / f"depth/{name[:-3]}npy" for name in names},
         "normals": {name: tmp_path / f"normals/{name[:-3]}png" for name in names},
     }
-    alone = read_photos("a", photographs(tmp_path / "alone", "images/cam/{}.jpg"))
+    alone = read_photos(photographs(tmp_path / "alone", "images/cam/{}.jpg"))
     assert alone.fingerprint == capture.fingerprint
 
 
@@ -75,5 +75,5 @@ def test_a_folder_that_is_named_is_read_whatever_its_name(tmp_path):
     with refusal(
         r"all 5 files are masks, thumbnails or the like: thumbs/ \(5\): scene.images=FOLDER"
     ):
-        read_photos("a", tmp_path)
-    assert len(read_photos("a", tmp_path, images="thumbs").image_names) == COUNT
+        read_photos(tmp_path)
+    assert len(read_photos(tmp_path, images="thumbs").image_names) == COUNT

@@ -3,6 +3,8 @@
 import json
 import math
 import shutil
+import tempfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -67,7 +69,8 @@ def in_frame(number, **keys):
     return lambda document: document["frames"][number].update(keys)
 
 
-def capture_of(folder, work, **options):
+def capture_of(folder, **options):
+    work = Path(tempfile.mkdtemp(dir=folder.parent))
     return read_with_step(folder, work, name="t", kind="transforms", **options)
 
 
@@ -78,7 +81,7 @@ def project(model, name, point):
 
 def test_points_are_projected_by_the_formulas_of_the_format(tmp_path):
     """x is right, y up, z towards the viewer: column cx + fl_x x/-z, row cy - fl_y y/-z."""
-    model = read_model(capture_of(write(tmp_path / "in"), tmp_path / "made").model)
+    model = read_model(capture_of(write(tmp_path)).model)
     for k, eye in enumerate(EYES):
         for point in (np.zeros(3), np.array([0.3, -0.2, 0.1])):
             x, y, z, _ = np.linalg.inv(looking_at_origin(eye)) @ [*point, 1]
@@ -90,7 +93,7 @@ def test_points_are_projected_by_the_formulas_of_the_format(tmp_path):
 
 def test_the_applied_transform_is_undone_for_cameras_and_points(tmp_path):
     """The file holds applied_scale (R p + t); cameras and the PLY get their original places."""
-    plain = capture_of(write(tmp_path / "plain"), tmp_path / "one")
+    plain = capture_of(write(tmp_path / "plain"))
     applied = np.array([[0, 1, 0, 0.5], [1, 0, 0, -2], [0, 0, -1, 3.0]])
     scale = 2.5
     points = np.random.default_rng(0).normal(size=(5, 3))
@@ -111,12 +114,12 @@ def test_the_applied_transform_is_undone_for_cameras_and_points(tmp_path):
     names = ["double x", "double y", "double z", "uchar red", "uchar green", "uchar blue"]
     header = ["ply", "format ascii 1.0", "element vertex 5", *(f"property {n}" for n in names)]
     (folder / "p.ply").write_text("\n".join([*header, "end_header", *lines, ""]))
-    moved = capture_of(folder, tmp_path / "two")
+    moved = capture_of(folder)
     one, other = (cameras_of(read_model(capture.model)) for capture in (plain, moved))
     for name, camera in one.items():
         assert_allclose(camera.rotation, other[name].rotation, atol=1e-9)
         assert_allclose(camera.translation, other[name].translation, atol=1e-9)
-    for capture in (moved, capture_of(in_blenders_files(folder), tmp_path / "three")):
+    for capture in (moved, capture_of(in_blenders_files(folder))):
         cloud = read_cloud(capture.model)
         assert_allclose(cloud.points, points, atol=1e-9)
         assert cloud.colors.tolist() == [[10, 20, k] for k in range(5)]
@@ -130,7 +133,7 @@ IDENTITY = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
     TABLES["files with other points"],
 )
 def test_two_files_must_name_the_same_points_under_one_transform(tmp_path, change, said):
-    folder = in_blenders_files(write(tmp_path / "in", ply_file_path="a.ply"))
+    folder = in_blenders_files(write(tmp_path, ply_file_path="a.ply"))
     for name in ("a.ply", "b.ply"):
         (folder / name).write_text("ply")
     assert read_transforms(folder).points.path == folder / "a.ply"
@@ -188,7 +191,7 @@ def test_blender_scenes_with_their_angle_names_split_and_alpha_are_read(tmp_path
             frames.append({"file_path": f"./{part}/r_{k}", "transform_matrix": matrix})
         document = {"camera_angle_x": angle, "frames": frames}
         (tmp_path / f"transforms_{part}.json").write_text(json.dumps(document))
-    capture = capture_of(tmp_path, tmp_path / "made", split="list")
+    capture = capture_of(tmp_path, split="list")
     assert capture.test_names == tuple(f"test/r_{k}.png" for k in range(3))
     assert capture.train_names == tuple(f"train/r_{k}.png" for k in range(5))
     camera = {row.name: row.camera for row in read_transforms(tmp_path).photographs}[
@@ -196,7 +199,7 @@ def test_blender_scenes_with_their_angle_names_split_and_alpha_are_read(tmp_path
     ]
     assert camera.params == pytest.approx((0.5 * 40 / math.tan(0.5 * angle),) * 2 + (20, 20))
     # held out by scene.split, not by the files
-    assert capture_of(tmp_path, tmp_path / "every").test_names == ("test/r_0.png",)
+    assert capture_of(tmp_path).test_names == ("test/r_0.png",)
     assert not any(name.startswith("val/") for name in read_transforms(tmp_path).names)
     (tmp_path / "transforms_test.json").unlink()
     assert read_transforms(tmp_path).named("test") == ["val/r_0.png", "val/r_1.png"]
@@ -213,33 +216,33 @@ def test_blender_scenes_with_their_angle_names_split_and_alpha_are_read(tmp_path
 
 
 def test_a_line_says_which_of_both_forms_of_a_scene_is_read(tmp_path, caplog):
-    folder = write(tmp_path / "in")
+    folder = write(tmp_path)
     shutil.copy(folder / "transforms.json", folder / "transforms_train.json")
     read_transforms(folder)
     assert "transforms.json is read, and transforms_train.json not" in caplog.text
 
 
 def test_masks_and_depth_maps_that_frames_name_are_columns_of_the_record(tmp_path):
-    folder = write(tmp_path / "in", in_frame(1, mask_path="masks/1.png", depth_file_path="d/1.npy"))
+    folder = write(tmp_path, in_frame(1, mask_path="masks/1.png", depth_file_path="d/1.npy"))
     (folder / "masks" / "images").mkdir(parents=True)
     Image.new("L", (40, 30), 255).save(folder / "masks/1.png")
     for k in range(6):
         Image.new("L", (40, 30), 255).save(folder / "masks" / "images" / f"{k}.png.png")
-    found = capture_of(folder, tmp_path / "a")
+    found = capture_of(folder)
     assert found.masks == {"images/1.png": folder / "masks/1.png"}
     assert found.beside == {"depth": {"images/1.png": folder / "d/1.npy"}}
-    found = capture_of(folder, tmp_path / "b", masks="masks")
+    found = capture_of(folder, masks="masks")
     assert found.masks["images/2.png"] == folder / "masks/images/2.png.png"
 
 
 def test_the_file_is_read_once_and_changes_the_fingerprint(tmp_path, monkeypatch):
     read, files = transforms.read_bytes, []
     monkeypatch.setattr(transforms, "read_bytes", lambda path: files.append(path) or read(path))
-    folder = write(tmp_path / "in")
-    capture = capture_of(folder, tmp_path / "a")
+    folder = write(tmp_path)
+    capture = capture_of(folder)
     assert files == [*capture.read_from] == [folder / "transforms.json"]
     write(folder, fl_x=49.0)
-    assert capture_of(folder, tmp_path / "b").fingerprint != capture.fingerprint
+    assert capture_of(folder).fingerprint != capture.fingerprint
 
 
 REFUSED_ROWS = [(key, f"{key}: {reason}") for key, reason in KEYS["refused"].items()]
@@ -257,37 +260,37 @@ SIZE = {"w": 20, "h": 15}
     ],
 )
 def test_a_file_that_cannot_be_understood_is_named_in_one_line(tmp_path, change, said):
-    folder = write(tmp_path / "in", change)
+    folder = write(tmp_path, change)
     with refusal(said) as caught:
         read_transforms(folder)
     assert str(folder / "transforms.json") in str(caught.value)
 
 
 def test_images_one_pixel_wide_are_accepted_and_a_missing_side_is_measured(tmp_path):
-    write(tmp_path / "in")
+    write(tmp_path)
     for k in range(len(EYES)):
-        Image.new("RGB", (1, 30)).save(tmp_path / f"in/images/{k}.png")
-    change_json(tmp_path / "in/transforms.json", w=1)
-    rows = read_transforms(tmp_path / "in").photographs
+        Image.new("RGB", (1, 30)).save(tmp_path / f"images/{k}.png")
+    change_json(tmp_path / "transforms.json", w=1)
+    rows = read_transforms(tmp_path).photographs
     assert {row.camera.width for row in rows} == {1}
     for side in ("w", "h"):
-        for camera in cameras(tmp_path / "in", **{side: None}).values():
+        for camera in cameras(tmp_path, **{side: None}).values():
             assert (camera.width, camera.height) == (40, 30)
 
 
 def test_a_missing_file_and_a_name_that_fits_two_images_are_refused(tmp_path):
     with refusal(r"neither transforms\.json nor transforms_train\.json is here"):
         read_transforms(tmp_path)
-    folder = write(tmp_path / "in", in_frame(0, file_path="images/0"))
+    folder = write(tmp_path, in_frame(0, file_path="images/0"))
     Image.new("RGB", (40, 30)).save(folder / "images" / "0.jpg")
     with refusal(r"images/0 may be images/0\.jpg or images/0\.png: keep one"):
         read_transforms(folder)
 
 
 def test_images_without_a_file_are_left_out(tmp_path, caplog):
-    folder = write(tmp_path / "in")
+    folder = write(tmp_path)
     (folder / "images" / "4.png").unlink()
-    assert len(capture_of(folder, tmp_path / "made").image_names) == 5
+    assert len(capture_of(folder).image_names) == 5
     assert "1 image with a camera but without a file: ./images/4.png" in caplog.text
 
 
@@ -301,10 +304,10 @@ def reduced(folder, name="images_2"):
 
 @pytest.mark.parametrize("keep", [True, False])
 def test_scene_images_replaces_the_folder_that_the_file_names(tmp_path, keep):
-    folder = reduced(write(tmp_path / "in"))
+    folder = reduced(write(tmp_path))
     if not keep:
         shutil.rmtree(folder / "images")
-    capture = capture_of(folder, tmp_path / "made", images="images_2")
+    capture = capture_of(folder, images="images_2")
     assert capture.image_names == tuple(f"images_2/{k}.png" for k in range(6))
     fitted = read_reference(capture)
     change_json(
@@ -318,46 +321,29 @@ def test_scene_images_replaces_the_folder_that_the_file_names(tmp_path, keep):
         assert (camera.width, camera.height) == (24, 18)
         assert camera.focal_length_x == pytest.approx(50 * 0.6)
     with refusal(r"nowhere: no such folder; set scene.images to one of"):
-        capture_of(folder, tmp_path / "made", images="nowhere")
+        capture_of(folder, images="nowhere")
 
 
 def test_an_error_says_that_another_folder_may_have_the_named_files(tmp_path):
-    folder = reduced(write(tmp_path / "in"))
+    folder = reduced(write(tmp_path))
     shutil.rmtree(folder / "images")
     with refusal(
         r"0 images with a file and a camera in transforms.json, while ./images/0.png, .* have no "
         r"file, but at least 3 are needed: set scene.images to the folder of the photographs"
     ):
-        capture_of(folder, tmp_path / "made")
+        capture_of(folder)
 
 
 def focal(side, angle):
     return 0.5 * side / math.tan(angle / 2)
 
 
-WIDE, HIGH = focal(40, math.radians(70)), focal(30, math.radians(50))
-
-
-@pytest.mark.parametrize(
-    "said, focal_x, focal_y",
-    [
-        ({"x_fov": 70.0}, WIDE, WIDE),
-        ({"y_fov": 50.0}, HIGH, HIGH),
-        ({"x_fov": 70.0, "y_fov": 50.0}, WIDE, HIGH),
-        ({"camera_angle_x": 1.2}, focal(40, 1.2), focal(40, 1.2)),
-        ({"camera_angle_y": 0.9}, focal(30, 0.9), focal(30, 0.9)),
-        ({"camera_angle_x": 1.2, "camera_angle_y": 0.9}, focal(40, 1.2), focal(30, 0.9)),
-        ({"fl_y": 51.0}, 51.0, 51.0),
-        ({"fl_x": 50.0, "camera_angle_y": 0.9}, 50.0, focal(30, 0.9)),
-        ({"fl_x": 50.0, "fl_y": 51.0, "x_fov": 70.0, "camera_angle_y": 0.9}, 50.0, 51.0),
-    ],
-)
+@pytest.mark.parametrize("said, x, y", TABLES["fields of view"])
 @pytest.mark.parametrize("edit", [in_each_frame, lambda **said: lambda d: d.update(said)])
-def test_focal_lengths_follow_from_every_way_to_give_a_field_of_view(
-    tmp_path, said, focal_x, focal_y, edit
-):
-    for camera in cameras(tmp_path / "in", edit(**said), fl_x=None, fl_y=None).values():
-        assert camera.params[:2] == pytest.approx((focal_x, focal_y))
+def test_focal_lengths_follow_from_every_way_to_give_a_field_of_view(tmp_path, said, x, y, edit):
+    wanted = [focal(*value) if isinstance(value, list) else value for value in (x, y)]
+    for camera in cameras(tmp_path, edit(**said), fl_x=None, fl_y=None).values():
+        assert camera.params[:2] == pytest.approx(tuple(wanted))
 
 
 def test_a_frame_with_a_field_of_view_of_its_own_uses_no_focal_length_of_the_file(tmp_path):
@@ -366,12 +352,12 @@ def test_a_frame_with_a_field_of_view_of_its_own_uses_no_focal_length_of_the_fil
             document["frames"][number].update(keys)
 
     found = [camera.params[0] for camera in cameras(tmp_path, edit).values()]
-    assert found == pytest.approx([focal(40, 0.5), WIDE, 70, 50, 50, 50])
+    assert found == pytest.approx([focal(40, 0.5), focal(40, math.radians(70)), 70, 50, 50, 50])
 
 
 def test_a_focal_length_that_contradicts_the_field_of_view_is_used_with_one_line(tmp_path, caplog):
     def read(edit=None, **changes):
-        return capture_of(write(tmp_path / "in", edit, **changes), tmp_path / "made")
+        return capture_of(write(tmp_path, edit, **changes))
 
     read(camera_angle_x=2 * math.atan(20 / 50 * 1.02))
     own = SIZE | {"fl_x": 25, "fl_y": 25, "cx": 10, "cy": 7.5}
@@ -393,7 +379,7 @@ def test_a_principal_point_of_a_larger_photograph_asks_for_its_size(tmp_path, cx
 )
 def test_higher_coefficients_distort_as_in_opencv(tmp_path, said):
     """OpenCV: (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)."""
-    capture = capture_of(write(tmp_path / "in", k1=0.1, k2=-0.02, **said), tmp_path / "made")
+    capture = capture_of(write(tmp_path, k1=0.1, k2=-0.02, **said))
     model = read_model(capture.model)
     k = {key: said.get(key, 0.0) for key in ("k3", "k4", "k6")}
     for x, y in ((0.3, -0.2), (-0.6, 0.5)):
@@ -407,15 +393,15 @@ def test_higher_coefficients_distort_as_in_opencv(tmp_path, said):
 
 @pytest.mark.parametrize("key", sorted([*KEYS["harmless"], *KEYS["refused"]]))
 def test_known_keys_without_effect_are_ignored_without_a_warning(tmp_path, key, caplog):
-    wanted = cameras(tmp_path / "in")
+    wanted = cameras(tmp_path)
     values = (None,) if key.startswith("transform_matrix") else (None, 0, False, [0.0, 0.0])
     for value in (*values, *([1.5, "text", [1.0]] if key in KEYS["harmless"] else [])):
-        assert cameras(tmp_path / "in", **{key: value}) == wanted
+        assert cameras(tmp_path, **{key: value}) == wanted
     assert not caplog.text
 
 
 def test_black_transparent_is_refused_where_transparent_pixels_become_white(tmp_path):
-    folder = write(tmp_path / "in", black_transparent=True)
+    folder = write(tmp_path, black_transparent=True)
     assert CaptureSource(SceneConfig(name="t", kind="transforms", path=str(folder))).step
     white = SceneConfig(name="t", kind="transforms", path=str(folder), transparent="white")
     with refusal(r"black_transparent: .*save the files so"):
@@ -423,7 +409,7 @@ def test_black_transparent_is_refused_where_transparent_pixels_become_white(tmp_
 
 
 def test_unknown_keys_are_named_in_one_line(tmp_path, caplog):
-    read_transforms(write(tmp_path / "in", in_each_frame(lens="wide"), exporter="x", fl_X=3.0))
+    read_transforms(write(tmp_path, in_each_frame(lens="wide"), exporter="x", fl_X=3.0))
     (record,) = caplog.records
     assert record.getMessage().endswith("3 keys are not known and not used: exporter, fl_X, lens")
 
@@ -437,17 +423,17 @@ def test_nerfstudios_lists_of_filenames_are_the_split(tmp_path, lists, train, te
         return tuple(f"images/{k}.png" for k in numbers)
 
     named = {f"{part}_filenames": names(numbers) for part, numbers in lists.items()}
-    folder = write(tmp_path / "in", **named)
-    capture = capture_of(folder, tmp_path / "made", split="list")
+    folder = write(tmp_path, **named)
+    capture = capture_of(folder, split="list")
     assert (capture.train_names, capture.test_names) == (names(train), names(test))
     assert not caplog.text
-    assert len(capture_of(folder, tmp_path / "other").image_names) == 6
+    assert len(capture_of(folder).image_names) == 6
     assert "its own split: scene.split=list uses it" in caplog.text
 
 
 @pytest.mark.parametrize("written", ["images/4.JPG", "images/4", "IMAGES/4.PNG", "images\\4.jpeg"])
 def test_a_file_is_found_whatever_its_extension_and_capitals(tmp_path, written):
-    folder = write(tmp_path / "in", in_frame(4, file_path=written))
+    folder = write(tmp_path, in_frame(4, file_path=written))
     assert read_transforms(folder).names == [f"images/{k}.png" for k in range(6)]
 
 

@@ -17,20 +17,13 @@ from gsbench.scene.types import Scene, View
 from tests.helpers import refusal
 from tests.scene.captures import read_colmap, read_photos
 from tests.scene.conftest import smooth_image
+from tests.scene.tables import TABLES
 from tests.train.conftest import orbit_camera
 
 
 @pytest.mark.parametrize(
     "names, wanted, left_out",
-    [
-        (["a.jpg", "a.png", "b.jpg"], (), {"a.png": "a.jpg"}),
-        # the format that more photographs have
-        (["a.jpg", "a.png", "b.png"], (), {"a.jpg": "a.png"}),
-        (["a.JPEG", "a.png", "b.png", "c.JPG", "c.tif"], (), {"a.JPEG": "a.png", "c.tif": "c.JPG"}),
-        (["a.jpg", "a.png", "b.jpg"], {"a.png"}, {"a.jpg": "a.png"}),
-        (["1/a.jpg", "2/a.png"], (), {}),
-        (["a.jpg", "a.v2.jpg"], (), {}),
-    ],
+    TABLES["copies by name"],
 )
 def test_one_of_several_photographs_with_the_same_stem_is_used(names, wanted, left_out):
     assert copies_by_name(names, wanted) == left_out
@@ -45,13 +38,13 @@ def photographs(folder, suffixes, count=9):
 
 
 def test_a_folder_with_every_photograph_in_two_formats_is_read_once(tmp_path, caplog):
-    capture = read_photos("own", photographs(tmp_path / "own", (".jpg", ".png")))
+    capture = read_photos(photographs(tmp_path / "own", (".jpg", ".png")))
     assert capture.image_names == tuple(f"{k}.jpg" for k in range(9))
     (line,) = [record.message for record in caplog.records]
     assert (
         "9 photographs left out, with the name or content of another: 0.png (0.jpg is used)" in line
     )
-    alone = read_photos("own", photographs(tmp_path / "alone", (".jpg",)))
+    alone = read_photos(photographs(tmp_path / "alone", (".jpg",)))
     assert (capture.fingerprint, alone.left_out) == (alone.fingerprint, {})
 
 
@@ -60,7 +53,7 @@ def test_a_training_file_with_the_content_of_a_test_view_is_left_out(make_scene)
     shutil.copy(root / "images/00.png", root / "images/03.png")  # 00.png is the test view
     # copies within training are the user's choice
     shutil.copy(root / "images/04.png", root / "images/05.png")
-    capture = read_colmap("toy", root)
+    capture = read_colmap(root)
     assert capture.test_names == ("00.png",)
     assert capture.train_names == ("01.png", "02.png", "04.png", "05.png")
     assert capture.left_out == {"03.png": "00.png"}

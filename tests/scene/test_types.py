@@ -5,6 +5,7 @@ import pytest
 
 from gsbench.scene.types import Camera, CameraModel, to_pinhole
 from tests.scene.cameras import looking
+from tests.scene.tables import TABLES
 
 SOUND = {
     **{"width": 1, "height": 1, "fx": 1e-3, "fy": 1e-3, "cx": -5.0, "cy": 0.0},
@@ -12,15 +13,7 @@ SOUND = {
 }
 
 
-@pytest.mark.parametrize(
-    "name, value",
-    [
-        *(("width", 0), ("height", 0), ("cx", np.inf), ("cy", np.nan)),
-        *((focal, value) for focal in ("fx", "fy") for value in (0.0, -1.0, np.inf, np.nan)),
-        *(("rotation", value) for value in (1.01 * np.eye(3), np.eye(4), np.full((3, 3), np.nan))),
-        *(("translation", value) for value in (np.zeros(2), np.array([0.0, np.nan, 0.0]))),
-    ],
-)
+@pytest.mark.parametrize("name, value", TABLES["impossible cameras"])
 def test_impossible_values_of_a_camera_are_refused(name, value):
     Camera(**SOUND)  # one pixel is a picture
     with pytest.raises(ValueError, match="camera: "):

@@ -41,9 +41,6 @@ class Client:
 
         return call
 
-    def called(self, name):
-        return [given for called, given, _ in self.calls if called == name]
-
 
 def experiment(stage="active", **tags):
     return SimpleNamespace(experiment_id=7, lifecycle_stage=stage, tags=tags)
@@ -100,13 +97,11 @@ def test_long_texts_are_cut_and_times_are_those_of_the_training(sink):
         params={"short": "a", "long": "b" * 600},
         tags={"raster": "cpu", "note": "n" * 6000},
         scalars=[Scalar("eval/psnr", 20.5, 30, 2.5)],
-        files={"a.txt": Path("a.txt"), "sub/b.png": Path("b.png")},
         pictures=[PICTURE],
         status="FAILED",
         reason="x" * 6000,
     )
     sink.send(update)
-    sink.send(Update(status="KILLED"))
     (_, _, sent) = sink._client.calls[0]
     assert [len(param.value) for param in sent["params"]] == [1, 500]
     lengths = {tag.key: len(tag.value) for tag in sent["tags"]}
@@ -114,7 +109,5 @@ def test_long_texts_are_cut_and_times_are_those_of_the_training(sink):
     (metric,) = sent["metrics"]
     found = (metric.key, metric.value, metric.step, metric.timestamp)
     assert found == ("eval/psnr", 20.5, 30, 1_002_500)
-    assert sink._client.called("log_artifact") == [("r", "a.txt", None), ("r", "b.png", "sub")]
     (image,) = [named for name, _, named in sink._client.calls if name == "log_image"]
-    assert image == {"key": "view", "step": 30, "timestamp": 1_002_500, "synchronous": True}
-    assert sink._client.called("set_terminated") == [("r", "FAILED"), ("r", "KILLED")]
+    assert (image["timestamp"], image["synchronous"]) == (1_002_500, True)

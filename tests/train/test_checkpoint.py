@@ -61,11 +61,6 @@ def test_the_folder_is_synced_and_the_thread_ends(tmp_path, monkeypatch):
     assert not any(thread.name.startswith("gsbench-checkpoint") for thread in threading.enumerate())
 
 
-def test_torch_load_reads_a_checkpoint_file(tmp_path):
-    save_checkpoint(tmp_path, 1, state(1))
-    assert equal(torch.load(tmp_path / "checkpoint-00000001.pt", weights_only=True), state(1))
-
-
 def test_a_damaged_checkpoint_is_detected_and_the_one_before_is_loaded(tmp_path, caplog):
     save_checkpoint(tmp_path, 10, state(10))
     save_checkpoint(tmp_path, 20, state(20))

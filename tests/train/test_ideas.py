@@ -57,17 +57,6 @@ def z_of(gaussians, camera):
     return gaussians.means @ axis + float(camera.translation[2])
 
 
-def test_depth_of_the_cpu_is_that_of_the_reference_in_float64(case):
-    exact, _ = render_depth(ReferenceRasterizer(), case.gaussians(), case.camera())
-    ours, _ = render_depth(
-        create_rasterizer("cpu", torch.device("cpu")),
-        case.gaussians().map(torch.Tensor.float),
-        case.camera(),
-    )
-    assert (exact > 0).any()
-    assert torch.allclose(ours.double(), exact, atol=1e-4, rtol=1e-4)
-
-
 def test_depth_is_the_sum_of_weights_times_z_over_alpha():
     """One opaque Gaussian has its own z everywhere it is seen."""
     case = Case(24, 18, 1, sh_degree=0)
@@ -207,12 +196,6 @@ def test_each_term_has_a_column(lab):
     term = ideas.LowOpacity()
     trained(lab, "two", parts={"terms": [(term, 0.1), (term, 0.2)]})
     assert {"term_LowOpacity", "term_LowOpacity_2", "l1"} <= lab.records(METRICS, "two")[0].keys()
-
-
-def test_an_opacity_term_lowers_opacities(lab):
-    plain = trained(lab, "plain")
-    lower = trained(lab, "lower", parts={"terms": [(ideas.LowOpacity(), 1.0)]})
-    assert lower.opacity_logits.mean() < plain.opacity_logits.mean() - 0.1
 
 
 def test_terms_on_depth_enter_the_gradient_that_densifiers_see(lab):
@@ -424,16 +407,6 @@ def test_a_term_reads_the_pictures_beside_the_photograph(lab, divisor):
     trainer.run(lab.folder)
     assert len(seen) == 12
     assert len(set(seen)) == divisor  # sizes
-
-
-def test_without_pictures_beside_it_a_view_has_no_depth(lab):
-    class Bare:
-        def __call__(self, step):
-            assert step.view.depth is None
-            assert not step.view.more
-            return 0 * step.render.image.mean()
-
-    trained(lab, parts={"terms": [(Bare(), 1.0)]}, iterations=2)
 
 
 def test_an_error_of_a_term_names_it_and_says_how_to_ask_for_depth(lab):

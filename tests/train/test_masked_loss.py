@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 from skimage.metrics import structural_similarity
-from torch.testing import assert_close
 
 from gsbench.eval.images import replace_ignored
 from gsbench.raster import create_rasterizer
@@ -72,23 +71,6 @@ def test_ignored_pixels_change_neither_the_loss_nor_its_gradient(picture, dtype)
         results.append((loss.detach(), drawn.grad))
     assert torch.equal(results[0][0], results[1][0])
     assert torch.equal(results[0][1], results[1][1])
-
-
-def test_far_from_ignored_pixels_the_gradient_is_that_without_a_mask(picture):
-    """Thresholds on gradients keep their meaning, because the loss is divided by all pixels.
-
-    Far means at least 11 px: the gradient has two windows of SSIM, each of radius 5.
-    """
-    image, target, _ = picture
-    mask = torch.ones(HEIGHT, WIDTH, 1, dtype=torch.bool)
-    mask[:, 30:] = False
-    gradients = []
-    for chosen in (None, mask):
-        drawn = image.clone().requires_grad_()
-        PhotometricLoss(threads=1)(replace_ignored(drawn, target, chosen), target)[0].backward()
-        gradients.append(drawn.grad)
-    assert_close(gradients[0][:, :19], gradients[1][:, :19], rtol=0, atol=0)
-    assert not torch.equal(gradients[0][:, 20:30], gradients[1][:, 20:30])
 
 
 def test_densifiers_get_no_error_at_ignored_pixels(picture):

@@ -10,7 +10,6 @@ from gsbench.analysis.differences import ingredients
 from gsbench.densify import EdgeAware
 from gsbench.runs.config_hash import config_hash
 from gsbench.scene.types import View
-from gsbench.train.options import TrainConfig
 from gsbench.train.resolution import (
     Resolution,
     ScaledViews,
@@ -205,14 +204,6 @@ def test_the_schedule_is_an_ingredient_and_part_of_the_hash():
     assert ingredients(plain, plain | {"train.resolution_schedule": "pictures"}) == (
         "resolution schedule",
     )
-
-
-def test_an_unknown_schedule_is_refused():
-    with pytest.raises(
-        ValueError,
-        match=r"train\.resolution_schedule must be 'none' or 'pictures'",
-    ):
-        TrainConfig(name="x", resolution_schedule="spectrum")
 
 
 @pytest.mark.parametrize(

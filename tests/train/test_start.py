@@ -1,4 +1,7 @@
-"""The checks of initial points and cameras, in a scene whose points and colours are known."""
+"""The facts of initial points and cameras, in a scene whose points and colours are known.
+
+`tests/scene/tables.yaml` has the limits of the rules that judge them.
+"""
 
 import logging
 import math
@@ -79,34 +82,11 @@ def test_a_cloud_of_one_colour_causes_a_warning(scene, cloud, level):
     assert f"the colour ({level}, {level}, {level})" in odd.line
 
 
-def seen_by_brute_force(points, scene):
-    """The share of points that two views see, point by point and view by view."""
-    shares = []
-    for point in points:
-        seen = 0
-        for view in scene.train:
-            x, y, z = view.camera.rotation @ point + view.camera.translation
-            if z > 0.2:
-                column = view.camera.fx * x / z + view.camera.cx
-                row = view.camera.fy * y / z + view.camera.cy
-                seen += 0 <= column < view.camera.width and 0 <= row < view.camera.height
-        shares.append(seen >= 2)
-    return float(np.mean(shares))
-
-
-def test_the_share_in_view_equals_that_of_a_loop_over_points_and_views(scene):
-    points = np.random.default_rng(1).uniform(-4, 8, (300, 3))
-    colors = np.random.default_rng(2).integers(0, 256, points.shape, dtype=np.uint8)
-    assert check_start(points, colors, scene, True)[0].seen == seen_by_brute_force(points, scene)
-
-
 @pytest.mark.parametrize(
     "change, doubt",
     [
         (lambda points: points - [1.4, 0.3, 0], "hardly agree"),
-        (lambda points: (points - [0, 0, 4]) * [-1, -1, 1] + [0, 0, 4], "hardly agree"),
         (lambda points: points / 100 + [0, 0, 3.96], "half of the initial points lie within"),
-        (lambda points: points / 100 + [0, 0, 3.96], "hardly agree"),
         (lambda points: points * [8, 8, 1], "in view of two training views"),
         (
             lambda points: np.where(np.arange(600)[:, None] < 400, points[:1], points),
@@ -129,48 +109,10 @@ def test_a_wrong_cloud_causes_a_warning_and_a_random_one_none_about_colours_or_v
     assert not any("agree" in odd.line or "in view" in odd.line for odd in at_random)
 
 
-def test_colour_agreement_is_relative_to_all_pairs_of_points(scene, cloud):
-    points, colors = cloud
-    swapped = colors[:, ::-1]
-    (facts, _), (right, _) = (check_start(points, c, scene) for c in (swapped, colors))
-    # The photographs show a point's own colour up to half a pixel, so these differences are close
-    # to those that are measured.
-    own = np.abs(swapped.astype(int) - colors).mean()
-    pairs = np.abs(swapped[:, None].astype(int) - colors[None]).mean()
-    assert facts.color_agreement == pytest.approx(1 - own / pairs, abs=0.05)
-    assert facts.color_agreement < right.color_agreement
-
-
-@pytest.mark.parametrize(
-    "points, error",
-    [
-        (np.array([[0, 0, 4.0]] * 9), r"100% of the initial points share .*\(0, 0, 4\)"),
-        (
-            np.array([[0, 0, 4.0], [1, 1, 4], [0, 1, 4], [1e30, 1e30, 1e30]]),
-            r"initial point 3 of 4 .* \(1e\+30",
-        ),
-        (
-            np.array([[k, 0, 1000.0] for k in range(9)]) * [1, 1, -1],
-            "other coordinates than the cameras",
-        ),
-    ],
-)
-def test_a_start_from_which_nothing_can_be_learnt_is_refused(scene, points, error):
-    colors = np.zeros(points.shape, dtype=np.uint8)
-    with refusal(error):
-        check_start(points, colors, scene)
-
-
 def test_messages_have_the_scenes_own_coordinates(scene):
     points, colors = np.array([[0, 0, 4.0]] * 9), np.zeros((9, 3), dtype=np.uint8)
     with refusal(r"\(500000, 5400000, 308\)"):
         check_start(points, colors, scene, normalization=Normalization((5e5, 5.4e6, 300.0), 0.5))
-
-
-def test_cameras_at_one_place_are_refused(scene, cloud):
-    first = scene.train[0]
-    with refusal("all training cameras stand at one place"):
-        check_start(*cloud, Scene("still", (first, first, first), ()))
 
 
 def test_ignored_pixels_have_no_effect_on_the_agreement(scene, cloud):

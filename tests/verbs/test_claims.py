@@ -5,7 +5,7 @@ from shlex import split
 
 import pytest
 
-from gsbench.verbs.plan import PLANNED, plan
+from gsbench.verbs.planning import PLANNED, plan
 from tests.helpers import change_json, refusal
 from tests.trials import ask_about, write_runs, write_trial
 

@@ -23,7 +23,7 @@ from gsbench.runs.user_code import user_modules
 from gsbench.verbs import ledger as verb
 from tests.composed import composed
 from tests.conftest import script
-from tests.helpers import write
+from tests.helpers import table, write
 from tests.trials import write_results
 
 SETTINGS = split("scene=courtyard init=random densify=adc tracking=none eval.lpips=[]")
@@ -240,18 +240,7 @@ def test_after_all_planned_ideas_no_further_idea_is_tried(trainings, not_tried):
 
 @pytest.mark.parametrize(
     "words, reason",
-    [
-        (["scene.views=12"], "scene.views: an idea may change densify, init, train and raster"),
-        (["seed=7"], "seed: an idea may change"),
-        (["eval.flip=false"], "eval.flip: an idea may change"),
-        (["name=x", f"{SPLIT}=0.02"], "name: an idea may change"),
-        ([], "the idea is baseline itself"),
-        (split(f"{SPLIT}=0.02 --least 0.01"), "unrecognized arguments: --least 0.01"),
-        (["densify=adc"], "the idea is baseline itself"),
-        (split(f"{SPLIT}=0.02 --against nobody"), "--against nobody: it must be one of baseline"),
-        ([f"{SPLIT}=0.02,0.03"], "compares one arm at a time"),
-        (["densify=nothing_like_it"], "nothing_like_it"),
-    ],
+    table(__file__, "ideas"),
 )
 def test_settings_that_are_no_idea_are_refused_and_leave_no_line(home, words, reason, not_tried):
     before = (home / COMMANDS).read_bytes()
@@ -261,17 +250,7 @@ def test_settings_that_are_no_idea_are_refused_and_leave_no_line(home, words, re
 
 @pytest.mark.parametrize(
     "words, reason",
-    [
-        ("seed=0", "needs at least 2 seeds"),
-        ("seed=0,1 densify=adc,volumetric", "one arm at a time"),
-        ("seed=0,1 --metric psmr", "there is no such metric"),
-        ("seed=0,1 --fdr 1", "must be a number in (0, 1)"),
-        ("seed=0,1 --fdr 0", "must be a number in (0, 1)"),
-        ("seed=0,1 --fdr 5%", "must be a number in (0, 1), got '5%'"),
-        ("seed=0,1 --ideas 0", "must be a whole number in [1, 10000]"),
-        ("seed=0,1 eval.primary=psnr", "eval.primary follows from the ledger"),
-        ("seed=0,1 launch.wait=false", "launch.wait=false"),
-    ],
+    table(__file__, "ledgers"),
 )
 def test_a_ledger_that_could_not_decide_is_refused(trainings, words, reason, refused):
     assert reason in refused("ledger", "new", "night", *SETTINGS, *split(words))

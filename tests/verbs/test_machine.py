@@ -55,7 +55,7 @@ def test_gpus_are_listed_with_their_memory(gpus, monkeypatch):
 def test_every_extra_of_the_package_is_checked():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = set(project["optional-dependencies"]) - {"dev", "docs"}
-    assert {extra for _, extra in machine.OPTIONAL.values()} == extras
+    assert {extra for _, extra in machine.PACKAGES["optional"].values()} == extras
 
 
 def test_without_a_gpu_the_cause_is_named(no_gpu, monkeypatch):
@@ -93,7 +93,7 @@ def test_doctor_on_this_machine_covers_all_topics(tmp_path, capsys):
     topics = {line.split()[1] for line in lines}
     assert {"gsbench", "python", "torch", "gpu", "rasterizer", "runs", "weights"} <= topics
     assert all(line.split()[0] in ("ok", "note", "bad") for line in lines)
-    for module in machine.OPTIONAL:
+    for module in machine.PACKAGES["optional"]:
         (line,) = (line for line in lines if line.split()[1] == module)
         assert ("not installed" in line) == (importlib.util.find_spec(module) is None)
 
@@ -126,10 +126,10 @@ def test_doctor_on_a_runs_folder(runs):
 def test_doctor_says_what_is_missing(monkeypatch):
     monkeypatch.setattr(machine, "version_of", lambda name: "")
     found = {one[1]: one for one in machine.check_packages()}
-    for name in machine.REQUIRED:
+    for name in machine.PACKAGES["required"]:
         assert found[name][0] == "bad"
         assert found[name][2].startswith("missing: ")
-    for name, (purpose, _) in machine.OPTIONAL.items():
+    for name, (purpose, _) in machine.PACKAGES["optional"].items():
         assert found[name][0] == "note"
         assert found[name][2].startswith(f"not installed; needed for {purpose}: ")
     monkeypatch.setitem(sys.modules, "torch", None)

@@ -20,7 +20,7 @@ from gsbench.runs.commands import read_history
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.programs import allowed_modules
 from gsbench.tracking.sync import MirrorError
-from gsbench.verbs import trials
+from gsbench.verbs import servers, trials
 from tests.composed import composed
 from tests.helpers import refusal, write
 from tests.trials import record_of, write_results
@@ -245,7 +245,7 @@ def test_sync_sends_the_begun_trials_of_one_or_all_experiments(folders, runs, mo
         sent.extend((one.path.parents[2].name, uri) for one in given)
         return [f"sent {len(given)}"]
 
-    monkeypatch.setattr(trials, "send_missing", send)
+    monkeypatch.setattr(servers, "send_missing", send)
     assert said("sync x --uri http://here") == "sent 2\n"
     assert sent == [("x", "http://here")] * 2
     assert said("sync") == "sent 3\n"
@@ -257,6 +257,6 @@ def test_a_failed_sync_says_that_nothing_is_lost(folders, runs, monkeypatch, err
     def send(*_):
         raise error
 
-    monkeypatch.setattr(trials, "send_missing", send)
+    monkeypatch.setattr(servers, "send_missing", send)
     with pytest.raises(GsbenchError, match="no answer; the files are complete: try again"):
-        trials.sync(["x"], runs)
+        servers.sync(["x"], runs)

@@ -15,8 +15,8 @@ from gsbench.analysis.results import TrialPair, TrialResult
 from gsbench.errors import InputError
 from gsbench.parsing import Number, Record, read_if_sound
 from gsbench.runs.layout import FROM_PIXELS, GROUND_TRUTH, MASKS, REGIONS, RENDERS
+from gsbench.scene.beside import read_mask
 from gsbench.scene.images import read_image
-from gsbench.scene.masks import read_mask
 
 SIDE = 32  # px, of a region
 TEXTURE_SIGMA = 2.0  # px: the Gaussian over which the squared gradient is averaged

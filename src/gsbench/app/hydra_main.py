@@ -26,8 +26,9 @@ from gsbench.config.hydra_setup import (
     installed_nodes,
 )
 from gsbench.config.overrides import key_of
+from gsbench.config.permissions import ALLOWED
 from gsbench.config.schema import register_schemas
-from gsbench.config.trust import HYDRAS_CALLBACKS, load_callbacks
+from gsbench.config.trust import load_callbacks
 from gsbench.errors import InputError
 from gsbench.runs.nested import targets_in
 from gsbench.system.install import conf_dir
@@ -121,7 +122,7 @@ def run_main(
     with (
         # else Hydra prints errors and ends the process
         patch.dict(os.environ, HYDRA_FULL_ERROR="1"),
-        WHITELIST([*HYDRAS_CALLBACKS, *names, *(f"{name}.*" for name in names)]),
+        WHITELIST([*ALLOWED["callbacks"], *names, *(f"{name}.*" for name in names)]),
         redirect_stderr(_WithoutHydrasLine(sys.stderr)),
         hydra_config(None),
         patch.object(sys, "argv", ["gsbench", *argv]),

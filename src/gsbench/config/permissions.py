@@ -18,6 +18,7 @@ from omegaconf.grammar_parser import parse
 
 from gsbench.errors import InputError
 from gsbench.external.settings import program_of
+from gsbench.parsing import table_beside
 from gsbench.runs.nested import TARGET, entries_of
 from gsbench.system.programs import allowed_modules
 from gsbench.words import did_you_mean
@@ -25,6 +26,8 @@ from gsbench.words import did_you_mean
 PACKAGE = "gsbench"
 # groups that name one class each; `eval.extra` names any number
 COMPONENTS = ("init", "densify", "raster", "tracking")
+# lists of all that needs no permission
+ALLOWED: dict[str, list[str]] = table_beside(__file__, "allowed.yaml")
 UNQUOTED = re.compile(r"[\w./:+-]+")  # a name that needs no quotes in a list on the command line
 
 
@@ -118,7 +121,7 @@ def packages_allowed_at(place: Sequence[str]) -> tuple[str, ...]:
     """gsbench's packages and classes that a setting at ``place`` may name without permission."""
     if len(place) == 1 and place[0] in COMPONENTS:
         own = f"{PACKAGE}.{place[0]}"
-        return (own, *EXTERNAL) if place[0] == "densify" else (own,)
+        return (own, *ALLOWED["external"]) if place[0] == "densify" else (own,)
     if len(place) == 3 and tuple(place[:2]) == ("eval", "extra"):
         return (f"{PACKAGE}.eval",)
     return ()
@@ -126,46 +129,17 @@ def packages_allowed_at(place: Sequence[str]) -> tuple[str, ...]:
 
 # ---- programs, shell lines, options of Slurm, and variables
 
-# import paths of one class
-EXTERNAL = ("gsbench.densify.External", "gsbench.external.settings.External")
 # the permissions for shell lines, and for unusual options of Slurm
 SHELL, SBATCH = "bash", "sbatch"
-# Variables that a configuration may set: they choose numbers of threads and devices. This is a list
-# of harmless ones, since no list of dangerous ones could be complete: MPLBACKEND imports a module,
-# NUMBA_CACHE_DIR unpickles, CUDA_INJECTION64_PATH and GCONV_PATH load libraries, CC names a
-# program.
-FREE_VARIABLES = frozenset(
-    """
-    OMP_NUM_THREADS OMP_THREAD_LIMIT OMP_DYNAMIC OMP_PROC_BIND OMP_PLACES OMP_SCHEDULE OMP_STACKSIZE
-    OMP_WAIT_POLICY MKL_NUM_THREADS OPENBLAS_NUM_THREADS NUMEXPR_NUM_THREADS NUMBA_NUM_THREADS
-    VECLIB_MAXIMUM_THREADS CUDA_VISIBLE_DEVICES CUDA_DEVICE_ORDER CUDA_LAUNCH_BLOCKING
-    CUBLAS_WORKSPACE_CONFIG PYTORCH_CUDA_ALLOC_CONF HIP_VISIBLE_DEVICES ROCR_VISIBLE_DEVICES TZ
-    """.split()  # noqa: SIM905 - words are easier to read than a list of 20 quoted ones
-)
-# Variables that any configuration may read: places, names and devices. All others may be secrets.
-READABLE_VARIABLES = FREE_VARIABLES | {"HOME", "USER", "PWD", "TMPDIR", "SCRATCH", "WORK"}
 OWN_VARIABLES = "GSBENCH_"
-# Options of sbatch that choose resources (from Slurm's manual). Others can run a program
-# (task_prolog), start a container, or pass on variables (export).
-SBATCH_RESOURCES = frozenset(
-    """
-    account begin clusters comment constraint contiguous core_spec cores_per_socket cpu_freq
-    cpus_per_gpu cpus_per_task deadline dependency exclude exclusive gpu_bind gpu_freq gpus
-    gpus_per_node gpus_per_socket gpus_per_task gres gres_flags hint hold licenses mail_type
-    mail_user mem mem_bind mem_per_cpu mem_per_gpu mincpus network nice nodelist nodes ntasks
-    ntasks_per_core ntasks_per_gpu ntasks_per_node ntasks_per_socket overcommit oversubscribe
-    partition prefer priority qos requeue reservation signal sockets_per_node spread_job switches
-    thread_spec threads_per_core time time_min tmp use_min_nodes wckey
-    """.split()  # noqa: SIM905
-)
 
 
 def is_external(densify: Mapping[str, Any]) -> bool:
     """Return whether these settings make another program the trainer.
 
-    They do if their class has one of the import paths `EXTERNAL`.
+    They do if their class has one of the import paths ``external`` in ``allowed.yaml``.
     """
-    return densify.get(TARGET) in EXTERNAL
+    return densify.get(TARGET) in ALLOWED["external"]
 
 
 def check_program(settings: Mapping[str, Any], allowed: Sequence[str]) -> None:
@@ -195,7 +169,7 @@ def foreign_variables(variables: Mapping[str, Any], allowed: Sequence[str]) -> d
     return {
         name: value
         for name, value in variables.items()
-        if name not in FREE_VARIABLES and name not in allowed and value != os.environ.get(name)
+        if name not in (*ALLOWED["variables"], *allowed) and value != os.environ.get(name)
     }
 
 
@@ -207,7 +181,7 @@ def reading(variable: str) -> str:
 def is_readable(variable: str, allowed: Sequence[str]) -> bool:
     """Return whether a configuration may read the variable, so that results have its value."""
     return (
-        variable in READABLE_VARIABLES
+        variable in ALLOWED["variables"] + ALLOWED["readable"]
         or variable.startswith(OWN_VARIABLES)
         or reading(variable) in allowed
     )
@@ -223,7 +197,7 @@ def check_launch(launch: Mapping[str, Any], allowed: Sequence[str]) -> None:
     options = {
         str(name).replace("-", "_"): value for name, value in (launch.get("sbatch") or {}).items()
     }
-    if (not_resources := sorted(options.keys() - SBATCH_RESOURCES)) and SBATCH not in allowed:
+    if (not_resources := sorted(options.keys() - set(ALLOWED["sbatch"]))) and SBATCH not in allowed:
         raise InputError(
             f"launch.sbatch.{not_resources[0]} chooses more than resources; if you trust it, "
             + permission_advice([SBATCH], allowed)
@@ -237,11 +211,6 @@ def check_launch(launch: Mapping[str, Any], allowed: Sequence[str]) -> None:
 
 
 # ---- limits of ${…}, by whomever it was written
-
-# Resolvers that make only texts and numbers. Resolvers that turn texts into mappings (oc.create,
-# oc.decode, oc.dict) could create a `_target_` after the check; resolvers of plug-ins could do
-# anything.
-RESOLVERS = ("hydra", "now", "oc.env", "oc.select", "python_version")
 
 
 def check_texts(values: Any, allowed: Sequence[str], file: str = "") -> None:
@@ -267,9 +236,10 @@ def _check_interpolation(where: str, key: str, value: str, allowed: Sequence[str
     except GrammarParseError:
         return
     for name, first in calls:
-        if name not in RESOLVERS:
+        if name not in ALLOWED["resolvers"]:
             raise InputError(
-                f"{where}={value}: ${{{name}:…}} is not resolved here, only {', '.join(RESOLVERS)}"
+                f"{where}={value}: ${{{name}:…}} is not resolved here, only "
+                f"{', '.join(ALLOWED['resolvers'])}"
             )
         # Its value would stand in results, archives and trackers, where others read it.
         if name == "oc.env" and not is_readable(first, allowed):

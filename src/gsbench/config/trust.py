@@ -13,8 +13,8 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from gsbench.config.permissions import (
+    ALLOWED,
     PACKAGE,
-    SBATCH_RESOURCES,
     check_launch,
     check_program,
     check_target,
@@ -29,47 +29,12 @@ from gsbench.errors import InputError
 from gsbench.runs.nested import TARGET, entries_of, targets_in
 from gsbench.runs.user_code import PERMISSIONS
 
-ADDRESS_VARIABLES = ("MLFLOW_TRACKING_URI", "WANDB_BASE_URL")  # by which users name their trackers
-# Where gsbench and Hydra write. Only the command line chooses another place than gsbench's own
-# configuration and the installed packages: Hydra would overwrite a ``config.yaml`` there.
-WRITTEN = (
-    "runs",
-    "hydra.run.dir",
-    "hydra.sweep.dir",
-    "hydra.sweep.subdir",
-    "hydra.output_subdir",
-    "hydra.job.name",
-)
 OWN_RUNS = "${oc.env:GSBENCH_RUNS,runs}"
 
-# ---- Hydra's own settings
-SPECIAL_KEYS = (  # keys by which Hydra instantiates objects, beside _target_
-    "_recursive_",
-    "_convert_",
-    "_args_",
-    "_partial_",
-    "_isolate_",
-    "_execution_whitelist_",
-)
-HYDRAS_CALLBACKS = tuple(
-    f"hydra.experimental.callbacks.{name}"
-    for name in ("LogJobReturnCallback", "PickleJobInfoCallback")
-)
 # Hydra's nodes of which plug-ins and loggers are made. What an installed package writes there is
 # trusted.
 MADE_NODES = ("launcher", "sweeper", "job_logging", "hydra_logging")
 CLASS_KEYS = ("class", "()")  # logging's keys of import paths
-# Keys whose texts start nothing: resources, names and directions, and how a log line looks. In a
-# plug-in any other text may be a line for a shell, a module or a server whose answers are
-# unpickled; in a logger, a file to append to.
-FREE_KEYS = SBATCH_RESOURCES | {
-    *("name", "direction", "study_name", "timeout", "pre_dispatch", "backend", "metric", "seed"),
-    *("level", "format", "datefmt", "style", "handlers", "formatter"),
-}
-# streams; a Ray cluster of this machine
-FREE_TEXTS = ("ext://sys.stdout", "ext://sys.stderr", "auto", "local")
-# parts of a sweeper that are words of its jobs, checked as such
-SWEPT_TEXTS = ("params", "grids", "search_space")
 # Classes of this form are not imported for the check, since an import may take seconds.
 PUBLIC_CLASS = re.compile(rf"{PACKAGE}\.\w+\.[A-Z]\w*")
 # Settings that a sweep in a file may not vary: its jobs are composed after the check of the whole
@@ -101,7 +66,7 @@ def check_permissions(values: Mapping[str, Any]) -> None:
 
 def check_key(path: Sequence[str]) -> None:
     """Refuse a key by which Hydra makes objects in another way, such as a function from a class."""
-    if path[-1] in SPECIAL_KEYS:
+    if path[-1] in ALLOWED["special"]:
         raise InputError(f"{'.'.join(path)}: gsbench makes no objects this way: leave it out")
 
 
@@ -110,7 +75,7 @@ def foreign_address(tracking: Mapping[str, Any], allowed: Sequence[str]) -> str:
 
     The user's own are those ``allowed`` on the command line, and those in the environment.
     """
-    known = {*allowed, *map(os.environ.get, ADDRESS_VARIABLES)}
+    known = {*allowed, *map(os.environ.get, ALLOWED["addresses"])}
     given = ((key, str(value)) for key, value in tracking.items() if value)
     places = (text for key, text in given if key == "uri" or "://" in text)
     return next((place for place in places if place not in known), "")
@@ -144,7 +109,7 @@ def check_composed(
             is_callback = place[:2] == ("hydra", "callbacks") and len(place) == 3
             # gsbench's classes are allowed in their own group only:
             # `densify._target_=gsbench.init.…` is refused.
-            own = HYDRAS_CALLBACKS if is_callback else packages_allowed_at(place)
+            own = ALLOWED["callbacks"] if is_callback else packages_allowed_at(place)
             check_target(value, ".".join(place), allowed, own)
             if is_allowed(value, (PACKAGE,)) and not PUBLIC_CLASS.fullmatch(value):
                 # refuses names such as gsbench.densify.adc.torch.load
@@ -168,11 +133,11 @@ def _check_hydra(
         raise InputError(
             "hydra.job.env_set can change what runs: set variables in the shell, before the command"
         )
-    if where in WRITTEN and value is not None and where not in typed:
+    if where in ALLOWED["written"] and value is not None and where not in typed:
         raise InputError(
             f"a file sets {where}={value}, a place to write: type it on the command line"
         )
-    if path[:2] == ("hydra", "sweeper") and path[2:3] and path[2] in SWEPT_TEXTS:
+    if path[:2] == ("hydra", "sweeper") and path[2:3] and path[2] in ALLOWED["swept"]:
         # A job is composed after this check, and its words could name packages to import
         # configurations from.
         if swept := next(filter(NOT_SWEPT.match, (path[-1], text)), ""):
@@ -186,14 +151,16 @@ def _check_hydra(
     if not text or node not in MADE_NODES or key == TARGET:
         return
     # In any text, logging imports the name after ext://.
-    is_plain = key in FREE_KEYS and "://" not in text and text.isprintable()
+    is_plain = (
+        key in ALLOWED["keys"] + ALLOWED["sbatch"] and "://" not in text and text.isprintable()
+    )
     if key in CLASS_KEYS:
         if not is_allowed(text, allowed):
             advice = permission_advice([text.split(".")[0]], allowed)
             raise InputError(
                 f"{where}={text} is not what a package set; if you trust that code, {advice}"
             )
-    elif not is_plain and text not in FREE_TEXTS and not is_allowed(f"hydra.{node}", allowed):
+    elif not is_plain and text not in ALLOWED["texts"] and not is_allowed(f"hydra.{node}", allowed):
         advice = permission_advice([f"hydra.{node}"], allowed)
         raise InputError(
             f"{where}={text!r} could start code or write a file; if you trust it, {advice}"
@@ -211,7 +178,7 @@ def load_callbacks(callbacks: Any, allowed: Sequence[str]) -> None:
         if not isinstance(callback, Mapping) or not callback.get(TARGET):
             raise InputError(f"hydra.callbacks.{name} names no {TARGET}: the class to use")
         for place, target in targets_in(callback, ("hydra", "callbacks", str(name))):
-            cls = load_class(target, ".".join(place), [*allowed, *HYDRAS_CALLBACKS])
+            cls = load_class(target, ".".join(place), [*allowed, *ALLOWED["callbacks"]])
             base, what = (
                 (Callback, "a class of hydra.experimental.callback.Callback")
                 if len(place) == 3

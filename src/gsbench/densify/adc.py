@@ -1,7 +1,6 @@
 """Adaptive density control (ADC) as in the 2023 code of 3DGS; later variants of it are options."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal, NamedTuple
 
@@ -10,24 +9,17 @@ from annotated_types import Ge, Interval
 from pydantic import PositiveFloat, PositiveInt
 from torch import Tensor
 
-from gsbench.densify.base import NEVER, Refinement, Rule, Statistic
+from gsbench.densify.base import Refinement, Rule
 from gsbench.densify.budget import Budgeted, admit
 from gsbench.densify.formulas import revised_logits
 from gsbench.densify.scores import draw
 from gsbench.events import Cause
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import RenderOutput
-from gsbench.settings import OpenFraction, Switch
+from gsbench.settings import OpenFraction
 
 # limit for the children of one split; more would fill the memory in one round
 MAX_CHILDREN = 64
-OPACITY_RESET = Switch(
-    {"opacity_reset_interval": NEVER},
-    "opacity resets, and the pruning by size that follows the first",
-)
-ABSOLUTE_GRADIENT = Switch(
-    {"gradient": "signed"}, "the absolute gradient, in which pixels do not cancel"
-)
 # rounds after an opacity reset in which the governor does not raise ``cull``; our choice
 LOCKED_ROUNDS = 5
 
@@ -70,18 +62,10 @@ class ADC(Budgeted):
         0.0002
     """
 
-    STATISTICS: ClassVar[Mapping[str, torch.dtype | Statistic]] = {
+    STATISTICS: ClassVar = {
         "gradient_sum": torch.float32,  # NDC, since the last refinement
         "visible_count": torch.int32,  # iterations
         "max_radii": torch.int32,  # px
-    }
-
-    SWITCHES: ClassVar[Mapping[str, Switch]] = {
-        "opacity_reset": OPACITY_RESET,
-        "absolute_gradient": ABSOLUTE_GRADIENT,
-        "revised_opacity": Switch(
-            {"revised_opacity": False}, "children that share their parent's opacity"
-        ),
     }
 
     prunes_by_size: ClassVar[bool] = True
@@ -128,10 +112,9 @@ class ADC(Budgeted):
         """A round in the order of 3DGS, then the opacity reset."""
         step = refinement.step
         rules: list[Rule] = []
-        if self.due(step) and self.frozen(refinement):
-            rules.append(self.skip_round)
-        elif self.due(step):
-            rules += [*self.governing(), *self.round_at(step)]
+        if self.due(step):
+            frozen = self.frozen(refinement)
+            rules = [self.skip_round] if frozen else [*self.governing(), *self.round_at(step)]
         # As in 3DGS: with a white background, opacities are also reset once at the start of the
         # window.
         first = self.context.white_background and step == self.start

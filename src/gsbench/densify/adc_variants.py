@@ -1,20 +1,21 @@
 """Variants of ADC: other criteria of growth, and another way to split."""
 
-from collections.abc import Mapping
+import math
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 import torch
-from annotated_types import Interval
+from annotated_types import Interval, Lt
 from pydantic import PositiveFloat, PositiveInt
 from torch import Tensor
 
-from gsbench.densify.adc import ADC, OPACITY_RESET
-from gsbench.densify.base import NEVER, Refinement, Rule
+from gsbench.densify.adc import ADC, Grown
+from gsbench.densify.base import Refinement, Rule, Statistic
 from gsbench.densify.budget import admit
-from gsbench.densify.formulas import quantile
+from gsbench.densify.formulas import faded, quantile, standard_normal
+from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import RenderOutput
-from gsbench.settings import OpenFraction, Switch
+from gsbench.settings import OpenFraction
 
 
 @dataclass
@@ -29,16 +30,8 @@ class AbsGS(ADC):
     """
 
     # NDC, since the last refinement
-    STATISTICS: ClassVar[dict[str, torch.dtype]] = {"absolute_sum": torch.float32}
+    STATISTICS: ClassVar = {"absolute_sum": torch.float32}
     needs_absolute_gradient = True
-
-    SWITCHES: ClassVar[Mapping[str, Switch]] = {
-        "opacity_ceiling": Switch({"ceiling_interval": NEVER}, "the ceiling on opacities"),
-        "small_split_size": Switch(
-            {"split_size": ADC.split_size}, "the smaller size above which a Gaussian is split"
-        ),
-        "opacity_reset": OPACITY_RESET,
-    }
 
     split_size: PositiveFloat = 0.001
     split_threshold: PositiveFloat = 4e-4  # of splits, by the absolute gradient
@@ -94,14 +87,9 @@ class PixelGS(ADC):
     the optimiser's gradients are not changed.
     """
 
-    STATISTICS: ClassVar[dict[str, torch.dtype]] = {
+    STATISTICS: ClassVar = {
         "weighted_gradient_sum": torch.float32,  # NDC px, since the last refinement
         "pixel_sum": torch.int64,  # px
-    }
-
-    SWITCHES: ClassVar[Mapping[str, Switch]] = {
-        "near_scaling": Switch({"near_fraction": None}, "less growth near the cameras"),
-        "opacity_reset": OPACITY_RESET,
     }
 
     near_fraction: PositiveFloat | None = 0.37  # of the scene extent; None: f = 1
@@ -144,9 +132,8 @@ class QuantileADC(ADC):
     def candidates(self, refinement: Refinement) -> tuple[Tensor, Tensor]:
         _, large = super().candidates(refinement)
         mean = self.mean_gradient()
-        count = int(self.growth_rate / refinement.strictness * len(mean)) // (
-            self.split_children - 1
-        )
+        gain = self.split_children - 1
+        count = int(self.growth_rate / refinement.strictness * len(mean)) // gain
         largest = torch.zeros_like(large)
         largest[mean.sort(descending=True, stable=True).indices[:count]] = True
         return largest & (mean > 0), large
@@ -165,3 +152,89 @@ class QuantileADC(ADC):
             return torch.zeros_like(opacity_logits, dtype=torch.bool)
         share = min(self.prune_share * cull, 1.0)
         return opacity_logits < quantile(opacity_logits.detach().sort().values, share)
+
+
+@dataclass
+class SteepGS(ADC):
+    """ADC that splits only where a split lowers the loss (Wang et al., arXiv 2505.05587).
+
+    Consider a split of a Gaussian into two halves at small offsets +-d. To second order, the loss
+    changes by d S d / 2, where S is the splitting matrix: the sum over pixels of (d loss / d s)
+    times the second derivative of s by the mean, with s the opacity times the density at the pixel.
+    So a split lowers the loss only if S has a negative eigenvalue, and lowers it most along the
+    eigenvector of the least eigenvalue. Halves of equal weight are best.
+
+    A candidate of ADC grows only if the least eigenvalue of its S, averaged over the iterations in
+    which it was visible, is below ``eigenvalue_threshold``, in units of the loss per squared scene
+    extent (None: no condition). Two children replace it, on either side along the eigenvector, with
+    ``opacity_factor`` times its opacity. If it is large, their scales are divided by
+    ``split_shrink``, and each offset has the length of a draw from the parent's density. If it is
+    small, their scales are the parent's, and the offset is the present learning rate of the means.
+    Under a cap, candidates with the least eigenvalues come first. ``split_children`` and
+    ``revised_opacity`` have no effect.
+    """
+
+    STATISTICS: ClassVar = {
+        # per world unit squared, since the last refinement
+        "splitting_sum": Statistic(torch.float32, (3, 3))
+    }
+    needs_extra = "splitting_matrix"
+
+    eigenvalue_threshold: Annotated[float, Lt(0)] | None = -1e-6  # loss per squared extent
+    opacity_factor: Annotated[float, Interval(gt=0, le=1)] = 0.5
+
+    def observe(self, step: int, render: RenderOutput) -> None:
+        super().observe(step, render)
+        if step < self.stop:
+            self.statistics["splitting_sum"] += render.require_extra()
+
+    def saddles(self, refinement: Refinement) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The candidates of ADC whose split lowers the loss, as a mask [N], and where to split.
+
+        The rest is a mask [N] of all large Gaussians and, for the candidates of ADC, the least
+        eigenvalue [N] of the mean splitting matrix, in units of the loss per squared extent, with
+        its eigenvector [N, 3], whose largest component is positive.
+        """
+        over, large = super().candidates(refinement)
+        seen = self.statistics["visible_count"][over].clamp_min(1)  # [S]
+        mean = self.statistics["splitting_sum"][over].double() / seen[:, None, None]  # [S, 3, 3]
+        eigenvalues, vectors = torch.linalg.eigh(mean)  # in rising order
+        steepest = vectors[..., 0]
+        largest = steepest.gather(-1, steepest.abs().argmax(-1, keepdim=True))  # [S, 1]
+        values = torch.zeros(len(over), dtype=torch.float64, device=over.device)
+        directions = values.new_zeros(len(over), 3)
+        values[over] = eigenvalues[:, 0] * self.context.extent**2
+        directions[over] = steepest * largest.sign()
+        if self.eigenvalue_threshold is not None:
+            over = over & (values < self.eigenvalue_threshold)
+        return over, large, values, directions
+
+    def candidates(self, refinement: Refinement) -> tuple[Tensor, Tensor]:
+        return self.saddles(refinement)[:2]
+
+    def grown(self, refinement: Refinement) -> Grown:
+        values = refinement.gaussians.values
+        over, large = self.candidates(refinement)
+        log_scales = values.log_scales - math.log(self.split_shrink) * large.unsqueeze(-1)
+        return Grown.halved(
+            values, over, log_scales, faded(values.opacity_logits, self.opacity_factor)
+        )
+
+    def grow_by_gradient(self, refinement: Refinement) -> None:
+        """Replace each candidate by two halves."""
+        gaussians = refinement.gaussians
+        over, large, values, directions = self.saddles(refinement)
+        selected, blocked = admit(over, -values, 1, self.allowance(refinement))
+        parents = gaussians.values.detach().select(selected)
+        is_large = large[selected].unsqueeze(-1)  # [S, 1]
+        direction = directions[selected].to(parents.means)  # [S, 3]
+        noise = standard_normal((2 * len(parents), 3), refinement.rng, parents.means)
+        lengths = (noise * parents.scales.repeat(2, 1)).norm(dim=-1, keepdim=True)  # [2 S, 1]
+        lengths = torch.where(is_large.repeat(2, 1), lengths, gaussians.position_rate)
+        children = Gaussians.concatenate([parents, parents])
+        children.means = children.means + lengths * torch.cat([direction, -direction])
+        shrink = math.log(self.split_shrink) * is_large  # [S, 1]
+        children.log_scales = children.log_scales - shrink.repeat(2, 1)
+        children.opacity_logits = faded(children.opacity_logits, self.opacity_factor)
+        self.split_in_halves(refinement, selected, children)
+        refinement.event.blocked_by_cap += blocked

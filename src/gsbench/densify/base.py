@@ -20,7 +20,6 @@ from gsbench.settings import Switch, check_settings
 from gsbench.words import NamesAttributes
 
 CPU = torch.device("cpu")
-NEVER = 10**9  # an iteration or interval longer than any training
 
 
 @dataclass(frozen=True)
@@ -76,7 +75,7 @@ class Densifier:
 
     - ``rules``: what a refinement does;
     - ``STATISTICS``: the statistics that it gathers, in addition to those of its base class;
-    - ``SWITCHES``: the parts that ``gsbench ablate`` can turn off.
+    - ``SWITCHES``: the parts that ``gsbench ablate`` can turn off (gsbench's own: switches.yaml).
 
     The state is ``context``, ``lineage`` and ``statistics``. ``statistics`` has one tensor [N] for
     each name in ``STATISTICS`` ([N, …] for a `Statistic` with a shape), zero at the start, on the

@@ -1,7 +1,7 @@
 """3DGS-MCMC and MRNF: small growth by random draws, and noise on the means."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar, Literal
 
@@ -19,13 +19,10 @@ from gsbench.events import Cause
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.raster.base import RenderOutput
-from gsbench.settings import Fraction, OpenFraction, Switch
+from gsbench.settings import Fraction, OpenFraction
 
 BINOMIALS = 51  # rows of the authors' table of binomials; their code allows one copy fewer
 GATE_STEEPNESS = 100.0  # of the sigmoid that suppresses noise on opaque Gaussians
-
-
-NOISE = Switch({"noise_rate": 0.0}, "noise on the means")
 
 
 @dataclass
@@ -50,12 +47,6 @@ class MCMC(SpreadOut):
     common opacity and scale, so that the picture stays the same (eq. 9 of the paper). After each
     step, noise is added to the means. The count never exceeds ``max_gaussians``.
     """
-
-    SWITCHES: ClassVar[Mapping[str, Switch]] = {
-        "noise": NOISE,
-        "opacity_term": Switch({"opacity_weight": 0.0}, "the opacities' term of the loss"),
-        "scale_term": Switch({"scale_weight": 0.0}, "the scales' term of the loss"),
-    }
 
     stop: int = 25_000
     max_gaussians: PositiveInt = 1_000_000  # exact
@@ -210,13 +201,7 @@ class MRNF(SpreadOut):
     iteration ``decay_until``. After each step, the means of faint Gaussians get noise.
     """
 
-    STATISTICS: ClassVar[dict[str, torch.dtype]] = {"seen": torch.bool}  # since the last round
-
-    SWITCHES: ClassVar[Mapping[str, Switch]] = {
-        "noise": NOISE,
-        "opacity_decay": Switch({"opacity_decay": 0.0}, "opacities that decay"),
-        "scale_decay": Switch({"scale_decay": 0.0}, "scales that decay"),
-    }
+    STATISTICS: ClassVar = {"seen": torch.bool}  # since the last round
 
     start: NonNegativeInt = 0
     stop: int = 25_000

@@ -1,7 +1,7 @@
 """ResGS: a residual split, in stages of growing detail."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, ClassVar, Literal
 
@@ -10,13 +10,13 @@ from annotated_types import Ge, Interval
 from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor
 
-from gsbench.densify.adc import ABSOLUTE_GRADIENT, ADC
+from gsbench.densify.adc import ADC
 from gsbench.densify.base import Refinement, Rule
 from gsbench.densify.formulas import faded
 from gsbench.errors import InputError
 from gsbench.events import Cause
 from gsbench.raster.base import RenderOutput
-from gsbench.settings import OpenFraction, Switch
+from gsbench.settings import OpenFraction
 
 # rounds before the window in which gradients are gathered (200 iterations in the authors' code)
 GATHER_ROUNDS = 2
@@ -41,15 +41,7 @@ class ResGS(ADC):
     """
 
     # number of residual splits from an initial Gaussian to this one
-    STATISTICS: ClassVar[dict[str, torch.dtype]] = {"level": torch.int32}
-
-    SWITCHES: ClassVar[Mapping[str, Switch]] = {
-        "absolute_gradient": ABSOLUTE_GRADIENT,
-        "fading": Switch({"fade": 1.0}, "opacities that fade"),
-        "levels": Switch(
-            {"level_factor": 1.0}, "lower thresholds for those that earlier stages passed over"
-        ),
-    }
+    STATISTICS: ClassVar = {"level": torch.int32}
 
     prunes_by_size = False
 

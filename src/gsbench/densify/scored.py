@@ -43,7 +43,7 @@ class FastGS(AbsGS):
     """
 
     # computed and used within one round
-    STATISTICS: ClassVar[dict[str, torch.dtype]] = {"count": torch.float32, "score": torch.float32}
+    STATISTICS: ClassVar = {"count": torch.float32, "score": torch.float32}
     needs_footprint = True
 
     split_threshold: PositiveFloat = 1.2e-3  # of splits, by the absolute gradient
@@ -125,7 +125,7 @@ class Taming(ADC):
     """
 
     # score of this round; 0 for new Gaussians
-    STATISTICS: ClassVar[dict[str, torch.dtype]] = {"score": torch.float32}
+    STATISTICS: ClassVar = {"score": torch.float32}
     needs_footprint = True
 
     max_gaussians: PositiveInt = 1_000_000  # the budget

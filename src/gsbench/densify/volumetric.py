@@ -5,9 +5,8 @@ where these say nothing, the split of ADC. Volumes and condition numbers are com
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 import torch
 from annotated_types import Ge, Interval
@@ -21,7 +20,7 @@ from gsbench.densify.formulas import quantile
 from gsbench.errors import InputError
 from gsbench.events import Cause
 from gsbench.gaussians.paper_values import VOLUME_THRESHOLD
-from gsbench.settings import OpenFraction, Switch
+from gsbench.settings import OpenFraction
 
 LOG_SPHERE = math.log(4 * math.pi / 3)
 
@@ -64,20 +63,6 @@ class Volumetric(ADC):
     power ``governor_dimension``. With 3 the factor acts on a size, whose cube is V_th. With 1 it
     acts on V_th itself.
     """
-
-    SWITCHES: ClassVar[Mapping[str, Switch]] = {
-        "volume_rule": Switch({"volume_stop": 0}, "the split of what is too large"),
-        "shrink": Switch(
-            {"condition_of": "nothing"},
-            "eq. 7's scales of its children, instead of ADC's",
-            "volume_rule",
-        ),
-        "no_resplit": Switch(
-            {"split_isotropic": True},
-            "a Gaussian is not split if its children would be split again",
-            "volume_rule",
-        ),
-    }
 
     # V_th, in the units of the COLMAP model cubed
     volume_threshold: PositiveFloat = VOLUME_THRESHOLD
@@ -204,18 +189,16 @@ class Volumetric(ADC):
 
     def log_threshold(self, volumes: Tensor, strictness: float = 1.0) -> float:
         """log V_th for Gaussians with log volumes [N], ``strictness`` of the governor included."""
-        governed = self.governor_dimension * math.log(strictness)
-        return self._ungoverned_log_threshold(volumes) + governed
-
-    def _ungoverned_log_threshold(self, volumes: Tensor) -> float:
-        if self.threshold_mode == "absolute":
-            return math.log(self.volume_threshold)
-        if self.threshold_mode == "extent_relative":
-            return math.log(self.volume_threshold) + 3 * math.log(self.context.extent)
-        if len(volumes) == 0:
+        if self.threshold_mode in ("absolute", "extent_relative"):
+            ungoverned = math.log(self.volume_threshold)
+            if self.threshold_mode == "extent_relative":
+                ungoverned += 3 * math.log(self.context.extent)
+        elif len(volumes) == 0:
             return math.inf
-        ordered = volumes.sort().values
-        if self.threshold_mode == "quantile":
-            return quantile(ordered, self.volume_quantile)
-        first, third = quantile(ordered, 0.25), quantile(ordered, 0.75)
-        return third + TUKEY_FENCE * (third - first)
+        else:
+            ordered = volumes.sort().values
+            ungoverned = quantile(ordered, self.volume_quantile)
+            if self.threshold_mode == "auto":
+                first, third = quantile(ordered, 0.25), quantile(ordered, 0.75)
+                ungoverned = third + TUKEY_FENCE * (third - first)
+        return ungoverned + self.governor_dimension * math.log(strictness)

@@ -16,8 +16,8 @@ from gsbench.eval.evaluator import Evaluator
 from gsbench.files import DAMAGE
 from gsbench.logs import Progress, no_progress
 from gsbench.runs.trial_record import Oddity
+from gsbench.scene.beside import read_mask
 from gsbench.scene.images import EXIF_ORIENTATION, open_image, read_image
-from gsbench.scene.masks import read_mask
 from gsbench.scene.rules import Finding, inspect
 
 # A view of so many pixels takes half a minute; a file of some kB may claim more.

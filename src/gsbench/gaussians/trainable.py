@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
@@ -317,9 +316,8 @@ class TrainableGaussians:
         gaussians = Gaussians(**state["gaussians"]).map(lambda tensor: tensor.to(device))
         trainable = cls(gaussians, rates, spatial_scale, step_all, optimizer)
         for name, saved in state["adam"].items():
-            copied = copy.deepcopy(saved)
-            tensors = {key: value.to(device) for key, value in copied["tensors"].items()}
-            trainable.adam[name] = ParameterState(copied["rate"], copied["step"], tensors)
+            tensors = {key: value.clone().to(device) for key, value in saved["tensors"].items()}
+            trainable.adam[name] = ParameterState(saved["rate"], saved["step"], tensors)
         return trainable
 
 

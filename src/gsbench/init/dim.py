@@ -17,10 +17,10 @@ from gsbench.files import file_sha256
 from gsbench.init.base import Timer
 from gsbench.init.colmap.pairs import STRONGEST, proposed_pairs
 from gsbench.init.options import ImageSize, MatchRatio
-from gsbench.init.reconstruction import Facts, Job, Reconstruction
+from gsbench.init.sfm import Facts, Job, Reconstruction
 from gsbench.logs import Progress
 from gsbench.parsing import table_beside
-from gsbench.scene.masks import read_mask
+from gsbench.scene.beside import read_mask
 from gsbench.scene.types import Capture
 from gsbench.settings import AnyPath, Fraction
 from gsbench.weights import WeightsFile, digests_of_unpinned, find_all_weights

@@ -31,8 +31,8 @@ from gsbench.init.base import (
 )
 from gsbench.init.point_files import read_points
 from gsbench.logs import Progress, no_progress
+from gsbench.scene.beside import read_mask
 from gsbench.scene.images import read_image
-from gsbench.scene.masks import read_mask
 from gsbench.scene.types import Array, Capture
 from gsbench.settings import AnyPath, check_settings
 from gsbench.system.isolate import run_isolated

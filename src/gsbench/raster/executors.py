@@ -9,11 +9,13 @@ import os
 import shutil
 import sys
 import sysconfig
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
 from gsbench.errors import InputError
+from gsbench.parsing import table_beside
 from gsbench.settings import MISSING, TargetName, check_settings
 from gsbench.words import did_you_mean
 
@@ -28,8 +30,8 @@ class Executor:
 
     name: str  # as in ``raster=NAME``, in results and in tables
     target: str  # import path of its class
-    devices: tuple[str, ...]  # types of torch devices that it runs on; empty: all
     text: str  # description in one line
+    devices: Sequence[str] = ()  # types of torch devices that it runs on; empty: all
     package: str | None = None  # a package that it needs beyond gsbench's own requirements
     install: str = ""  # how to get that package
     takes_threads: bool = False  # its class has an argument ``threads``
@@ -57,34 +59,10 @@ class Executor:
         return None if self.is_installed else f"needs {self.package}: {self.install}"
 
 
-EXECUTORS = (  # ``auto`` takes the first that is made for the type of device and installed
-    Executor(
-        "reference",
-        "gsbench.raster.reference.ReferenceRasterizer",
-        devices=(),
-        text="plain torch, float32 or float64: the definition; all others are tested against it; "
-        "slow",
-        same_bits=False,  # torch's sums on a GPU use atomics
-    ),
-    Executor(
-        "cpu",
-        "gsbench.raster.cpu.CpuRasterizer",
-        devices=("cpu",),
-        text="compiled by numba at first use; the same bits on every run and for any number of "
-        "threads",
-        takes_threads=True,
-    ),
-    Executor(
-        "triton",
-        "gsbench.raster.triton.executor.TritonRasterizer",
-        # for tests, Triton's interpreter runs the kernels on the CPU
-        devices=("cuda", "cpu") if os.environ.get("TRITON_INTERPRET") == "1" else ("cuda",),
-        text="Triton kernels, compiled at first use by what torch brings along; the same bits on "
-        "every run",
-        package="triton",
-        install="pip install triton, in the version that your torch asks for",
-    ),
-)
+EXECUTORS = tuple(Executor(**row) for row in table_beside(__file__, "executors.yaml"))
+if os.environ.get("TRITON_INTERPRET") == "1":  # for tests: then its kernels run on the CPU, too
+    *_others, _triton = EXECUTORS
+    EXECUTORS = (*_others, replace(_triton, devices=("cuda", "cpu")))
 
 
 def names() -> tuple[str, ...]:

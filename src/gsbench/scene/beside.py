@@ -1,27 +1,187 @@
-"""Pictures beside photographs, such as a sensor's depth, as pixels of the trained views.
+"""Pictures beside photographs: masks, and others such as a sensor's depth.
 
-``scene.beside`` names them. Losses, terms and densifiers read them (docs/ideas.md).
+A mask says which pixels of a photograph count: black pixels are ignored, all others count. COLMAP
+extracts no features where a mask "is black (pixel intensity value 0 in grayscale)" (its FAQ, "Mask
+image regions"), and nerfstudio trains only where a mask is not 0 (its page "Data conventions").
+Ignored pixels are replaced before any other step reads a photograph, so that they cannot influence
+a result.
+
+``scene.beside`` names the others, which become pixels of the trained views. Losses, terms and
+densifiers read them (docs/ideas.md).
 """
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.files import DAMAGE, file_sha256
-from gsbench.scene.images import open_image
+from gsbench.scene.images import image_size, list_images, open_image, read_image, write_png
+from gsbench.scene.names import match
+from gsbench.scene.options import Backdrop
+from gsbench.scene.record import Photograph
+from gsbench.scene.rules import given
 from gsbench.scene.types import Camera, CameraModel, Capture
 from gsbench.scene.undistortion import as_colmap, grid, rays_through
-from gsbench.words import listed
+from gsbench.words import listed, some_of
 
 DEPTH = "depth"
 MILLIMETRE = 0.001  # of a world in metres: the step of most sensors
 Pixels = NDArray[Any]  # [H, W] or [H, W, C]
+Mask = NDArray[np.bool_]  # [H, W], True where a pixel counts
+SUFFIX = ".png"
+WHITE = np.uint8(255)
+IMAGES, MASKS = "images", "masks"  # in the folder of `prepare_photograph`
+NEARLY_ONE = 1 - 1e-6  # a mean of ones in float32 may round to less than 1
+
+
+def find_masks(folder: Path, names: Sequence[str], setting: str = "scene.masks") -> dict[str, Path]:
+    """The mask file in ``folder`` of each image: ``b.jpg.png`` (COLMAP's) or ``b.png``.
+
+    Raises InputError naming the ``setting`` and the images without a mask.
+    """
+    found = {name: f"{name}{SUFFIX}" for name in names if (folder / f"{name}{SUFFIX}").is_file()}
+    if missing := [name for name in names if name not in found]:
+        found |= match(missing, list_images(folder))
+    if missing := [name for name in names if name not in found]:
+        raise InputError(
+            f"{setting}: no mask of {some_of(missing)} in {folder}: add {missing[0]}{SUFFIX} "
+            "(all white where every pixel counts)"
+        )
+    return {name: folder / found[name] for name in names}
+
+
+def check_masks(rows: Sequence[Photograph]) -> None:
+    """Raise InputError for a mask that is no image, or not of its photograph's size."""
+    for row in rows:
+        if row.mask is not None:
+            size = image_size(row.mask)
+            texts = {"size": "{}x{}".format(*size), "full": "{}x{}".format(*row.size)}
+            given("mask-of-other-size", size != row.size, str(row.mask), name=row.name, **texts)
+
+
+def read_mask(path: Path, may_be_black: bool = False) -> Mask:
+    """Read a mask [H, W]: False where the file is black.
+
+    Raises InputError for a file that is no mask: with colours, with many greys, or black
+    everywhere unless it ``may_be_black``.
+    """
+    with open_image(path, decode=True) as image:
+        transparent = image.has_transparency_data
+        if transparent and np.asarray(image.convert("RGBA"))[..., 3].min() < 255:
+            raise InputError(
+                f"{path}: a mask says by black what is ignored, not by transparency: save it as "
+                "grey"
+            )
+        in_colors = image.mode in ("P", "CMYK", "YCbCr", "RGBA", "LA")
+        pixels = np.asarray(image.convert("RGB") if in_colors else image)
+    if pixels.ndim == 3:
+        if (pixels != pixels[..., :1]).any():
+            raise InputError(
+                f"{path}: is in colours, and no mask: make it black where pixels are ignored, "
+                "else white"
+            )
+        pixels = pixels.max(axis=2)
+    mask: Mask = pixels != 0
+    if not may_be_black:
+        given("black-mask", float(mask.mean()), str(path))
+    given("grey-mask", float((mask & (pixels != pixels.max())).mean()), str(path))
+    return mask
+
+
+def write_mask(mask: Mask, path: Path) -> None:
+    """Write the mask as a PNG in black and white."""
+    write_png(mask.astype(np.uint8) * WHITE, path)
+
+
+def prepare_photograph(
+    folder: Path, images: Path, masks: Mapping[str, Path], name: str, backdrop: Backdrop = "black"
+) -> None:
+    """Write the photograph ``name`` without its ignored and transparent pixels.
+
+    The photograph goes to ``images/<name>`` below ``folder``: a copy if nothing changes, else a PNG
+    with the original EXIF data. Its mask, if any, goes to ``masks/<name>.png`` in black and white.
+    """
+    target, mask_target = folder / IMAGES / name, prepared_mask(folder, name)
+    for path in (target, mask_target):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    mask = None
+    if name in masks:
+        mask = read_mask(masks[name])
+        write_mask(mask, mask_target)
+    with open_image(images / name) as original:
+        exif, transparent = original.info.get("exif", b""), original.has_transparency_data
+    if (mask is None or mask.all()) and (backdrop == "black" or not transparent):
+        shutil.copyfile(images / name, target)
+        return
+    pixels = read_image(images / name, backdrop)
+    if mask is not None:
+        pixels = fill_ignored(pixels, mask)
+    write_png(pixels, target, exif)
+
+
+def prepared_mask(folder: Path, name: str) -> Path:
+    """The file of the mask that `prepare_photograph` writes, as COLMAP names it."""
+    return folder / MASKS / f"{name}{SUFFIX}"
+
+
+def fill_ignored(image: NDArray[np.uint8], mask: Mask) -> NDArray[np.uint8]:
+    """``image`` [H, W, 3] with its ignored pixels interpolated from counted pixels nearby.
+
+    Uses the pull and push of Gortler et al. 1996, "The Lumigraph", section 3.4.1: the counted
+    pixels are averaged over blocks of 2, 4, 8, … pixels; then coarser levels are interpolated
+    bilinearly into finer pixels without a value. The filling leaves no edge at the border of the
+    mask where features would be detected.
+    """
+    filled = _pull_push(image.astype(np.float32), mask)
+    return np.where(mask[..., None], image, np.rint(filled).astype(np.uint8))
+
+
+def _pull_push(image: NDArray[np.float32], mask: Mask) -> NDArray[np.float32]:
+    if mask.all():
+        return image
+    height, width = mask.shape
+    to_even = ((0, height % 2), (0, width % 2))
+    weights = np.pad(mask, to_even).astype(np.float32)
+    rows, columns = weights.shape[0] // 2, weights.shape[1] // 2
+    blocks = (rows, 2, columns, 2)
+    padded = np.pad(image * mask[..., None], (*to_even, (0, 0)))
+    sums = padded.reshape(*blocks, 3).sum((1, 3))  # [H/2, W/2, 3]
+    counted = weights.reshape(blocks).sum((1, 3))  # [H/2, W/2]
+    coarse = _pull_push(sums / np.maximum(counted, 1)[..., None], counted > 0)
+    pushed = _double(_double(coarse, 0), 1)[:height, :width]
+    return np.where(mask[..., None], image, pushed)
+
+
+def _double(image: NDArray[np.float32], axis: int) -> NDArray[np.float32]:
+    """``image`` [H, W, 3] with twice as many pixels along ``axis``, interpolated linearly."""
+    rows = np.moveaxis(image, axis, 0)
+    padded = np.concatenate([rows[:1], rows, rows[-1:]])
+    pairs = [0.75 * rows + 0.25 * beside for beside in (padded[:-2], padded[2:])]
+    doubled = np.stack(pairs, axis=1, dtype=np.float32).reshape(-1, *rows.shape[1:])
+    return np.moveaxis(doubled, 0, axis)
+
+
+def resize_mask(mask: Mask, width: int, height: int) -> Mask:
+    """The mask at another size: a pixel counts if all original ones centred in its area count.
+
+    The filters that resize photographs reach further than that. Beyond the mask's border they use
+    the pixels that `fill_ignored` made.
+    """
+    if mask.shape == (height, width):
+        return mask
+    shares = Image.fromarray(mask.astype(np.float32)).resize((width, height), Image.Resampling.BOX)
+    return np.asarray(shares) >= NEARLY_ONE
+
+
+# ---- other pictures
 
 
 def files_beside(capture: Capture, kinds: Sequence[str]) -> dict[str, Mapping[str, Path]]:

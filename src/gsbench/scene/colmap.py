@@ -14,7 +14,7 @@ from gsbench.scene.colmap_read import read_model as read_model
 from gsbench.scene.images import check_size, image_size
 from gsbench.scene.names import match_anywhere
 from gsbench.scene.types import Array, Camera, CameraModel, Capture, to_pinhole
-from gsbench.scene.undistortion import as_colmap, as_values, without_distortion
+from gsbench.scene.undistortion import as_colmap, as_values
 from gsbench.scene.undistortion import plain_camera as plain_camera
 
 Cloud = tuple[Array, NDArray[np.uint8]]  # positions [P, 3] in world units, colours [P, 3]
@@ -134,8 +134,7 @@ def rescaled_camera(
     and y, and so does a camera without distortion. Other models with one focal length scale it by
     the mean of both scales, as COLMAP does.
     """
-    camera = without_distortion(camera)
-    values = as_values(camera)
+    values = plain_camera(camera)
     if values.name == "SIMPLE_PINHOLE":
         values = replace(values, name="PINHOLE", params=(values.params[0], *values.params))
     # Copied because a Camera object taken from a Reconstruction is a view into it.

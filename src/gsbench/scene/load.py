@@ -27,10 +27,17 @@ from gsbench.parsing import MAX_NUMBER, Count, Number, Record, read_typed
 from gsbench.runs.keys import VIEWS, Step, step_of
 from gsbench.runs.store import Store
 from gsbench.runs.trial_record import Oddity
-from gsbench.scene.beside import DEPTH, files_beside, view_of_file
+from gsbench.scene.beside import (
+    DEPTH,
+    WHITE,
+    files_beside,
+    read_mask,
+    resize_mask,
+    view_of_file,
+    write_mask,
+)
 from gsbench.scene.colmap_files import model_files
 from gsbench.scene.images import read_image, resize_image, write_png
-from gsbench.scene.masks import WHITE, read_mask, resize_mask, write_mask
 from gsbench.scene.options import PrincipalPoint, Resample, downscaled_size
 from gsbench.scene.rules import MIN_IMAGES, inspect, settle
 from gsbench.scene.types import Camera, CameraModel, Capture, Scene, View, to_pinhole

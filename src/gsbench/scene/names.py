@@ -142,9 +142,9 @@ def match_pictures(
     the option that error messages suggest for `match_by_order`.
     """
     missing = photographs  # by the rule that leaves the fewest
-    for rule, make_keys in PICTURE_RULES.items():
-        keys = make_keys(photographs)
-        by_key = grouped(pictures, make_keys(pictures).__getitem__)
+    for rule, how in PICTURE_RULES.items():
+        keys = _keys(photographs, *how)
+        by_key = grouped(pictures, _keys(pictures, *how).__getitem__)
         lacking = [name for name in photographs if keys[name] not in by_key]
         missing = min(missing, lacking, key=len)
         if lacking or len({*keys.values()}) < len(photographs):
@@ -202,33 +202,26 @@ def _base(name: str) -> str:
     return re.split(r"/|__", _stem(name))[-1]
 
 
-Words = dict[str, str]  # what is compared of each name
+def _folded(words: list[str]) -> list[str]:
+    return [word.casefold() for word in words]
 
 
-def _folded(words: Words) -> Words:
-    return {name: word.casefold() for name, word in words.items()}
-
-
-def _stripped(words: Words) -> Words:
+def _stripped(words: list[str]) -> list[str]:
     """The words without the start and the end that all of them share.
 
     Digits next to the rest are kept, so that numbers stay whole.
     """
     if len(words) < 2:
         return words
-    texts = list(words.values())
     # Letters are compared, not parts of paths.
-    start = len(commonprefix(texts).rstrip("0123456789"))  # noqa: RUF071
-    ends = [text[start:][::-1] for text in texts]
+    start = len(commonprefix(words).rstrip("0123456789"))  # noqa: RUF071
+    ends = [word[start:][::-1] for word in words]
     end = len(commonprefix(ends).rstrip("0123456789"))  # noqa: RUF071
-    return {name: text[start : len(text) - end] for name, text in words.items()}
+    return [word[start : len(word) - end] for word in words]
 
 
-def _unpadded(words: Words) -> Words:
-    return {
-        name: re.sub(r"\d+", lambda digits: str(int(digits[0])), word)
-        for name, word in words.items()
-    }
+def _unpadded(words: list[str]) -> list[str]:
+    return [re.sub(r"\d+", lambda digits: str(int(digits[0])), word) for word in words]
 
 
 def _by_value(name: str) -> list[tuple[int, int, str]]:
@@ -236,24 +229,23 @@ def _by_value(name: str) -> list[tuple[int, int, str]]:
     return [(1, int(part), part) if part.isdigit() else (0, 0, part) for part in parts]
 
 
-def _rule(key: Key, *steps: Callable[[Words], Words]) -> Callable[[Sequence[str]], Words]:
-    def keys(names: Sequence[str]) -> Words:
-        words = {name: key(name) for name in names}
-        for step in steps:
-            words = step(words)
-        return words
-
-    return keys
+def _keys(names: Sequence[str], form: Key, steps: int) -> dict[str, str]:
+    words = [form(name) for name in names]
+    for step in (_folded, _stripped, _unpadded)[:steps]:
+        words = step(words)
+    return dict(zip(names, words, strict=True))
 
 
-PICTURE_RULES = {  # from strict to loose; names are equal if their keys are
-    SAME_NAMES: _rule(str),
-    "apart from the extension": _rule(_stem),
-    "with folders as part of the name": _rule(_flat),
-    "apart from case": _rule(_flat, _folded),
-    "apart from what all names begin or end with": _rule(_flat, _folded, _stripped),
-    "apart from leading zeros": _rule(_flat, _folded, _stripped, _unpadded),
-    "apart from folders": _rule(_base, _folded),
-    "apart from folders and what all names begin or end with": _rule(_base, _folded, _stripped),
-    "apart from folders and leading zeros": _rule(_base, _folded, _stripped, _unpadded),
+# From strict to loose: a form of the names, and how many steps go on from there. Names are equal if
+# their keys are.
+PICTURE_RULES: dict[str, tuple[Key, int]] = {
+    SAME_NAMES: (str, 0),
+    "apart from the extension": (_stem, 0),
+    "with folders as part of the name": (_flat, 0),
+    "apart from case": (_flat, 1),
+    "apart from what all names begin or end with": (_flat, 2),
+    "apart from leading zeros": (_flat, 3),
+    "apart from folders": (_base, 1),
+    "apart from folders and what all names begin or end with": (_base, 2),
+    "apart from folders and leading zeros": (_base, 3),
 }

@@ -14,11 +14,10 @@ from gsbench.errors import InputError
 from gsbench.files import require_regular
 from gsbench.normalization import IDENTITY, find_normalization
 from gsbench.parsing import text_of
-from gsbench.scene.beside import DEPTH
+from gsbench.scene.beside import DEPTH, check_masks, find_masks
 from gsbench.scene.colmap_files import model_files, require_subfolder
 from gsbench.scene.hold_out import SplitLists, hold_out, select_images
 from gsbench.scene.images import check_picture_names
-from gsbench.scene.masks import check_masks, find_masks
 from gsbench.scene.names import match
 from gsbench.scene.options import (
     LISTS,

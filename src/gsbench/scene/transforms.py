@@ -121,12 +121,10 @@ def read_transforms(
     if "" in files:
         roles = _named_split(files[""], records[""], rows, image_folder)
         rows = {name: replace(row, role=roles.get(name, row.role)) for name, row in rows.items()}
-    read_from = [*files.values()]
-    if points is not None:
-        read_from.append(points.path)
+    read_from = *files.values(), *([] if points is None else [points.path])
     ordered = tuple(rows[name] for name in sorted(rows))
     noted = {"no-file": [Finding(len(missing), missing)], "focal-length-and-field": ratios}
-    return RawCapture(folder, ordered, points, tuple(read_from), noted=noted)
+    return RawCapture(folder, ordered, points, read_from, noted=noted)
 
 
 def _beside(path: Path, written: str | None) -> Path | None:

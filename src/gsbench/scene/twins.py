@@ -15,7 +15,7 @@ from PIL import Image
 
 from gsbench.files import file_sha256
 from gsbench.runs.trial_record import TwinViews
-from gsbench.scene.masks import resize_mask
+from gsbench.scene.beside import resize_mask
 from gsbench.scene.names import grouped, stem_of
 from gsbench.scene.rules import given
 from gsbench.scene.types import Scene, View

@@ -160,7 +160,7 @@ class View:
     """One photograph with its camera; ``image`` is [H, W, 3] uint8, sRGB.
 
     ``mask`` [H, W] is True where a pixel counts, or None if all pixels count. Ignored pixels hold
-    the colours made by `gsbench.scene.masks.fill_ignored`. ``beside`` are the pictures that
+    the colours made by `gsbench.scene.beside.fill_ignored`. ``beside`` are the pictures that
     ``scene.beside`` names, as `gsbench.scene.beside` reads them.
     """
 

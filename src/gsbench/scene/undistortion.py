@@ -7,6 +7,7 @@ coefficients are zero. Undistorting these again would resample every pixel for n
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from gsbench.errors import InputError
 from gsbench.scene.rules import Finding
-from gsbench.scene.types import PINHOLE_NAMES, Array, Camera, CameraModel, to_pinhole
+from gsbench.scene.types import Array, Camera, CameraModel, to_pinhole
 from gsbench.system.isolate import CrashError, run_isolated
 from gsbench.words import some_of
 
@@ -125,28 +126,20 @@ def undistort(image: NDArray[np.uint8], camera: CameraModel) -> tuple[NDArray[np
     return np.array(flat.to_array()), to_pinhole(plain_camera(pinhole))
 
 
-def without_distortion(camera: pycolmap.Camera) -> pycolmap.Camera:
-    """The PINHOLE camera that projects as ``camera`` does, or ``camera`` itself if no pinhole does.
+def plain_camera(camera: pycolmap.Camera) -> CameraModel:
+    """A COLMAP camera as plain values, as PINHOLE if a pinhole projects as it does.
 
     Projections are compared, not coefficients: a fisheye with zero coefficients is no pinhole,
     while FULL_OPENCV with coefficients that cancel, FOV with an angle near 0 and EUCM with alpha =
     0 are. SIMPLE_PINHOLE stays as it is.
     """
+    values = as_values(camera)
     # pycolmap's focal lengths of a panorama are not defined; asking for them ends the process.
-    if camera.model_name in PINHOLE_NAMES or camera.is_spherical():
-        return camera
+    if not values.distorted or camera.is_spherical():
+        return values
     if not largest_distortion(camera) <= MAX_IGNORED_DISTORTION:  # also for NaN
-        return camera
-    params = tuple(_pinhole_parameters(camera))
-    values = CameraModel("PINHOLE", camera.width, camera.height, params)
-    pinhole = as_colmap(values, camera.camera_id)
-    pinhole.has_prior_focal_length = camera.has_prior_focal_length
-    return pinhole
-
-
-def plain_camera(camera: pycolmap.Camera) -> CameraModel:
-    """A COLMAP camera as plain values, as PINHOLE if it has no distortion."""
-    return as_values(without_distortion(camera))
+        return values
+    return replace(values, name="PINHOLE", params=tuple(_pinhole_parameters(camera)))
 
 
 def largest_distortion(camera: pycolmap.Camera) -> float:

@@ -6,7 +6,7 @@ import os
 import time
 import uuid
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import chdir, nullcontext
+from contextlib import AbstractContextManager, chdir, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -38,6 +38,15 @@ NOT_OPTIONS = ("name", "enabled", "flush_seconds", "patience_seconds", "images",
 def class_of(options: Tracking) -> str:
     """The import path of the tracker's class."""
     return str(options.get("_target_") or MLFLOW)
+
+
+def place_for(options: Tracking) -> AbstractContextManager[str | Path]:
+    """The folder to call a tracker in: an empty one, but a user's own tracker stays here.
+
+    Trackers' clients read settings in the current folder: W&B would take its server's address from
+    a stranger's ``wandb/settings``.
+    """
+    return own_folder() if class_of(options).startswith(GSBENCH) else nullcontext(Path.cwd())
 
 
 def tracker_name(options: Tracking) -> str:
@@ -116,10 +125,7 @@ def sync(
             yield f"left out: {folder.label}: {error}"
             continue
         try:
-            # Trackers' clients read settings in the current folder: W&B would take its server's
-            # address from a stranger's ``wandb/settings``. A user's own tracker stays here.
-            is_own = class_of(options).startswith(GSBENCH)
-            with own_folder() if is_own else nullcontext(Path.cwd()) as place, chdir(place):
+            with place_for(options) as place, chdir(place):
                 is_new = mirror(folder, options, values, allowed, live=state == "running")
         except BusyError:
             yield f"{folder.label} is being mirrored by another process"

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
-
 import torch
-from torch import Tensor
 
 from gsbench.eval.images import replace_ignored
 from gsbench.gaussians.model import Gaussians
@@ -34,87 +30,54 @@ def direct_fault(rasterizer: Rasterizer, device: torch.device, case: Case) -> st
     """
     if not isinstance(rasterizer, TritonRasterizer):
         return ""
-    return _fault(rasterizer, device, case, False) or _fault(rasterizer, device, case, True)
-
-
-def _fault(rasterizer: TritonRasterizer, device: torch.device, case: Case, extended: bool) -> str:
-    expected = _train(device, case, partial(_with_autograd, rasterizer, case, extended))
-    for graphs in (False, True) if device.type == "cuda" else (False,):
-        name = ("extended " if extended else "") + ("recorded steps" if graphs else "direct steps")
-        try:
-            found = _train(device, case, partial(_direct, rasterizer, case, extended, graphs))
-        except torch.OutOfMemoryError:
-            raise
-        except (RuntimeError, ValueError) as error:
-            first, *_ = str(error).strip().splitlines() or [""]
-            return f"{name} fail: {type(error).__name__}: {first}"
-        for parameter, tensor in expected.tensors().items():
-            if not torch.equal(tensor, getattr(found, parameter)):
-                return f"{parameter} has other bits after {STEPS} {name} than with autograd"
+    for extended in (False, True):
+        expected = _train(rasterizer, device, case, extended)
+        for graphs in (False, True) if device.type == "cuda" else (False,):
+            name = f"{'extended ' if extended else ''}{'recorded' if graphs else 'direct'} steps"
+            try:
+                found = _train(rasterizer, device, case, extended, graphs)
+            except torch.OutOfMemoryError:
+                raise
+            except (RuntimeError, ValueError) as error:
+                first, *_ = str(error).strip().splitlines() or [""]
+                return f"{name} fail: {type(error).__name__}: {first}"
+            for parameter, tensor in expected.tensors().items():
+                if not torch.equal(tensor, getattr(found, parameter)):
+                    return f"{parameter} has other bits after {STEPS} {name} than with autograd"
     return ""
 
 
-Step = Callable[[int], None]  # makes one step
-
-
 def _train(
-    device: torch.device, case: Case, stepper: Callable[[TrainableGaussians], Step]
-) -> Gaussians:
-    initial = case.gaussians().map(lambda tensor: tensor.to(device, torch.float32))
-    model = TrainableGaussians(initial, LearningRates(), 1.0, TritonAdam())
-    make = stepper(model)
-    for step in range(1, STEPS + 1):
-        model.set_step(step)
-        make(step)
-    return model.values.detach()
-
-
-def _target(case: Case, device: torch.device) -> Tensor:
-    """A picture [H, W, 3] uint8 that no render has."""
-    numbers = torch.arange(case.height * case.width * 3, device=device) * 37 % 256
-    return numbers.to(torch.uint8).view(case.height, case.width, 3)
-
-
-def _regularizer(model: TrainableGaussians) -> Tensor:
-    return model.values.opacities.mean() + model.values.scales.mean()
-
-
-def _with_autograd(
-    rasterizer: TritonRasterizer, case: Case, extended: bool, model: TrainableGaussians
-) -> Step:
-    loss, target = TritonLoss(SSIM_WEIGHT), _target(case, model.device)
-    black, mask = torch.zeros(3, device=model.device), target[..., :1] > 99 if extended else None
-
-    def step(_: int) -> None:
-        render = rasterizer.render(model.values, case.camera(), case.sh_degree, black)
-        loss(replace_ignored(render.image, target, mask), target)[0].backward()
-        if extended:
-            _regularizer(model).backward()
-        model.optimizer_step(case.sh_degree, render.visible if extended else None)
-
-    return step
-
-
-def _direct(
     rasterizer: TritonRasterizer,
+    device: torch.device,
     case: Case,
     extended: bool,
-    graphs: bool,
-    model: TrainableGaussians,
-) -> Step:
-    black, target = torch.zeros(3, device=model.device), _target(case, model.device)
-    direct = DirectStep(rasterizer, TritonLoss(SSIM_WEIGHT), black, graphs, visible_only=extended)
-    camera, mask = case.camera(), target[..., :1] > 99 if extended else None
-
-    def step(number: int) -> None:
-        if number == CRAMPED_STEP:
+    graphs: bool | None = None,
+) -> Gaussians:
+    """The Gaussians after all steps: with autograd (None), or direct ones, recorded or not."""
+    initial = case.gaussians().map(lambda tensor: tensor.to(device, torch.float32))
+    model = TrainableGaussians(initial, LearningRates(), 1.0, TritonAdam())
+    numbers = torch.arange(case.height * case.width * 3, device=device) * 37 % 256
+    target = numbers.to(torch.uint8).view(case.height, case.width, 3)  # as no render
+    mask = target[..., :1] > 99 if extended else None
+    black, loss, camera = torch.zeros(3, device=device), TritonLoss(SSIM_WEIGHT), case.camera()
+    direct = DirectStep(rasterizer, loss, black, bool(graphs), visible_only=extended)
+    for step in range(1, STEPS + 1):
+        model.set_step(step)
+        term = model.values.opacities.mean() + model.values.scales.mean() if extended else None
+        if graphs is None:
+            render = rasterizer.render(model.values, camera, case.sh_degree, black)
+            loss(replace_ignored(render.image, target, mask), target)[0].backward()
+            if term is not None:
+                term.backward()
+            model.optimizer_step(case.sh_degree, render.visible if extended else None)
+            continue
+        if step == CRAMPED_STEP:
             direct.limit_room(Room(1, 1))
-        term = _regularizer(model) if extended else None
         direct.step(model, camera, target, case.sh_degree, False, None, mask, term)
         direct.optimize(model)
-        if number == CRAMPED_STEP and direct.repeats == 0:
+        if step == CRAMPED_STEP and direct.repeats == 0:
             raise RuntimeError("lists without room were not noticed")
-        if number == STEPS and direct.graphs != graphs:
-            raise RuntimeError("CUDA refuses to record steps")
-
-    return step
+    if direct.graphs != bool(graphs):
+        raise RuntimeError("CUDA refuses to record steps")
+    return model.values.detach()

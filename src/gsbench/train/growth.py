@@ -33,7 +33,6 @@ class GrowthWatch:
         self._runaway_rounds = self._runaway_rounds + 1 if share >= RUNAWAY_SHARE and many else 0
         if self._runaway_rounds == RUNAWAY_ROUNDS:
             self._warn(
-                "runaway",
                 "iteration %d: in %d refinements in a row, at least %.0f %% of splits by volume "
                 "had children that are over the threshold again, so they split again and again; "
                 "densify=volumetric_once does not split near-spheres",
@@ -52,7 +51,6 @@ class GrowthWatch:
             self._blocked_since = event.step
         if event.step - self._blocked_since > BLOCKED_ITERATIONS:
             self._warn(
-                "blocked",
                 "iterations %d to %d: densify.max_gaussians refused growth in every refinement, so "
                 "the rule no longer decides where Gaussians are; raise it, or compare at equal "
                 "counts with densify.cap=governor",
@@ -60,7 +58,7 @@ class GrowthWatch:
                 event.step,
             )
 
-    def _warn(self, kind: str, message: str, *values: float) -> None:
-        if kind not in self._warned:
-            self._warned.add(kind)
+    def _warn(self, message: str, *values: float) -> None:
+        if message not in self._warned:
+            self._warned.add(message)
             log.warning(message, *values)

@@ -55,10 +55,12 @@ def _weight(k: tl.constexpr):
 
 @triton.jit
 def _zeros(like):
-    """Eleven running sums, all zero."""
-    # Written out: Triton's tuples know no ``*``.
-    zero = tl.zeros_like(like)
-    return (zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero)
+    """A running sum for each row of the window, all zero."""
+    # Triton's tuples grow by ``+``; it knows neither ``*`` nor comprehensions.
+    sums = ()
+    for _ in tl.static_range(2 * RADIUS + 1):
+        sums = sums + (tl.zeros_like(like),)  # type: ignore[assignment]  # noqa: RUF005
+    return sums
 
 
 @triton.jit
@@ -67,19 +69,11 @@ def _push(sums, value):
 
     The first of the returned sums is complete.
     """
-    return (
-        tl.fma(value, W5, sums[1]),
-        tl.fma(value, W4, sums[2]),
-        tl.fma(value, W3, sums[3]),
-        tl.fma(value, W2, sums[4]),
-        tl.fma(value, W1, sums[5]),
-        tl.fma(value, W0, sums[6]),
-        tl.fma(value, W1, sums[7]),
-        tl.fma(value, W2, sums[8]),
-        tl.fma(value, W3, sums[9]),
-        tl.fma(value, W4, sums[10]),
-        value * W5,
-    )
+    pushed = ()
+    for k in tl.static_range(2 * RADIUS):
+        weight = _weight(RADIUS - k if k < RADIUS else k - RADIUS)
+        pushed = pushed + (tl.fma(value, weight, sums[k + 1]),)  # type: ignore[assignment]  # noqa: RUF005
+    return pushed + (value * _weight(RADIUS),)  # noqa: RUF005
 
 
 @triton.jit
@@ -104,6 +98,21 @@ def _add(sums, x, y, weight):
         tl.fma(wx, x, tl.fma(wy, y, sums[2])),
         tl.fma(wx, y, sums[3]),
     )
+
+
+@triton.jit
+def _similarity(mx, my, squares, product):
+    """SSIM, and its derivatives by the blurred image, its blurred square and the blurred product.
+
+    SSIM = a1 a2 / (b1 b2) (Wang et al. 2004, eq. 13); `loss_cpu` has it in full.
+    """
+    means = mx * mx + my * my
+    a1, a2 = 2 * mx * my + F_C1, 2 * (product - mx * my) + F_C2
+    b1, b2 = means + F_C1, squares - means + F_C2
+    inverse = 1.0 / (b1 * b2)
+    similarity = a1 * a2 * inverse
+    by_mean = 2 * (my * (a2 - a1) - similarity * mx * (b2 - b1)) * inverse
+    return similarity, by_mean, -similarity * b1 * inverse, 2 * a1 * inverse
 
 
 @triton.jit(do_not_specialize=["height", "numbers", "rows"])
@@ -152,23 +161,15 @@ def measure_similarity(
 
         center = row - RADIUS
         inside = (center >= first) & (number < numbers)
-        # SSIM = a1 a2 / (b1 b2) (Wang et al. 2004, eq. 13); `loss_cpu` has it in full, with its
-        # derivatives by the blurred image, its blurred square and the blurred product.
-        mx, my = mean_x[0], mean_y[0]
-        means = mx * mx + my * my
-        a1 = 2 * mx * my + F_C1
-        a2 = 2 * (product[0] - mx * my) + F_C2
-        b1 = means + F_C1
-        b2 = squares[0] - means + F_C2
-        inverse = 1.0 / (b1 * b2)
-        similarity = a1 * a2 * inverse
+        similarity, by_mean, by_square, by_product = _similarity(
+            mean_x[0], mean_y[0], squares[0], product[0]
+        )
         total_similarity += tl.where(inside, similarity, 0.0)
         if DIFFERENTIATE:
             place = derivatives + center * numbers + number
-            d_mean = 2 * (my * (a2 - a1) - similarity * mx * (b2 - b1)) * inverse
-            tl.store(place, d_mean, mask=inside)
-            tl.store(place + plane, -similarity * b1 * inverse, mask=inside)
-            tl.store(place + 2 * plane, 2 * a1 * inverse, mask=inside)
+            tl.store(place, by_mean, mask=inside)
+            tl.store(place + plane, by_square, mask=inside)
+            tl.store(place + 2 * plane, by_product, mask=inside)
     program = tl.program_id(1) * tl.num_programs(0) + tl.program_id(0)
     # Atomics would add in any order; `add_up` adds these in one order, for the same bits.
     tl.store(sums + 2 * program, tl.sum(total_similarity, 0))

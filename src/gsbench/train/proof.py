@@ -16,7 +16,7 @@ import logging
 import math
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, nullcontext, suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -85,30 +85,25 @@ def prove(
     departure ends the proof, since the next comparison would only repeat it. It takes seconds,
     besides the compilation of the kernels.
     """
-    started, chosen = time.perf_counter(), loss or PhotometricLoss()
+    started = time.perf_counter()
     errors: list[Error] = []
     failures: list[str] = []
-    comparisons: list[Callable[[], list[Error]]] = [
-        lambda: [error for case in scenes for error in measure(rasterizer, case, str(device))],
-        lambda: _repeat_errors(rasterizer, device, scenes),
-        lambda: _training_errors(rasterizer, device, scenes[0], chosen),
-    ]
     try:
-        for compare in comparisons:
-            errors += compare()
-            failures += [str(error) for error in errors if error.is_departure]
+        for found in _comparisons(rasterizer, device, scenes, loss or PhotometricLoss()):
+            errors += found
+            failures += [str(error) for error in found if error.is_departure]
             if failures:
                 break
     except (torch.OutOfMemoryError, InputError):
         raise
-    except Exception as error:  # noqa: BLE001
+    except Exception as raised:  # noqa: BLE001
         # Whatever a compiler or a driver raises is the result of the proof.
-        reason, *_ = str(error).strip().splitlines() or [""]
-        failures.append(f"{type(error).__name__}: {reason}")
+        reason, *_ = str(raised).strip().splitlines() or [""]
+        failures.append(f"{type(raised).__name__}: {reason}")
     largest: dict[str, float] = {}
-    for found in errors:
-        if math.isfinite(found.off):
-            largest[found.quantity] = max(largest.get(found.quantity, 0.0), found.off)
+    for error in errors:
+        if math.isfinite(error.off):
+            largest[error.quantity] = max(largest.get(error.quantity, 0.0), error.off)
     direct_fault = ""
     if rasterizer.name == "triton" and not failures:
         from gsbench.train import direct_proof  # it imports Triton
@@ -125,21 +120,21 @@ def prove(
     )
 
 
-def _repeat_errors(
-    rasterizer: Rasterizer, device: torch.device, scenes: tuple[Case, ...]
-) -> list[Error]:
-    """The tensors whose bits differ in a second run, if the same bits are promised."""
-    if not find_executor(rasterizer.name).same_bits:
-        return []
-    first = [_bits(rasterizer, case, str(device)) for case in scenes]
-    # The second run is after all scenes, so that it reuses memory.
-    again = [_bits(rasterizer, case, str(device)) for case in scenes]
-    errors = []
-    for case, bits, other in zip(scenes, first, again, strict=True):
-        unequal = [name for name in bits if bits[name] != other[name]]
-        count, names = float(len(unequal)), ", ".join(unequal)
-        errors.append(Error(str(case), "bits of a second run", count, 0.5, names, " tensors"))
-    return errors
+def _comparisons(
+    rasterizer: Rasterizer, device: torch.device, scenes: tuple[Case, ...], loss: Loss
+) -> Iterator[list[Error]]:
+    """The errors of each comparison of `prove`, one comparison after the other."""
+    yield [error for case in scenes for error in measure(rasterizer, case, str(device))]
+    if find_executor(rasterizer.name).same_bits:
+        # The second run is after all scenes, so that it reuses memory.
+        first, again = ([_bits(rasterizer, case, str(device)) for case in scenes] for _ in range(2))
+        errors = []
+        for case, bits, other in zip(scenes, first, again, strict=True):
+            unequal = [name for name in bits if bits[name] != other[name]]
+            count, names = float(len(unequal)), ", ".join(unequal)
+            errors.append(Error(str(case), "bits of a second run", count, 0.5, names, " tensors"))
+        yield errors
+    yield _training_errors(rasterizer, device, scenes[0], loss)
 
 
 def _bits(rasterizer: Rasterizer, case: Case, device: str) -> dict[str, bytes]:
@@ -157,33 +152,19 @@ def _training_errors(
 ) -> list[Error]:
     """Train ten steps with ``loss`` and Adam; return the errors against torch in float64."""
     other = dataclasses.replace(case, count=case.count + 1)  # another random scene, the target
+    reference, black = ReferenceRasterizer(), torch.zeros(3, dtype=torch.float64)
     with torch.no_grad():
-        target = (
-            ReferenceRasterizer()
-            .render(
-                other.gaussians(),
-                case.camera(),
-                case.sh_degree,
-                torch.zeros(3, dtype=torch.float64),
-            )
-            .image.clamp(0, 1)
-        )
-    expected, image = _train(ReferenceRasterizer(), case, target, torch_photometric_loss)
+        drawn = reference.render(other.gaussians(), case.camera(), case.sh_degree, black)
+    target = drawn.image.clamp(0, 1)
+    expected, image = _train(reference, case, target, torch_photometric_loss)
     found, own_image = _train(rasterizer, case, target.to(device, torch.float32), loss)
+    steps = [f"training step {step}" for step in range(1, STEPS + 1)]
     errors = [
-        Error(
-            str(case),
-            "loss",
-            abs(value / reference - 1),
-            LOSS_TOLERANCE,
-            f"training step {step}",
-            " of itself",
-        )
-        for step, (value, reference) in enumerate(zip(found, expected, strict=True), start=1)
+        Error(str(case), "loss", abs(value / wanted - 1), LOSS_TOLERANCE, step, " of itself")
+        for step, value, wanted in zip(steps, found, expected, strict=True)
     ]
     off = float((own_image.double().cpu() - image).abs().max())
-    last = f"training step {STEPS}"
-    return [*errors, Error(str(case), "trained image", off, TRAINED_TOLERANCE, last)]
+    return [*errors, Error(str(case), "trained image", off, TRAINED_TOLERANCE, steps[-1])]
 
 
 def _train(
@@ -242,26 +223,16 @@ def _device_name(device: torch.device) -> str:
 # ---- stamps: the files that keep results
 
 
-def stamp_folder() -> Path:
-    """The folder of the results of proofs, in the user's cache."""
-    return (
-        Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
-        / "gsbench"
-        / "proofs"
-    )
-
-
 def stamp_of(raster: str, device: torch.device) -> Path:
-    """The file of the last proof of ``raster`` on ``device`` with the installed versions."""
-    parts = [
-        raster,
-        _device_name(device),
-        *(f"{name} {version}" for name, version in versions_on(device).items()),
-    ]
-    return (
-        stamp_folder()
-        / f"{raster}-{hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]}.json"
-    )
+    """The file of the last proof of ``raster`` on ``device`` with the installed versions.
+
+    It is in the user's cache.
+    """
+    versions = [f"{name} {version}" for name, version in versions_on(device).items()]
+    parts = json.dumps([raster, _device_name(device), *versions])
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
+    digest = hashlib.sha256(parts.encode()).hexdigest()
+    return cache / "gsbench" / "proofs" / f"{raster}-{digest[:16]}.json"
 
 
 def prove_apart(raster: str, device: str) -> RasterProof:
@@ -277,11 +248,10 @@ def prove_apart(raster: str, device: str) -> RasterProof:
         ) from error
     except CrashError as error:
         place = torch.device(device)
-        versions = versions_on(place)
         return RasterProof(
             raster=raster,
             device=_device_name(place),
-            versions=versions,
+            versions=versions_on(place),
             errors={},
             failures=[str(error)],
             seconds=0.0,

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsbench.scene.masks import resize_mask
+from gsbench.scene.beside import resize_mask
 from gsbench.scene.types import Camera, View
 from gsbench.train.options import TrainConfig
 from gsbench.train.views import Targets
@@ -108,7 +108,7 @@ def _first_reaching(
 
 
 class Resolution:
-    """The size of the pictures at each iteration.
+    """The size of the pictures at each iteration; always the full one without a schedule.
 
     Sizes depend only on the pictures and on the densification window of ``options``; they change
     only after rounds of densification.
@@ -116,7 +116,9 @@ class Resolution:
 
     def __init__(self, options: TrainConfig, views: Sequence[View]) -> None:
         self.options = options
-        self.schedule = scale_schedule([view.image for view in views], options.densify_stop)
+        self.schedule = ScaleSchedule((0,), (1.0,))
+        if options.resolution_schedule == "pictures":
+            self.schedule = scale_schedule([view.image for view in views], options.densify_stop)
 
     def scale(self, step: int) -> int:
         """The number by which the sides of pictures are divided at iteration ``step``."""
@@ -145,16 +147,15 @@ class ScaledViews:
         self, views: Sequence[View], targets: Targets, device: torch.device, budget: int | None
     ) -> None:
         self._full, self._device, self._budget = views, device, budget
-        self._targets = {1: targets}
-        self._cameras: dict[int, list[Camera]] = {1: [view.camera for view in views]}
+        self._sizes = {1: ([view.camera for view in views], targets)}
 
     def at(self, scale: int) -> tuple[list[Camera], Targets]:
         """Cameras and images with sides divided by ``scale``."""
-        if scale not in self._targets:
+        if scale not in self._sizes:
             small = [_reduced(view, scale) for view in self._full]
-            self._targets = {1: self._targets[1], scale: Targets(small, self._device, self._budget)}
-            self._cameras = {1: self._cameras[1], scale: [view.camera for view in small]}
-        return self._cameras[scale], self._targets[scale]
+            targets = Targets(small, self._device, self._budget)
+            self._sizes = {1: self._sizes[1], scale: ([view.camera for view in small], targets)}
+        return self._sizes[scale]
 
 
 def _reduced(view: View, scale: int) -> View:

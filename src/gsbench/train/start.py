@@ -4,9 +4,7 @@ A cloud in other coordinates or a point far outside would not stop a training, b
 mean nothing (`gsbench.scene.rules`, stage cloud). The facts are kept with the results.
 """
 
-from __future__ import annotations
-
-from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,26 +20,6 @@ MAX_POINTS = 20_000
 # Lengths are over the median distance of the training cameras from their median place.
 FAR = 1e4  # photographs do not determine the depth of a point so far away
 MIN_COLOR_SPREAD = 1.0  # levels of 255; the colours of a cloud of one colour say nothing
-
-
-@dataclass(frozen=True)
-class Start:
-    """Quantities that the rules of the stage cloud measure; None is not measured."""
-
-    extent: float
-    farthest: float
-    number: int  # of the farthest point
-    total: int
-    place: str
-    seen_by_one: float
-    identical: float
-    first_place: str
-    far: int
-    seen: float | None
-    spread: float | None
-    color_agreement: float | None
-    color_spread: float | None
-    first_color: tuple[int, ...]
 
 
 def check_start(
@@ -75,22 +53,21 @@ def check_start(
         far=int((distances > FAR).sum()),
         spread=float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)) / size),
     )
-    start = Start(
+    # the quantities that the rules measure; None is not measured
+    start = SimpleNamespace(
+        **vars(facts),
         extent=scene.extent,
         farthest=float(distances[farthest]),
         number=farthest,
         total=len(points),
         place=_place(points[farthest], normalization),
         seen_by_one=float(seen_by.any()),
-        identical=facts.identical,
         first_place=_place(points[0], normalization),
-        far=facts.far,
-        seen=None if random_points else facts.seen,
-        spread=None if random_points else facts.spread,
-        color_agreement=None if random_points else facts.color_agreement,
-        color_spread=None if random_points else float(colors.std(axis=0).max()),
+        color_spread=float(colors.std(axis=0).max()),
         first_color=tuple(colors[0].tolist()),
     )
+    if random_points:
+        start.seen = start.spread = start.color_agreement = start.color_spread = None
     return facts, inspect("cloud", start, f"scene {scene.name}", accept)
 
 

@@ -1,6 +1,7 @@
 """The training loop: the schedule of 3DGS, with any rasterizer and any densifier."""
 
 import logging
+import math
 import time
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
@@ -32,14 +33,7 @@ from gsbench.system.resources import CLOCK
 from gsbench.system.stopping import deferred, requested
 from gsbench.train.checkpoint import CheckpointWriter, load_checkpoint
 from gsbench.train.growth import GrowthWatch
-from gsbench.train.ideas import (
-    NO_IDEAS,
-    Ideas,
-    Step,
-    TrainedView,
-    scheduled,
-    value_of,
-)
+from gsbench.train.ideas import NO_IDEAS, Ideas, Step, TrainedView, scheduled, value_of
 from gsbench.train.loss import PhotometricLoss
 from gsbench.train.options import TrainConfig
 from gsbench.train.records import PHOTOMETRIC, LossLog, append, drop_after, volume_histogram
@@ -117,55 +111,48 @@ class Trainer:
             raise InputError(
                 "train.visible_adam is a setting of Adam: leave it out with train.optimizer"
             )
-        self.scene = scene
-        self.densifier = densifier
-        self.ideas = ideas
+        self.scene, self.densifier, self.rasterizer = scene, densifier, rasterizer
+        self.options, self.ideas, self.snapshot_at = options, ideas, frozenset(snapshot_at)
+        self.device = initial.means.device
         readers = [densifier, *ideas.named.values()]
         self.needs_depth, self.needs_median_depth = (
             any(getattr(part, name, False) for part in readers)
             for name in ("needs_depth", "needs_median_depth")
         )
         self.shows_view = "view" in signature(densifier.observe).parameters
-        self.rasterizer = rasterizer
-        self.options = options
-        self.snapshot_at = frozenset(snapshot_at)
-        self.device = initial.means.device
         initial = densifier.prepare(initial)
         color = [*options.background]
         self.background = torch.tensor(color, dtype=torch.float32, device=self.device)  # [3]
         self.loss = PhotometricLoss(options.ssim_weight, torch.get_num_threads())
         self.fast, step_all = fast_steps(rasterizer, self.loss, options, self.background)
         self.used: FastStep | None = None  # by this iteration
-        needs_autograd = ideas.reads_renders or ideas.optimizer is not None or self._adds_depth
-        if options.by_autograd or needs_autograd:
+        adds_depth = self.needs_depth or self.needs_median_depth
+        replaced = ideas.reads_renders or ideas.optimizer is not None
+        if options.by_autograd or replaced or adds_depth:
             self.fast = None
         self.gaussians = TrainableGaussians(
             initial, options, scene.extent, step_all, ideas.optimizer
         )
         self.rngs = generators(seed)
         self.order = CameraOrder(len(scene.train), self.rngs["cameras"])
-        self.step = 0
-        self.seconds = 0.0
+        self.step, self.seconds = 0, 0.0
         of_loss = PHOTOMETRIC if ideas.loss is None else ("loss",)
         self.losses = LossLog([*of_loss, *(f"term_{one.label}" for one in ideas.terms)])
         self.growth = GrowthWatch()
-        free = free_bytes(self.device)
-        image_budget = None if free is None else int(SHARE_FOR_IMAGES * free)
-        self.targets = Targets(scene.train, self.device, image_budget)
-        views = SceneViews(
-            scene.train,
-            self.targets,
-            rasterizer,
-            self.background,
-            self.loss,
-            partial(sh_degree_at, options),
-        )
-        self.scaled_views = ScaledViews(scene.train, self.targets, self.device, image_budget)
-        fixed = options.resolution_schedule == "none"
-        self.resolution = None if fixed else Resolution(options, scene.train)
-        is_white = bool((self.background == 1).all())
-        self.context = DensifyContext(scene.extent, is_white, self.device, views)
+        self.context = self._take_views()
         densifier.begin(initial, self.context)
+
+    def _take_views(self) -> DensifyContext:
+        """Take the training views to the device; return what the densifier may know of them."""
+        views, free = self.scene.train, free_bytes(self.device)
+        budget = None if free is None else int(SHARE_FOR_IMAGES * free)
+        self.targets = Targets(views, self.device, budget)
+        self.scaled_views = ScaledViews(views, self.targets, self.device, budget)
+        self.resolution = Resolution(self.options, views)
+        degree = partial(sh_degree_at, self.options)
+        shown = SceneViews(views, self.targets, self.rasterizer, self.background, self.loss, degree)
+        is_white = bool((self.background == 1).all())
+        return DensifyContext(self.scene.extent, is_white, self.device, shown)
 
     def run(
         self, folder: Path, on_status: Callable[[Status], None] = lambda status: None
@@ -203,21 +190,17 @@ class Trainer:
                 counts = {"num_gaussians": len(self.gaussians)}
                 event = self.iterate(folder)
                 self.seconds = earlier_seconds + _clock() - started
-                out_of_time = (
-                    options.max_seconds is not None and self.seconds >= options.max_seconds
-                )
+                out_of_time = self.seconds >= (options.max_seconds or math.inf)
                 last = self.step == options.iterations or out_of_time
                 if event is not None:
                     append(events, event.as_dict())
                 if self.step in options.volume_histogram:
                     with (folder / HISTOGRAMS).open("a") as stream:
-                        append(
-                            stream,
-                            volume_histogram(self.step, self.gaussians.values.log_scales.detach()),
-                        )
+                        log_scales = self.gaussians.values.log_scales.detach()
+                        append(stream, volume_histogram(self.step, log_scales))
                 if self.step % options.log_every == 0 or last:
                     record = self.losses.wait() | counts | {"sh_degree": self.sh_degree}
-                    if self.resolution is not None:
+                    if options.resolution_schedule != "none":
                         record["scale"] = self.scale
                     # Measure again: on a GPU, `wait` has waited for queued work.
                     self.seconds = earlier_seconds + _clock() - started
@@ -248,9 +231,7 @@ class Trainer:
         """
         self.step += 1
         step, options = self.step, self.options
-        self.gaussians.set_step(
-            step if self.resolution is None else self.resolution.position_step(step)
-        )
+        self.gaussians.set_step(self.resolution.position_step(step))
         if self.ideas.schedule is not None:
             base = self.gaussians.base_rates(self.gaussians.position_rate)
             for name, rate in scheduled(self.ideas.schedule, step, base).items():
@@ -308,8 +289,9 @@ class Trainer:
                 regularizer,
             )
         render = self.render(index)
-        depth_points = self._add_depth(render, cameras[index]) if self._adds_depth else None
-        total, scalars = self._loss(render, index, replace_ignored(render.image, target, mask))
+        depth_points = self._add_depth(render, cameras[index])
+        image = replace_ignored(render.image, target, mask)
+        total, scalars = self._loss(render, index, image, target)
         total.backward()
         if depth_points is not None and depth_points.grad is not None:
             # Terms on depth move the projected means, too: densifiers see the sum.
@@ -324,9 +306,11 @@ class Trainer:
             scalars.append(total)
         return render, torch.stack([scalar.detach().to(total) for scalar in scalars])
 
-    def _loss(self, render: RenderOutput, index: int, image: Tensor) -> tuple[Tensor, list[Tensor]]:
+    def _loss(
+        self, render: RenderOutput, index: int, image: Tensor, target: Tensor
+    ) -> tuple[Tensor, list[Tensor]]:
         """The sum to differentiate, and the scalars of `LossLog`, for a render with ``image``."""
-        ideas, target = self.ideas, self.scaled_views.at(self.scale)[1].get(index)
+        ideas = self.ideas
         if not ideas.reads_renders:
             loss, *shown = self.loss(image, target)
             return loss, [loss, *shown]
@@ -347,10 +331,6 @@ class Trainer:
             total = total + one.weight * value
             scalars.append(value)
         return total, scalars
-
-    @property
-    def _adds_depth(self) -> bool:
-        return self.needs_depth or self.needs_median_depth
 
     def _add_depth(self, render: RenderOutput, camera: Camera) -> Tensor | None:
         """Add the depths that parts ask for to a render.
@@ -422,7 +402,7 @@ class Trainer:
     @property
     def scale(self) -> int:
         """The divisor of the sides of pictures in the current iteration."""
-        return 1 if self.resolution is None else self.resolution.scale(self.step)
+        return self.resolution.scale(self.step)
 
     def _nobody_looks(self) -> bool:
         """Return whether nothing sees the model between the backward pass and Adam.

@@ -1,40 +1,36 @@
 """Parsing of a verb's words by argparse, with gsbench's errors of one line."""
 
 import argparse
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from pkgutil import resolve_name
+from types import MappingProxyType
 from typing import Annotated, Any, NoReturn
 
 from annotated_types import Interval
-from pydantic import TypeAdapter, ValidationError
+from pydantic import PositiveFloat, TypeAdapter, ValidationError
 
 from gsbench.errors import InputError
-from gsbench.settings import CONFIG, describe
+from gsbench.parsing import Count
+from gsbench.settings import CONFIG, OpenFraction, describe
 from gsbench.verbs import VERBS
 from gsbench.words import did_you_mean, is_path, split_outside_brackets
 
-Rows = Mapping[str, str | tuple[Any, ...]]
+Rows = Mapping[str, Any]
 
 
 class ArgumentParser(argparse.ArgumentParser):
     """An argparse parser that raises InputError for what it does not understand.
 
-    ``gsbench VERB --help`` prints the verb's purpose and the text ``more``, and exits. ``rows``
-    give each word its meaning, or its meaning, a function that reads the text (or a list of
-    choices) and a default: ``--name VALUE``, a flag ``--name``, and ``name SHOWN`` for a word
-    without a flag. ``name?`` may lack, there may be many of ``name*``, and ``--name=own`` is called
-    ``own``.
+    ``rows`` are its arguments, as ``verbs.yaml`` describes them.
     """
 
-    def __init__(self, verb: str = "", more: str = "", rows: Rows | None = None, **options: Any):
-        purpose = VERBS[verb][1] if verb else ""
-        stop = "" if purpose.endswith("?") else "."
-        description = f"{purpose[:1].upper()}{purpose[1:]}{stop} {more}"
-        super().__init__(prog=f"gsbench {verb}".strip(), description=description, **options)
-        for words, row in (rows or {}).items():
+    def __init__(self, rows: Rows, verb: str = "", **options: Any):
+        super().__init__(prog=f"gsbench {verb}".strip(), **options)
+        for words, row in rows.items():
             self._add(words, *((row,) if isinstance(row, str) else row))
 
-    def _add(self, words: str, meaning: str, read: Any = str, default: Any = None) -> None:
+    def _add(self, words: str, meaning: str, read: Any = "text", default: Any = None) -> None:
         name, _, shown = words.partition(" ")
         name, own = name.rstrip("?*+"), name[-1]
         how: dict[str, Any] = {"help": meaning}
@@ -47,8 +43,12 @@ class ArgumentParser(argparse.ArgumentParser):
         if name.startswith("-") and not shown:
             how["action"] = "store_true"
         else:
+            if isinstance(read, str):
+                read = READERS[read] if read in READERS else resolve_name(read)
             how |= {"default": [] if own == "*" else default}
-            how |= {"type": read, "metavar": shown or name} if callable(read) else {"choices": read}
+            how |= (
+                {"type": read, "metavar": shown or name} if callable(read) else {"choices": [*read]}
+            )
         self.add_argument(name, **how)
 
     def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
@@ -69,7 +69,7 @@ class ArgumentParser(argparse.ArgumentParser):
 
 
 def number(hint: Any) -> Callable[[str], Any]:
-    """The reader of a number as an annotation allows; an argument's ``type``."""
+    """The reader of a number as an annotation allows."""
     adapter = TypeAdapter(hint, config=CONFIG)
 
     def read(text: str) -> Any:
@@ -79,14 +79,6 @@ def number(hint: Any) -> Callable[[str], Any]:
             raise argparse.ArgumentTypeError(f"must be {describe(hint)}, got {text!r}") from None
 
     return read
-
-
-port = number(Annotated[int, Interval(ge=0, le=65535)])  # of TCP; 0: any free one
-
-
-def whole_number(most: int) -> Callable[[str], Any]:
-    """The reader of a whole number from 1 to ``most``."""
-    return number(Annotated[int, Interval(ge=1, le=most)])
 
 
 def comma_separated(read: Callable[[str], Any]) -> Callable[[str], list[Any]]:
@@ -108,14 +100,40 @@ def _condition(text: str) -> tuple[str, str]:
     return key, value
 
 
-WHERE = {  # `gsbench.analysis.cells.select_trials` takes a dict of them
-    "--where* KEY=A,B": ("only trials with one of these values (repeatable)", _condition)
-}
-
-
 def names(text: str) -> tuple[str, ...]:
     """Different names, such as ``adc,momentum[decay=0.9, lr=1]``; an argument's ``type``."""
     words = tuple(word.strip() for word in split_outside_brackets(text, ","))
     if not all(words) or len(set(words)) < len(words):
         raise argparse.ArgumentTypeError(f"must be different names, comma between, got {text!r}")
     return words
+
+
+_count = number(Annotated[int, Interval(ge=1, le=1_000_000_000)])
+READERS: dict[str, Callable[[str], Any]] = {
+    "text": str,
+    "int": int,
+    "float": float,
+    "path": path,
+    "names": names,
+    "condition": _condition,
+    "count": _count,
+    "counts": comma_separated(_count),
+    "seeds": comma_separated(number(Count)),
+    "to_10000": number(Annotated[int, Interval(ge=1, le=10_000)]),
+    "port": number(Annotated[int, Interval(ge=0, le=65535)]),  # of TCP; 0: any free one
+    "rate": number(OpenFraction),
+    "difference": number(PositiveFloat),
+}
+
+
+def options_of(verb: str, argv: Sequence[str], rows: Rows = MappingProxyType({})) -> Any:
+    """The words ``argv`` of a verb, by its arguments in ``verbs.yaml`` and further ``rows``.
+
+    ``gsbench VERB --help`` prints its purpose and the rest, and exits.
+    """
+    known = VERBS[verb]
+    purpose = known["purpose"]
+    stop = "" if purpose.endswith("?") else "."
+    description = f"{purpose[:1].upper()}{purpose[1:]}{stop} {known.get('more', '')}"
+    parser = ArgumentParser({**known["arguments"], **rows}, verb, description=description)
+    return parser.parse_args(argv)

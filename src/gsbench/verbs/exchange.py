@@ -1,21 +1,29 @@
-"""Verbs for what goes to others or comes from them: evaluate, export and site."""
+"""Verbs for what goes to others or comes from them: evaluate, judge, export and site."""
 
+import argparse
+import json
 import logging
 import shutil
 import sys
 import tempfile
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from gsbench.analysis.addresses import TRIAL
+from gsbench.analysis.frames import COLUMNS, Declared, compare_methods
 from gsbench.analysis.results import TrialResult, load_all_trials
 from gsbench.errors import InputError
-from gsbench.eval.protocol import PROTOCOLS
-from gsbench.files import atomic, own_output, writable_output
+from gsbench.files import atomic, own_output, require_regular, writable_output, write_text
 from gsbench.normalization import Normalization
+from gsbench.parsing import one_line, read_typed
+from gsbench.runs.experiments import DEFAULT_METRIC
 from gsbench.settings import is_folder_name
-from gsbench.verbs.arguments import ArgumentParser, path
-from gsbench.words import readable_bytes
+from gsbench.verbs.arguments import options_of
+from gsbench.words import counted, listed, printable, readable_bytes
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 DONE, LEFT_OUT = 0, 1
 
@@ -26,44 +34,13 @@ def evaluate(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 0 if every photograph was measured."""
     from gsbench.renders.measure import measure_renders
 
-    parser = ArgumentParser(
-        "evaluate",
-        "Names are matched, never guessed. Sizes must be equal.",
-        {
-            "renders RENDERS": ("folder of pictures, or of predictions by nerfbaselines"),
-            "settings* KEY=VALUE": "settings of the scene, and eval.…",
-            "--truth PLACE": "the photographs: a folder, a trial (folder or EXPERIMENT:SCENE:ARM), "
-            "or a scene's name, whose test views are taken as a trial sees them; not needed for "
-            "predictions",
-            "--protocol NAME": ("default: that of the trial, or paper", list(PROTOCOLS)),
-            "--by-order": "match sorted pictures with sorted photographs",
-            "--as=place EXPERIMENT:ARM": "enter them as a trial; ARM: a name or INIT-NAME",
-            "--seed K": ("which repetition of the arm they are (0)", int, 0),
-            "--scene NAME": "with --as, where PLACE is a folder: what to call the scene",
-            "--json": "print a JSON object instead of a table",
-        },
-    )
-    measure_renders(parser.parse_args(argv), runs)
+    measure_renders(options_of("evaluate", argv), runs)
     return 0
 
 
 def export(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 0 if the file, or folder, was written."""
-    options = ArgumentParser(
-        "export",
-        "`gsbench export init TRIAL --out DIR` copies the COLMAP model that the trial started "
-        "from. `gsbench export --results EXPERIMENT` writes results, configurations and hashes as "
-        "one small archive, without pixels unless --pictures is given.",
-        {
-            "--results EXPERIMENT": "the archive of its results (default: EXPERIMENT.zip)",
-            "trial* TRIAL": f"{TRIAL}; after the word init: its initial model",
-            "--out PATH": (
-                "the .ply file to write, for init the folder; a TRIAL needs it",
-                path,
-            ),
-            "--pictures": "with --results: the pictures of the test views, too",
-        },
-    ).parse_args(argv)
+    options = options_of("export", argv)
     if options.results is not None and not options.trial:
         export_results(options.results, runs, options.out, options.pictures)
         return 0
@@ -148,15 +125,7 @@ def site(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 0, or 1 if an archive was left out; raises InputError if none can be read."""
     from gsbench.claims.site import INDEX, write_site  # here, for a quick answer to --help
 
-    options = ArgumentParser(
-        "site",
-        "It needs no server, and has pictures if the archives have them.",
-        {
-            "archives+ ARCHIVE": ("of results", path),
-            "--out DIR": ("the folder to write into", path),
-            "--title TEXT": ("of its first page", str, "Results of gsbench"),
-        },
-    ).parse_args(argv)
+    options = options_of("site", argv)
     if options.out is None:
         raise InputError("site needs --out DIR, the folder to write into")
     page = options.out / INDEX
@@ -166,3 +135,107 @@ def site(argv: Sequence[str], runs: Path) -> int:
         print(f"gsbench: left out: {line}", file=sys.stderr)
     print(page)
     return LEFT_OUT if left_out else DONE
+
+
+# ---- the verdict on a table of results of any trainer, or on a folder of renders
+
+
+def judge(argv: Sequence[str], runs: Path) -> int:
+    """Run the verb; raises InputError for bad input."""
+    options = options_of("judge", argv)
+    if options.declare is not None:
+        return _declare(options)
+    if options.results is None:
+        raise InputError("judge needs RESULTS: a table (.csv) or a folder {arm}/{scene}/{seed}")
+    if options.declared is not None:
+        if not options.declared.is_file():
+            raise InputError(f"{options.declared}: no such file: judge --declare writes it")
+        asked = read_typed(options.declared, Declared)
+        _require_as_declared(options, asked)
+    elif options.baseline is None:
+        raise InputError("judge needs --baseline NAME, one of the methods")
+    else:
+        asked = _asked(options)
+    comparison = compare_methods(_frame(options), asked, options.results.stem)
+    if options.json:
+        print(json.dumps(comparison.to_json(), indent=1))
+    else:
+        from gsbench.analysis.table_formats import to_markdown
+        from gsbench.analysis.tables import build_table
+
+        table = build_table(comparison.experiment, rows=("scene", "densify"), comparison=comparison)
+        print(to_markdown(replace(table, row_headings=("scene", "method"))), end="")
+    if options.out is not None:
+        from gsbench.analysis.report.build import build_report
+
+        with writable_output(options.out):
+            write_text(options.out, build_report(comparison.experiment))
+        print(options.out, file=sys.stderr)
+    return 0
+
+
+def _declare(options: argparse.Namespace) -> int:
+    """Write the question of trainings to come."""
+    needed = ("baseline", "methods", "scenes", "seeds")
+    if lacking := [f"--{name}" for name in needed if not getattr(options, name)]:
+        raise InputError(f"judge --declare needs {listed(lacking)}, too")
+    if options.results is not None or options.declared is not None:
+        raise InputError("judge --declare comes before the results: leave them out")
+    asked = replace(
+        _asked(options),
+        methods=options.methods,
+        scenes=options.scenes,
+        seeds=tuple(options.seeds),
+    )
+    if options.declare.exists():
+        raise InputError(f"{options.declare} is there already: a question is not changed")
+    write_text(options.declare, json.dumps(asked.to_json(), indent=1) + "\n")
+    trials = (1 + len(asked.methods)) * len(asked.scenes) * len(asked.seeds)
+    print(f"{options.declare}: {counted(len(asked.methods), 'question')}, {trials} trainings")
+    return 0
+
+
+def _asked(options: argparse.Namespace) -> Declared:
+    return Declared(
+        baseline=options.baseline,
+        metric=options.metric or DEFAULT_METRIC,
+        better=options.better or "",
+        least=options.least,
+    )
+
+
+def _require_as_declared(options: argparse.Namespace, declared: Declared) -> None:
+    """Raise InputError for an option that says something else than what was declared."""
+    for name in ("baseline", "metric", "least", "better"):
+        value, known = getattr(options, name), getattr(declared, name)
+        if value not in (None, known):
+            raise InputError(f"--{name} {value}: {known} was declared: leave the option out")
+
+
+def _frame(options: argparse.Namespace) -> "pd.DataFrame":
+    """The table of results; that of a folder is measured now."""
+    import pandas as pd  # here, since it is slow to import
+
+    place = options.results
+    if place.is_dir():
+        from gsbench.renders.measure import measure_folders
+
+        if options.truth is None:
+            raise InputError("a folder of renders needs --truth DIR: photographs by scene")
+        return pd.DataFrame(measure_folders(place, options.truth, options.settings))
+    if options.settings or options.truth is not None:
+        raise InputError("KEY=VALUE and --truth are for a folder of renders, not for a table")
+    try:
+        require_regular(place)
+        frame = pd.read_csv(place, dtype=dict.fromkeys(COLUMNS[:2], str), keep_default_na=True)
+    except FileNotFoundError:
+        raise InputError(f"{place}: no such file") from None
+    except (ValueError, UnicodeDecodeError, pd.errors.ParserError) as error:
+        raise InputError(
+            f"{place} is no table of comma-separated values ({one_line(str(error))}); "
+            "`gsbench site` shows archives"
+        ) from None
+    for name in COLUMNS[:2]:
+        if name in frame:
+            frame[name] = [printable(" ".join(str(value).split())) for value in frame[name]]
+    return frame

@@ -19,7 +19,7 @@ from gsbench.errors import InputError
 from gsbench.files import remove_temporaries, storage_errors
 from gsbench.logs import progress
 from gsbench.system.locks import hold
-from gsbench.verbs.arguments import ArgumentParser
+from gsbench.verbs.arguments import options_of
 from gsbench.words import did_you_mean, is_path, readable_bytes
 
 MIRROR_VARIABLE = "GSBENCH_MIRROR"
@@ -30,20 +30,7 @@ PATIENCE = RetryPolicy()
 def fetch(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 0 if all requested scenes are here."""
     catalog = read_catalog()
-    options = ArgumentParser(
-        "fetch",
-        f"They come into the data folder (${DATA_VARIABLE}, else ./data), where scene=NAME finds "
-        "them: only the wanted scenes and image folders out of the archives. Stopped, the same "
-        "command goes on.",
-        {
-            "dataset? DATASET": ", ".join(catalog),
-            "scenes* SCENE": "the scenes wanted; none: all of the data set",
-            "--list": "list all scenes, and which ones are here",
-            "--images FOLDER": "another image folder than the scene file's, such as images",
-            "--mirror PLACE": "where the archives lie instead: the start of an address, or a "
-            f"folder with them (${MIRROR_VARIABLE})",
-        },
-    ).parse_args(argv)
+    options = options_of("fetch", argv)
     data = data_dir()
     if options.list or options.dataset is None:
         chosen = [_dataset(catalog, options.dataset)] if options.dataset else list(catalog.values())

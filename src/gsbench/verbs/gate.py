@@ -27,7 +27,7 @@ from gsbench.errors import GsbenchError, InputError, TrainingError
 from gsbench.files import checked_runs_folder, make_runs_folder
 from gsbench.runs.commands import Question
 from gsbench.runs.experiments import make_home
-from gsbench.verbs.arguments import WHERE, ArgumentParser, path
+from gsbench.verbs.arguments import options_of
 from gsbench.words import listed, printable
 
 # stand for the digests of trials, since versions may share settings
@@ -45,28 +45,10 @@ def gate(argv: Sequence[str], runs: Path) -> int:
     Raises GsbenchError (exit code 1) if trials fail, and InputError (2) for bad input. With
     ``--bisect`` nothing is raised, and the codes are those of ``git bisect run``.
     """
-    parser = ArgumentParser(
-        "gate",
-        "It trains this version on scenes and seeds of an archive (gsbench export --results), seed "
-        "by seed until it is decided. Exit code 0: not worse by --least; 1: worse, or a trial "
-        "failed; 3: undecided; 2: bad input (docs/gate.md).",
-        {
-            "archive": ("the results of the version that you trust", path),
-            "settings* KEY=VALUE": "of the trials, as of a sweep; no seeds",
-            "--metric NAME": ("decides, such as lpips_squeeze or gaussians (psnr)", str, "psnr"),
-            "--least SIZE": (
-                "the least difference that matters, as 0.1 or 10%%; default: the metric's"
-            ),
-            "--seeds N": ("the largest number of seeds; default: all that the archive has", int),
-            "--bisect": "for `git bisect run gsbench gate …`: exit code 125 if it is undecided or "
-            "does not train, 128 for bad input",
-            **WHERE,
-        },
-    )
     if "--bisect" not in argv:
-        return EXIT_CODES[_result(parser.parse_args(argv))]
+        return EXIT_CODES[_result(options_of("gate", argv))]
     try:
-        code = EXIT_CODES[_result(parser.parse_args(argv))]
+        code = EXIT_CODES[_result(options_of("gate", argv))]
     except GsbenchError as error:
         print(f"gsbench: {printable(str(error))}", file=sys.stderr)
         return STOP if isinstance(error, InputError) else SKIP

@@ -35,8 +35,9 @@ from gsbench.runs.commands import (
 )
 from gsbench.runs.config_hash import config_hash
 from gsbench.runs.layout import IN_RUNS
-from gsbench.settings import OpenFraction, is_folder_name
-from gsbench.verbs.arguments import ArgumentParser, number, whole_number
+from gsbench.settings import is_folder_name
+from gsbench.verbs import VERBS
+from gsbench.verbs.arguments import options_of
 from gsbench.words import listed
 
 EXIT_CODES = {"kept": 0, "dropped": 1, "failed": 1}
@@ -50,21 +51,12 @@ Trials = Mapping[Needed, Trial]
 def ledger(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 0 kept (or nothing was tried), 1 dropped or failed, 3 undecided."""
     action = next(filter(ACTIONS.__contains__, argv), "")  # without one, all words are shown
-    rows: dict[str, tuple[Any, ...] | str] = {
-        "action ACTION": (", ".join(ACTIONS), list(ACTIONS)),
-        "name": "the ledger, which is an experiment in the runs folder",
+    rows = {
+        words: (f"{actions}: {meaning}", *how)
+        for words, (actions, meaning, *how) in VERBS["ledger"]["of_actions"].items()
+        if action in actions
     }
-    for words, (actions, meaning, *how) in OPTIONS.items():
-        if action in actions:
-            rows[words] = (f"{actions}: {meaning}", *how)
-    options = ArgumentParser(
-        "ledger",
-        "`new` declares metric, baseline, captures, seeds and error rate. `try` trains one idea, "
-        "seed by seed until it is decided; what looks better is tested on new seeds. Exit code 0: "
-        "kept, 1: dropped, or its trials fail, 3: undecided, 2: bad input. `confirm` trains what "
-        "was kept on other captures. `show` lists all (docs/night.md).",
-        rows,
-    ).parse_args(argv)
+    options = options_of("ledger", argv, rows)
     if not is_folder_name(options.name) or options.name in IN_RUNS:
         raise InputError(f"ledger: {options.name!r} cannot be the name of an experiment")
     return ACTIONS[action](options, runs / options.name)
@@ -180,16 +172,6 @@ def show(options: Namespace, home: Path) -> int:
 
 
 ACTIONS = {"new": new, "try": try_idea, "confirm": confirm, "show": show}
-OPTIONS: dict[str, tuple[Any, ...]] = {  # their actions, and rows of `ArgumentParser`
-    "settings* KEY=VALUE": ("new, try, confirm", "as of a sweep"),
-    "--metric NAME": ("new", "decides, such as lpips_squeeze (psnr)", str, "psnr"),
-    "--least SIZE": ("new", "the least difference that matters, as 0.1 or 10%% (the metric's)"),
-    "--ideas N": ("new", "the most that are tried (40)", whole_number(10_000), 40),
-    "--fdr RATE": ("new", "false discovery rate, 0 to 1 (0.1)", number(OpenFraction), 0.1),
-    "--against IDEA": ("try", "a kept idea to start from (the baseline)", str, BASELINE),
-    "--as=idea NAME": ("try", "the idea's name (default: densify.name)", str, ""),
-    "--json": ("try, show", "print JSON"),
-}
 
 
 # ---- lines of the ledger

@@ -11,33 +11,23 @@ from pathlib import Path
 from typing import Any, Literal
 
 from gsbench.errors import InputError
+from gsbench.parsing import table_beside
 from gsbench.raster.executors import AUTO, EXECUTORS, missing_tools, names, resolve
 from gsbench.runs.trial_record import RasterProof
 from gsbench.scene.rules import MIN_SIZE
 from gsbench.system.install import install_command, version_of
 from gsbench.system.programs import allow_modules
 from gsbench.system.resources import available_threads, installed_gpus
-from gsbench.verbs.arguments import ArgumentParser, Rows, comma_separated, path, whole_number
+from gsbench.verbs.arguments import comma_separated, options_of
 from gsbench.words import counted, readable_bytes
 
 LITTLE_SPACE = 5_000_000_000  # bytes
-REQUIRED = ("pycolmap", "kornia", "numba", "mlflow")
-OPTIONAL = {  # module -> what needs it, and the extra that brings it
-    "transformers": ("init=dim", "dim"),
-    "gsplat": ("benchmarks.gsplat_raster", "gsplat"),
-    "piq": ("MS-SSIM, IW-SSIM, FSIM and GMSD (eval.more)", "piq"),
-    "optuna": ("searches (hydra.sweeper.tune)", "search"),
-    "tensorboard": ("tracking=tensorboard", "tensorboard"),
-    "viser": ("gsbench view", "view"),
-    "wandb": ("tracking=wandb", "wandb"),
-}
+PACKAGES = table_beside(__file__, "packages.yaml")
 NOT_SHOWN = ("scene", "threads", "device")  # columns that only the JSON of `bench` has
 MAX_SIDE = 16_384  # px
-SCENES = ("trained", "skewed", "crowded")
 # the errors of a proof that its line shows
 SHOWN_ERRORS = ("image", "gradient of means", "gradient of log_scales", "trained image")
-MAX_COUNT = 1_000_000_000
-
+RASTERS = names()
 
 Verdict = Literal["ok", "note", "bad"]
 
@@ -48,15 +38,7 @@ Finding = tuple[Verdict, str, str]
 
 def doctor(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 1 if something is bad, or if a proof fails."""
-    rows: Rows = {
-        "words* SETTING": "of a scene, such as scene=photos scene.path=/my/photos: what is odd "
-        "about it",
-        "--prove": "compare a rasterizer with the float64 reference on this machine",
-        "--raster NAME": ("the rasterizer to prove (auto)", names(), AUTO),
-        "--device NAME": ("where to prove it: auto, cpu, cuda or cuda:1", str, "auto"),
-        "--json": "print the proof as JSON",
-    }
-    options = ArgumentParser("doctor", rows=rows).parse_args(argv)
+    options = options_of("doctor", argv)
     if options.prove:
         return _prove(options.raster, options.device, options.json)
     if options.json or options.raster != AUTO or options.device != "auto":
@@ -169,11 +151,11 @@ def check_packages() -> Iterator[Finding]:
         "python",
         f"{sys.version.split()[0]} ({sys.executable}), {available_threads()} cores to use",
     )
-    for name in REQUIRED:
+    for name in PACKAGES["required"]:
         installed = version_of(name)
         text = installed or f"missing: {install_command()}"
         yield "ok" if installed else "bad", name, text
-    for name, (purpose, extra) in OPTIONAL.items():
+    for name, (purpose, extra) in PACKAGES["optional"].items():
         installed = version_of(name)
         text = installed or f"not installed; needed for {purpose}: {install_command(extra)}"
         yield "ok" if installed else "note", name, text
@@ -254,26 +236,7 @@ def check_runs(runs: Path) -> Iterator[Finding]:
 
 def bench(argv: Sequence[str], _runs: Path | None = None) -> int:
     """Print the table, or with ``--json`` the list of results."""
-    own = ", ".join(executor.name for executor in EXECUTORS)
-    count = whole_number(MAX_COUNT)
-    rows: Rows = {
-        "--raster A,B": (f"names: {own} or your own, mine.MyRaster", str, "cpu"),
-        "--size WIDTHxHEIGHT,…": ("image sizes", comma_separated(_size), "500x375"),
-        "--count N,…": ("numbers of Gaussians", comma_separated(count), "100000"),
-        "--scene NAME": (
-            "like a trained model (default), like one with its detail at few places, or with a "
-            "twentieth of it over one tile",
-            SCENES,
-            "trained",
-        ),
-        "--ply FILE": ("time this model instead of a synthetic scene", path),
-        "--repeats N": ("turns that count (default 5)", count, 5),
-        "--threads N": ("CPU threads (default: as many as torch takes)", count),
-        "--json": "print JSON",
-        "--no-memory": "do not measure peak memory, in processes of their own",
-    }
-    parser = ArgumentParser("bench", "Times are medians of steps that take turns.", rows)
-    options = parser.parse_args(argv)
+    options = options_of("bench", argv)
     if options.ply is not None and not options.ply.is_file():
         raise InputError(f"--ply: {options.ply} does not exist")
     rasters = options.raster.split(",")
@@ -323,3 +286,6 @@ def _size(text: str) -> tuple[int, int]:
             f"500x375, got {text!r}"
         )
     return int(width), int(height)
+
+
+sizes = comma_separated(_size)

@@ -77,7 +77,7 @@ def _parser() -> ArgumentParser:
         "--resolve": "with --cfg: show values instead of ${…}",
         "--hydra-help": "Hydra's own options",
     }
-    parser = ArgumentParser(rows=rows, add_help=False, allow_abbrev=False)
+    parser = ArgumentParser(rows, add_help=False, allow_abbrev=False)
     parser.add_argument("--cfg", "-c", choices=["job", "hydra", "all"])
     parser.add_argument("--package", "-p")
     info = ["all", "config", "defaults", "defaults-tree", "plugins", "searchpath"]

@@ -20,12 +20,10 @@ from gsbench.analysis.cells import (
 )
 from gsbench.analysis.comparison import Comparison, chosen, compare, joined
 from gsbench.analysis.fairness import fairness_table
-from gsbench.analysis.pairs import BASELINE
 from gsbench.analysis.paper import (
     layout_of,
     load_published,
     paper_tables,
-    published_names,
     published_table,
 )
 from gsbench.analysis.quantities import Quantity, quantity
@@ -34,46 +32,25 @@ from gsbench.analysis.results import (
     load_experiment,
 )
 from gsbench.analysis.table_formats import FORMATS, csv_of
-from gsbench.analysis.tables import DEFAULT_ROWS, build_table, format_cell
+from gsbench.analysis.tables import build_table, format_cell
 from gsbench.errors import InputError
 from gsbench.files import own_output, writable_output, write_text
 from gsbench.runs.experiments import list_experiments
 from gsbench.runs.package_code import edited
-from gsbench.verbs.arguments import WHERE, ArgumentParser, Rows, names, path
+from gsbench.verbs.arguments import options_of
 from gsbench.words import some_of, split_outside_brackets
 
 TRIALS, JSON = "trials", "json"
 FAIRNESS = "fairness"
 PAPER_NOTES = "paper"  # `gsbench tables paper` shows the paper's own inconsistencies
 REPORT_NAME = "report.html"
+FORMAT_NAMES = (*FORMATS, TRIALS, JSON)
+LAYOUTS = (*load_published().tables, "plain", FAIRNESS)
 
 
 def tables(argv: Sequence[str], runs: Path) -> int:
     """Run the verb; raises InputError for bad input."""
-    options = ArgumentParser(
-        "tables",
-        "`gsbench tables paper` lists where the paper contradicts itself.",
-        {
-            "experiment?": "its name (without one: lists them); table1, table2 and their _own look "
-            "as in the paper, with its values",
-            "other?": "another one, beside it on the same scenes",
-            "--format NAME": (
-                f"default: md; {TRIALS}: CSV with one row a trial; {JSON}: the verdicts",
-                [*FORMATS, TRIALS, JSON],
-            ),
-            "--out PATH": ("a folder, or a file whose ending says the format", path),
-            "--rows A,B": (f"fields or settings (default {','.join(DEFAULT_ROWS)})", names),
-            "--columns A,B": ("fields or settings, crossed with all metrics", names),
-            "--metrics A,B": ("such as psnr,lpips_squeeze,gaussians,train_time", names),
-            "--paper NAME": f"published numbers, too: {', '.join(published_names())}",
-            "--layout NAME": (
-                f"the paper's layout for any experiment; {FAIRNESS}: for each pair of arms in what "
-                "they differ, what was tuned, and whose defaults those are",
-                [*load_published().tables, "plain", FAIRNESS],
-            ),
-            **WHERE,
-        },
-    ).parse_args(argv)
+    options = options_of("tables", argv)
     options.format = options.format or _format_of(options.out)
     if options.experiment is None:
         print("\n".join(list_experiments(runs)) or f"no experiment in {runs} yet")
@@ -181,12 +158,7 @@ def report(argv: Sequence[str], runs: Path) -> int:
     """Run the verb; raises InputError for bad input."""
     from gsbench.analysis.report.build import build_report  # here, for a quick answer to --help
 
-    rows: Rows = {
-        "experiment": "its name",
-        "--out PATH": (f"folder or .html file; default: the experiment's {REPORT_NAME}", path),
-        "--baseline NAME": f"the densifier to compare with ({BASELINE})",
-    }
-    options = ArgumentParser("report", rows={**rows, **WHERE}).parse_args(argv)
+    options = options_of("report", argv)
     experiment = load_experiment(runs, options.experiment)
     densifiers = sorted({trial.densify for trial in experiment.trials})
     if options.baseline is not None and options.baseline not in densifiers:
@@ -203,8 +175,7 @@ def report(argv: Sequence[str], runs: Path) -> int:
 
 def explain(argv: Sequence[str], runs: Path) -> int:
     """Run the verb; raises InputError for bad input."""
-    parser = ArgumentParser("explain", rows={"cell CELL": f"a number of a table: {CELL}"})
-    print(explain_cell(parser.parse_args(argv).cell, runs))
+    print(explain_cell(options_of("explain", argv).cell, runs))
     return 0
 
 

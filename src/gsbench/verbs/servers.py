@@ -1,4 +1,4 @@
-"""Verbs that serve pages on this machine: ``gsbench view`` and ``gsbench ui``."""
+"""Verbs for what is shown in a browser: ``view`` and ``ui`` serve it, ``sync`` sends to it."""
 
 import importlib.util
 import itertools
@@ -11,15 +11,19 @@ from pathlib import Path
 
 import requests
 
-from gsbench.analysis.addresses import TRIAL
-from gsbench.errors import InputError
+from gsbench.config.command_words import typed_permissions
+from gsbench.config.overrides import key_of
+from gsbench.errors import GsbenchError, InputError
 from gsbench.files import require_no_links
-from gsbench.runs.experiments import experiment_home, list_experiments
+from gsbench.runs.experiments import experiment_home, list_experiments, trial_folders
 from gsbench.runs.layout import DATABASE
+from gsbench.runs.trial_folder import TrialFolder
+from gsbench.runs.user_code import PERMISSIONS
 from gsbench.system.install import require_package
 from gsbench.system.isolate import end_descendants
-from gsbench.system.programs import own_folder, safe_environment
+from gsbench.system.programs import allow_modules, own_folder, safe_environment
 from gsbench.system.stopping import stop_on_signals
+from gsbench.tracking.beside import send_beside
 from gsbench.tracking.ideas import addresses, show_ideas
 from gsbench.tracking.mlflow_sink import (
     SETTINGS,
@@ -28,9 +32,10 @@ from gsbench.tracking.mlflow_sink import (
     require_own_journal,
     tracker_uri,
 )
-from gsbench.verbs.arguments import ArgumentParser, Rows, port
+from gsbench.tracking.sync import MirrorError
+from gsbench.tracking.sync import sync as send_missing
+from gsbench.verbs.arguments import options_of
 
-VIEWER_PORT, DASHBOARD_PORT = 8080, 5000
 SECONDS_TO_ANSWER = 5.0
 # MLflow's defaults take eight processes and 2 GB
 LEAN = {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}
@@ -38,12 +43,7 @@ LEAN = {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}
 
 def view(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: serves the viewer until Ctrl-C."""
-    rows: Rows = {
-        "trial+ TRIAL": TRIAL,
-        "--port N": (f"on this machine; 0: any ({VIEWER_PORT})", port, VIEWER_PORT),
-        "--device NAME": ("auto, cpu, cuda or cuda:1", str, "auto"),
-    }
-    options = ArgumentParser("view", rows=rows).parse_args(argv)
+    options = options_of("view", argv)
     if len(options.trial) > 2:
         raise InputError(f"one or two trials can be viewed, not {len(options.trial)}")
     require_package("viser", "view", "the viewer")
@@ -71,12 +71,7 @@ def view(argv: Sequence[str], runs: Path) -> int:
 
 def ui(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: serves the dashboard until Ctrl-C, if no server does already."""
-    rows: Rows = {
-        "experiment?": "open the comparison of its arms; default: the only experiment",
-        "--uri ADDRESS": "the tracker's; default: $MLFLOW_TRACKING_URI, or the runs folder's",
-        "--port N": (f"of the server ({DASHBOARD_PORT})", port, DASHBOARD_PORT),
-    }
-    options = ArgumentParser("ui", rows=rows).parse_args(argv)
+    options = options_of("ui", argv)
     if options.uri is not None and "://" not in options.uri:
         raise InputError(f"--uri {options.uri} is not an address such as sqlite:///FILE")
     uri = tracker_uri(options.uri, runs)
@@ -148,3 +143,26 @@ def serve(uri: str, port: int) -> int:
             return 0
         finally:
             end_descendants()
+
+
+def sync(argv: Sequence[str], runs: Path) -> int:
+    """Run the verb: 1 if the tracker cannot be reached."""
+    options = options_of("sync", argv)
+    words = [options.experiment or "", *options.permissions]
+    experiment = "" if "=" in words[0] else words.pop(0)
+    if unread := [word for word in words if key_of(word) != PERMISSIONS]:
+        raise InputError(f"sync reads only {PERMISSIONS}, not {unread[0]}")
+    allow_modules(allowed := typed_permissions(words))
+    names = [experiment] if experiment else list_experiments(runs)
+    homes = [experiment_home(runs, name) for name in names]
+    try:
+        if options.beside is not None:
+            send_beside(sys.stdin, options.beside)
+            return 0
+        places = [place for home in homes for place in sorted(trial_folders(home))]
+        folders = [TrialFolder(Path(place)) for place in places]
+        for line in send_missing(folders, options.uri, allowed):
+            print(line, flush=True)
+    except (MirrorError, OSError) as error:
+        raise GsbenchError(f"{error}; the files are complete: try again") from error
+    return 0

@@ -1,10 +1,12 @@
-"""Verbs about trials of an experiment: ``gsbench status``, ``retry``, ``declare`` and ``sync``."""
+"""Verbs about trials: ``status``, ``retry``, ``declare``, and ``clean`` about what they stored."""
 
 from __future__ import annotations
 
+import argparse
 import json
 import logging
 import os
+import re
 import sys
 import time
 from collections.abc import Sequence
@@ -18,7 +20,7 @@ from rich.text import Text
 from gsbench.config.command_words import makes_other_trials, parse, typed_permissions
 from gsbench.config.compose import Trial, compose_one
 from gsbench.config.overrides import changed_words, key_of
-from gsbench.errors import GsbenchError, InputError
+from gsbench.errors import InputError
 from gsbench.files import checked_runs_folder, make_runs_folder
 from gsbench.launch.estimates import SPEED, describe_plan, progress_frame
 from gsbench.launch.record import check_looks, check_questions, planned_rows, record, remove
@@ -29,19 +31,19 @@ from gsbench.launch.states import (
     states_of_experiment,
     summary_of,
 )
+from gsbench.runs.cleaning import Stored, free, stored
 from gsbench.runs.commands import PlannedTrial, drop, read_history
 from gsbench.runs.experiments import experiment_home, list_experiments, trial_folders
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS
 from gsbench.runs.user_code import PERMISSIONS
+from gsbench.system.locks import is_held
 from gsbench.system.programs import allow_modules
-from gsbench.tracking.beside import send_beside
-from gsbench.tracking.sync import MirrorError
-from gsbench.tracking.sync import sync as send_missing
-from gsbench.verbs.arguments import ArgumentParser, Rows
-from gsbench.words import counted, readable_time
+from gsbench.verbs.arguments import options_of
+from gsbench.words import counted, readable_bytes, readable_time
 
 SECONDS_BETWEEN_LOOKS = 3.0
+HOURS = {"h": 1, "d": 24, "w": 7 * 24}  # by the units of an age
 SHOWN = ("folder", "state", "since", "note")  # facts of a trial in JSON
 
 log = logging.getLogger(__name__)
@@ -49,18 +51,7 @@ log = logging.getLogger(__name__)
 
 def status(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 0 if all trials are done, running or queued, 1 if any failed or is missing."""
-    rows: Rows = {
-        "experiment?": "its name; without one, a line for each experiment",
-        "--all": "list the finished trials too",
-        "--watch": "a row for each arm, renewed until all trials have ended",
-        "--verify": "also compare by content what a look leaves to size and time: large files, and "
-        "the results of stages in the store",
-        "--json": "print a JSON list instead of lines",
-        "--forget": "remove trials from the plan that never started",
-        "--forget-superseded": "delete the folders of trials that older code made; what their "
-        "stages computed stays in the store, and verdicts still count them as versions of the code",
-    }
-    options = ArgumentParser("status", rows=rows).parse_args(argv)
+    options = options_of("status", argv)
     if options.experiment is None:
         if options.watch:
             raise InputError("--watch needs the name of an experiment")
@@ -151,13 +142,7 @@ def retry(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: the exit code says whether a trial failed, as that of a sweep does."""
     from gsbench.app.command import run_trials
 
-    rows: Rows = {
-        "experiment": "its name",
-        "changes* KEY=VALUE": "settings that do not make a different trial: launch=slurm …; "
-        "allow_targets=[mine] for your own code",
-        "--dry-run": "only list them",
-    }
-    options = ArgumentParser("retry", rows=rows).parse_args(argv)
+    options = options_of("retry", argv)
     home = experiment_home(runs, options.experiment)
     if refused := [change for change in options.changes if makes_other_trials(key_of(change))]:
         raise InputError(
@@ -227,17 +212,11 @@ def recompose(
 
 def declare(argv: Sequence[str], runs: Path) -> int:
     """Run the verb; raises InputError for a wrong sweep."""
-    parser = ArgumentParser(
-        "declare",
-        "It writes the questions of a sweep and trains nothing: for loops and arrays of jobs that "
-        "train its trials one by one. Each of these commands then asks nothing more.",
-        {"settings* KEY=VALUE": "as of a sweep", "--config-dir FOLDER": "as of a sweep"},
-    )
-    parser.add_argument("-m", "--multirun", action="store_true", help="is understood")
-    parser.parse_args(argv)
+    options = options_of("declare", argv)
     from gsbench.app.command import compose_trials  # here, since it loads Hydra
 
-    words, _, _ = parse(argv)  # the words of a command
+    folders = [f"--config-dir={folder}" for folder in options.config_dir]
+    words, _, _ = parse([*folders, *options.settings])
     trials = compose_trials(words, multirun=True)
     if any(trial.values["launch"]["stop_when_decided"] for trial in trials):
         check_looks(trials, planned_rows(trials))
@@ -251,31 +230,53 @@ def declare(argv: Sequence[str], runs: Path) -> int:
     return 0
 
 
-def sync(argv: Sequence[str], runs: Path) -> int:
-    """Run the verb: 1 if the tracker cannot be reached."""
-    rows: Rows = {
-        "experiment?": "its name; without one, all",
-        "permissions* allow_targets=[mine]": "for trials that a tracker of your own shows",
-        "--uri ADDRESS": "such as http://127.0.0.1:5000; default: $MLFLOW_TRACKING_URI, or the "
-        "runs folder's",
-        "--beside SECONDS": ("send the trials that the standard input names, to its end", float),
-    }
-    options = ArgumentParser("sync", rows=rows).parse_args(argv)
-    words = [options.experiment or "", *options.permissions]
-    experiment = "" if "=" in words[0] else words.pop(0)
-    if unread := [word for word in words if key_of(word) != PERMISSIONS]:
-        raise InputError(f"sync reads only {PERMISSIONS}, not {unread[0]}")
-    allow_modules(allowed := typed_permissions(words))
-    names = [experiment] if experiment else list_experiments(runs)
-    homes = [experiment_home(runs, name) for name in names]
-    try:
-        if options.beside is not None:
-            send_beside(sys.stdin, options.beside)
-            return 0
-        places = [place for home in homes for place in sorted(trial_folders(home))]
-        folders = [TrialFolder(Path(place)) for place in places]
-        for line in send_missing(folders, options.uri, allowed):
-            print(line, flush=True)
-    except (MirrorError, OSError) as error:
-        raise GsbenchError(f"{error}; the files are complete: try again") from error
+def clean(argv: Sequence[str], runs: Path) -> int:
+    """Run the verb; what a finished trial needs always stays."""
+    options = options_of("clean", argv)
+    trials = [
+        Path(place) for name in list_experiments(runs) for place in trial_folders(runs / name)
+    ]
+    let_go = set[Path]()
+    if options.experiment is not None:
+        states = states_of_experiment(experiment_home(runs, options.experiment))
+        let_go = {trial.folder for trial in states if STATES[trial.state].freed}
+    if running := [place for place in trials if is_held(TrialFolder(place).lock)]:
+        raise InputError(
+            f"{counted(len(running), 'trial')} of this runs folder run now, and may need what "
+            "nothing refers to yet: wait for them"
+        )
+    found = stored(runs, [place for place in trials if place not in let_go])
+    goes = [one for one in found if not one.needed and one.age >= options.older_than]
+    print("\n".join(_store_lines(found, goes)))
+    if options.dry_run:
+        print(f"would free {_amount(goes)}; without --dry-run they are removed")
+        return 0
+    print(f"freed {_amount(free(runs, goes))}")
     return 0
+
+
+def _store_lines(found: Sequence[Stored], goes: Sequence[Stored]) -> list[str]:
+    """A line for each stage: its results, their bytes, and what nothing refers to."""
+    lines = []
+    for stage in sorted({one.stage for one in found}):
+        own = [one for one in found if one.stage == stage]
+        needed = sum(one.needed for one in own)
+        free_now = sum(one.stage == stage for one in goes)
+        size = readable_bytes(sum(one.size for one in own))
+        lines.append(
+            f"{stage:<14} {counted(len(own), 'result'):>12} {size:>10}   {needed} needed by "
+            f"trials, {len(own) - needed - free_now} kept for their age, {free_now} to free"
+        )
+    return lines or ["the store is empty"]
+
+
+def _amount(places: Sequence[Stored]) -> str:
+    return f"{counted(len(places), 'result')}, {readable_bytes(sum(one.own for one in places))}"
+
+
+def age(text: str) -> float:
+    """The seconds of an age such as ``30d``."""
+    match = re.fullmatch(r"(\d{1,6})([hdw])", text)
+    if match is None:
+        raise argparse.ArgumentTypeError(f"must be an age such as 12h, 30d or 4w, got {text!r}")
+    return int(match[1]) * 3600.0 * HOURS[match[2]]

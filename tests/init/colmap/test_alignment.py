@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 from skimage.transform import SimilarityTransform
 
-from gsbench.init.colmap.alignment import align_poses, compare_poses, fit_similarity
+from gsbench.init.colmap.models import align_poses, compare_poses, fit_similarity
 
 TRUE_SCALE = 2.5
 TRUE_ROTATION = Rotation.from_rotvec([0.3, -1.1, 2.0]).as_matrix()

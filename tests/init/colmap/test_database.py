@@ -13,7 +13,7 @@ from PIL.TiffImagePlugin import IFDRational
 from gsbench.init import Sfm
 from gsbench.init.colmap import database as made
 from gsbench.init.colmap import matches
-from gsbench.init.reconstruction import report_lenses, report_unused
+from gsbench.init.sfm import report_lenses, report_unused
 from gsbench.scene.images import (
     DIGITAL_ZOOM,
     EXIF_IFD,
@@ -24,6 +24,7 @@ from gsbench.scene.images import (
     MODEL,
 )
 from gsbench.scene.types import Capture
+from tests.init.tables import TABLES
 
 SIZES = dict.fromkeys(("a.png", "b.png", "c.png", "left/a.png", "left/b.png"), (40, 30))
 SIZES["c.png"] = (40, 32)
@@ -52,16 +53,11 @@ def database(images, tmp_path):
 
 @pytest.mark.parametrize(
     "sharing, expected",
-    [
-        ("exif", [{"a.png", "b.png", "left/a.png", "left/b.png"}, {"c.png"}]),
-        ("single", [{"a.png", "b.png", "left/a.png", "left/b.png"}, {"c.png"}]),
-        ("per_folder", [{"a.png", "b.png"}, {"c.png"}, {"left/a.png", "left/b.png"}]),
-        ("per_image", [{name} for name in SIZES]),
-    ],
+    TABLES["shared cameras"],
 )
 def test_images_share_a_camera_by_size_folder_or_not_at_all(images, sharing, expected):
     groups = groups_of(images, sharing=sharing)
-    assert [set(names) for _, names in groups] == expected
+    assert [sorted(names) for _, names in groups] == expected
     for camera, names in groups:
         assert (camera.width, camera.height) == SIZES[names[0]]
         assert (camera.focal_length, camera.has_prior_focal_length) == (1.2 * 40, False)
@@ -88,18 +84,7 @@ TELEPHONE = {"make": "X", "model": "X 7", "mm": 6.8, "film": 26}
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp"])
 @pytest.mark.parametrize(
     "change, cameras",
-    [
-        ({}, 1),
-        ({"mm": 6.8004}, 1),  # as written by another program
-        ({"film": 52}, 2),  # digital zoom of one lens
-        ({"zoom": 1.0}, 1),  # said by some of the photographs only
-        ({"zoom": 2.0}, 2),
-        ({"mm": 9.0, "film": 77}, 2),
-        ({"lens": "telephoto"}, 2),
-        ({"model": "X 8"}, 2),
-        ({"size": (30, 40)}, 2),
-        ({"film": 0, "mm": 0.0}, 2),  # unknown
-    ],
+    TABLES["lenses by EXIF"],
 )
 def test_photographs_share_a_camera_by_their_exif_data(tmp_path, suffix, change, cameras):
     names = [f"{k}{suffix}" for k in range(6)]

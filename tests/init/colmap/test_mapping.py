@@ -9,7 +9,6 @@ from PIL import Image
 
 from gsbench.init import Sfm
 from gsbench.init.colmap import mapping
-from gsbench.init.colmap.alignment import align_poses, common_poses
 from gsbench.init.colmap.database import (
     DatabaseTask,
     create_database,
@@ -18,10 +17,12 @@ from gsbench.init.colmap.database import (
 )
 from gsbench.init.colmap.mapping import Geometry, map_images, measure_geometry
 from gsbench.init.colmap.matches import verify_pairs
+from gsbench.init.colmap.models import align_poses, common_poses
 from gsbench.init.colmap.pairs import select_pairs
 from gsbench.logs import no_progress
 from tests.helpers import refusal
 from tests.init.models import add_point, camera_at, model_with
+from tests.init.tables import TABLES
 
 WIDTH, HEIGHT, FOCAL = 640, 480, 520.0  # px; COLMAP's guess without EXIF is 1.2 x 640 = 768
 
@@ -144,19 +145,12 @@ def ways(monkeypatch):
 
 @pytest.mark.parametrize(
     "found, best, tried",
-    [
-        ([[(9, 1)], [(10, 1)]], (9, 1), 1),  # enough of ten images
-        ([[(8, 1)], [(10, 1)]], (10, 1), 2),
-        ([[(8, 5)], [(8, 9)], [(7, 99)]], (8, 9), 3),
-        ([[(8, 9)], [(8, 5)], []], (8, 9), 3),
-        ([[(4, 1), (6, 1), (5, 9)]], (6, 1), 1),
-        ([[], [(3, 1)]], (3, 1), 2),
-    ],
+    TABLES["strategies"],
 )
 def test_strategies_are_tried_until_one_places_nine_of_ten_images(ten, ways, found, best, tried):
     ways[:] = [(f"way {k}", sizes) for k, sizes in enumerate(found)]
     result = mapped(ten, "auto")
-    assert (result.model.num_reg_images(), result.model.num_points3D()) == best
+    assert [result.model.num_reg_images(), result.model.num_points3D()] == best
     place = next(k for k, sizes in enumerate(found) if best in sizes)
     assert (result.strategy, result.models) == (f"way {place}", len(found[place]))
     most = [max(sizes, default=(0, 0))[0] for sizes in found[:tried]]

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from gsbench.init import Sfm
 from gsbench.init.base import TrainingPoints
-from gsbench.init.colmap import alignment, mapping, matches, models
+from gsbench.init.colmap import mapping, matches, models
 from gsbench.init.colmap import pairs as pairing
 from gsbench.init.colmap.database import DatabaseTask, create_database, write_features
 from gsbench.init.colmap.matches import verify_pairs
@@ -86,26 +86,6 @@ def test_matches_that_contradict_the_cameras_are_refused(database, tmp_path):
         mapping.triangulate(database, tmp_path, reference, Sfm(), no_progress)
 
 
-def test_the_poses_of_two_models_are_paired_by_name():
-    scale, shift = 2.0, np.array([1.0, -2.0, 3.0])
-    moved = {}  # in the opposite order, and without the first
-    for name, pose in reversed(list(poses().items())[1:]):
-        turn = pose.rotation.matrix()
-        moved[name] = camera_at(scale * -turn.T @ pose.translation + shift, turn)
-    first, second = model_of(poses()), model_of(moved)
-    centers, rotations, other_centers, other_rotations = alignment.common_poses(first, second)
-    places = [[0.8 * (k - 1.5), 0.2 * k, 0.1] for k in (1, 2, 3)]
-    turns = [poses()[name].rotation.matrix() for name in NAMES[1:]]
-    assert_allclose(centers, places, atol=1e-12)
-    assert_allclose(other_centers, scale * centers + shift, atol=1e-12)
-    assert_allclose(rotations, turns, atol=1e-12)
-    assert_allclose(other_rotations, rotations, atol=1e-12)
-    paired = centers, rotations, other_centers, other_rotations
-    assert alignment.align_poses(*paired).scale == pytest.approx(scale)
-    nothing = alignment.common_poses(first, pycolmap.Reconstruction())
-    assert [len(part) for part in nothing] == [0] * 4
-
-
 def test_points_of_training_views_keep_place_and_observations_and_get_those_views_colours(tmp_path):
     model = model_with(poses(), 3, camera())
     for shade, name in zip((10, 20, 60, 200), NAMES, strict=True):
@@ -124,8 +104,6 @@ def test_points_of_training_views_keep_place_and_observations_and_get_those_view
         assert point.color.tolist() == [shade, 0, 255 - shade]
         for image_id in seen:
             assert model.images[image_id].points2D[number - 1].point3D_id == number
-    with refusal(r"init\.points_from=train: no point is left"):
-        models.keep_training_points(model, NAMES[1:2], tmp_path)
 
 
 def test_settings_reach_colmaps_verification():

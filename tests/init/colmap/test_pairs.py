@@ -5,7 +5,13 @@ import itertools
 import numpy as np
 import pytest
 
-from gsbench.init.colmap.pairs import STRONGEST, best_pairs, count_agreements, sequential_pairs
+from gsbench.init.colmap.pairs import (
+    STRONGEST,
+    best_pairs,
+    count_agreements,
+    proposed_pairs,
+    sequential_pairs,
+)
 
 
 def slow_count(first, second):
@@ -55,6 +61,8 @@ def test_each_image_keeps_its_best_partners():
     assert set(pairs) == expected
     assert pairs == sorted(pairs)
     assert best_pairs(images, partners=99) == list(itertools.combinations(range(12), 2))
+    # few images get all pairs, without a preview
+    assert proposed_pairs("abc", None) == [("a", "b"), ("a", "c"), ("b", "c")]
 
 
 @pytest.mark.parametrize("partners", [1, 3])

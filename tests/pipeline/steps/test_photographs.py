@@ -22,7 +22,7 @@ from gsbench.pipeline.steps.scene import (
 )
 from gsbench.runs.keys import INIT, Step
 from gsbench.runs.store import Store
-from gsbench.scene.masks import read_mask
+from gsbench.scene.beside import read_mask
 from gsbench.scene.options import SceneConfig
 from gsbench.scene.types import Capture
 from tests.helpers import refusal
@@ -68,7 +68,7 @@ def test_the_courtyard_has_a_step_and_photographs_are_read_directly(photographs)
 def test_a_capture_is_moved_to_the_coordinates_of_the_training_by_a_step(photographs, monkeypatch):
     moved = []
     monkeypatch.setattr(scene_steps, "normalize_capture", lambda *given: moved.append(given))
-    capture = read_photos("own", photographs)
+    capture = read_photos(photographs)
     assert normalizing_step(capture) is None
     far = replace(capture, advised_normalization=Normalization((1e6, 0.0, 0.0), 0.5))
     step = normalizing_step(far)
@@ -83,8 +83,8 @@ def test_masked_and_transparent_pixels_are_replaced(photographs, tmp_path, monke
         scene_steps, "progress", lambda title: nullcontext(lambda _, *counts: told.append(counts))
     )
     bare, masks = (
-        read_photos("own", str(photographs)),
-        read_photos("own", str(photographs), masks="masks"),
+        read_photos(str(photographs)),
+        read_photos(str(photographs), masks="masks"),
     )
     assert masking_step(bare, "black") is None  # reading makes transparent pixels black anyway
     steps = [

@@ -129,10 +129,3 @@ def test_a_test_view_without_its_mask_is_refused(case):
     pictures(Path(parts.scene.path) / "masks", {NAMES[0]: np.full(SIZE[::-1], 255, np.uint8)})
     with refusal("eval.regions.sky: no mask of b.png"):
         region_inputs(views, parts)
-
-
-def test_without_regions_nothing_is_read(case):
-    views, parts = case
-    parts.eval.regions = None
-    assert region_inputs(views, parts) is None
-    assert regions_of(views, parts) == {}

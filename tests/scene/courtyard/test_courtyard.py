@@ -50,7 +50,7 @@ def test_the_colmap_model_has_the_exact_cameras(capture_dir, tmp_path):
         assert_allclose(written[name].rotation, camera.rotation, atol=1e-12)
         assert_allclose(written[name].translation, camera.translation, atol=1e-12)
         assert (written[name].fx, written[name].cx, written[name].cy) == (camera.fx, 80, 60)
-    capture = replace(read_colmap("courtyard", capture_dir), exact_poses=True)
+    capture = replace(read_colmap(capture_dir), exact_poses=True)
     assert len(loaded(capture, tmp_path).train) == 3
 
 

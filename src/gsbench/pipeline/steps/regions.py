@@ -15,11 +15,18 @@ from gsbench.eval.options import DISTANCE
 from gsbench.eval.regions import Depth, Regions, depths_of_points, regions_by_distance
 from gsbench.init.base import MODEL_FOLDER
 from gsbench.pipeline.steps.scene import Views
-from gsbench.scene.beside import DEPTH, digests, files_beside, pixels_of_view, view_of_file
+from gsbench.scene.beside import (
+    DEPTH,
+    digests,
+    files_beside,
+    find_masks,
+    pixels_of_view,
+    read_mask,
+    view_of_file,
+)
 from gsbench.scene.colmap import model_points, posed_by_name, read_model
 from gsbench.scene.colmap_files import require_subfolder
 from gsbench.scene.load import lenses_of
-from gsbench.scene.masks import find_masks, read_mask
 from gsbench.scene.types import Array, CameraModel, Capture, View
 from gsbench.scene.undistortion import flat_camera
 

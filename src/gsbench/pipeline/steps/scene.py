@@ -23,13 +23,19 @@ from gsbench.runs.layout import MASKS
 from gsbench.runs.nested import sha256_of
 from gsbench.runs.store import Store
 from gsbench.runs.user_code import NO_USER_CODE, UserCode
-from gsbench.scene.beside import digests, files_beside
+from gsbench.scene.beside import (
+    IMAGES,
+    digests,
+    files_beside,
+    prepare_photograph,
+    prepared_mask,
+    write_mask,
+)
 from gsbench.scene.colmap import Cloud, normalize_capture, write_frames
 from gsbench.scene.colmap_files import SPARSE_FOLDERS
 from gsbench.scene.courtyard.render import render_courtyard
 from gsbench.scene.images import png_name, read_image
 from gsbench.scene.load import load_scene
-from gsbench.scene.masks import IMAGES, prepare_photograph, prepared_mask, write_mask
 from gsbench.scene.options import Backdrop, SceneConfig
 from gsbench.scene.pipe import fingerprint, prepare
 from gsbench.scene.readers import existing_folder, read_raw

@@ -155,7 +155,22 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
         radii = allocate("radii", (count,), torch.int32)
         flags = scratch.take("flags", 1, torch.int32).zero_()
         keys = scratch.take("depth_keys", count, torch.int32)
-        projected = _project(memory, gaussians, view, request.degree, keys, radii, flags)
+        projected = Projected(
+            memory.take("records", (count + 1) * RECORD.value, torch.float32),
+            memory.take("color_slopes", count * COLOR_SLOPES.value, torch.float32),
+            memory.take("row_counts", count, torch.int32),
+        )
+        launch(project, count + 1, 128)(
+            gaussians=Parameters(**gaussians.detach().tensors()),
+            count=count,
+            camera=view,
+            projected=projected,
+            record_ints=projected.records.view(torch.int32),
+            keys=keys,
+            radii=radii,
+            flags=flags,
+            DEGREE=request.degree,
+        )
         order, unit_ends = sort_by_depth(scratch, projected, keys)
         started = Started(
             request,
@@ -214,11 +229,10 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
         g_alpha: Tensor | None,
     ) -> Gradients:
         """See `StagedRasterizer`."""
-        lifetime = Lifetime()
-        device = g_image.device
+        lifetime, device = Lifetime(), g_image.device
         with torch.cuda.device_of(g_image):
             scratch = self._scratch.lease(lifetime, device)
-            gradients = self.differentiate(
+            return self.differentiate(
                 frame,
                 gaussians,
                 request,
@@ -226,9 +240,8 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
                 g_alpha,
                 scratch,
                 fresh_on(device),
-                zeros_like_all(gaussians),
+                [torch.zeros_like(tensor) for tensor in gaussians.tensors().values()],
             )
-        return gradients
 
     def differentiate(
         self,
@@ -301,9 +314,8 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
         """See ``raster.base.RenderOutput``."""
         lifetime = Lifetime()
         with torch.cuda.device_of(gaussians.means):
-            scratch = self._scratch.lease(lifetime, gaussians.means.device)
-            count = len(gaussians)
-            device = gaussians.means.device
+            count, device = len(gaussians), gaussians.means.device
+            scratch = self._scratch.lease(lifetime, device)
             covered = torch.zeros(count, dtype=torch.int32, device=device)
             sums, distances = torch.zeros(2, count, device=device)
             given = sums if values is None else values.detach().float().contiguous()
@@ -338,46 +350,9 @@ def fresh_on(device: torch.device) -> Allocate:
     return lambda _, shape, dtype: torch.empty(shape, dtype=dtype, device=device)
 
 
-def zeros_like_all(gaussians: Gaussians) -> list[Tensor]:
-    return [torch.zeros_like(tensor) for tensor in gaussians.tensors().values()]
-
-
 def camera_numbers(camera: Camera, device: torch.device) -> Tensor:
     """`CameraNumbers` of ``camera``, [24] float32 on ``device``; the host does not wait."""
     return upload([*map(float, CameraNumbers.of(camera))], device)
-
-
-def _project(
-    memory: Workspace,
-    gaussians: Gaussians,
-    view: Tensor,
-    degree: int,
-    keys: Tensor,
-    radii: Tensor,
-    flags: Tensor,
-) -> Projected:
-    """Project all Gaussians; fill ``keys``, ``radii`` and ``flags``.
-
-    Gaussians are sorted by ``keys``. ``flags`` is 1 if a value is bad.
-    """
-    count = len(gaussians)
-    projected = Projected(
-        memory.take("records", (count + 1) * RECORD.value, torch.float32),
-        memory.take("color_slopes", count * COLOR_SLOPES.value, torch.float32),
-        memory.take("row_counts", count, torch.int32),
-    )
-    launch(project, count + 1, 128)(
-        gaussians=Parameters(**gaussians.detach().tensors()),
-        count=count,
-        camera=view,
-        projected=projected,
-        record_ints=projected.records.view(torch.int32),
-        keys=keys,
-        radii=radii,
-        flags=flags,
-        DEGREE=degree,
-    )
-    return projected
 
 
 def _sum_units(frame: TritonFrame, last_slots: Tensor, rows: Tensor) -> None:

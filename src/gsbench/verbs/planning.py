@@ -1,12 +1,14 @@
-"""``gsbench ablate``: an experiment that shows which part of a densifier makes its gain.
+"""Verbs that plan a study: ``plan`` (how many scenes and seeds show a difference, docs/claims.md)
+and ``ablate`` (an experiment that shows which part of a densifier makes its gain).
 
-A switch turns one part of the densifier off by its ``off`` settings; as configured, all switches
-are on. The class (``SWITCHES``), the YAML file (``switches``) or the command line declares it. A
-switch may have no effect while another is off (the scales of children if nothing is split). Runs
-that differ only in such switches are trained once.
+A switch turns one part of a densifier off by its ``off`` settings; as configured, all switches are
+on. The class (``SWITCHES``), the YAML file (``switches``) or the command line declares it. A switch
+may have no effect while another is off (the scales of children if nothing is split). Runs that
+differ only in such switches are trained once.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from graphlib import CycleError, TopologicalSorter
 from itertools import chain, combinations
 from pathlib import Path
@@ -14,15 +16,41 @@ from typing import Any
 
 import yaml
 
+from gsbench.analysis.comparison import compare
+from gsbench.analysis.notes import texts
+from gsbench.analysis.pairs import BASELINE
+from gsbench.analysis.planning import (
+    UNSURE,
+    Components,
+    Design,
+    designs_like_these,
+    deviation_range,
+    estimate_components,
+    sweep_designs,
+    sweep_power,
+)
+from gsbench.analysis.quantities import Quantity, quantity
+from gsbench.analysis.results import Arm, TrialResult, load_experiment
+from gsbench.analysis.statistics import MIN_SCENES
+from gsbench.analysis.verdicts import interval_of
 from gsbench.app.command import compose_trials
 from gsbench.config.compose import Trial
 from gsbench.config.overrides import value_text
 from gsbench.errors import InputError
 from gsbench.files import own_output, write_text
 from gsbench.launch.batch import check_parts
+from gsbench.runs.commands import ERROR_RATE
+from gsbench.runs.experiments import DEFAULT_METRIC
 from gsbench.settings import Switch, check_values
-from gsbench.verbs.arguments import ArgumentParser, names, path
+from gsbench.verbs.arguments import options_of
 from gsbench.words import command, counted, did_you_mean
+
+MAX_DESIGNS = 5  # combinations of scenes and seeds that `plan` shows
+PLANNED = "Planned for a sweep: each question errs in {:.3g} %; all seeds are judged at once."
+NEW_TRIALS = (
+    "Train all of them with seeds that the pilot does not have (it has {}), under another name: "
+    "what was seen is not declared beforehand."
+)
 
 MAX_SWITCHES = 8
 
@@ -35,19 +63,111 @@ EXPERIMENT = """\
 {content}"""
 
 
+def plan(argv: Sequence[str], runs: Path) -> int:
+    """Run the verb; raises InputError for bad input."""
+    options = options_of("plan", argv)
+    experiment = load_experiment(runs, options.experiment)
+    comparison = compare(experiment, None if options.baseline == BASELINE else options.baseline)
+    trials = comparison.trials
+    questions = [answer.verdict.question for answer in comparison.answers]
+    usual = questions[0].metric if questions else DEFAULT_METRIC
+    metric = quantity(options.metric or usual, trials)
+    if metric.cost:
+        raise InputError(
+            f"--metric {metric.key}: only metrics can be planned for, not counts and times"
+        )
+    difference = options.difference or metric.worthwhile
+    if difference is None:
+        raise InputError(
+            f"--difference is needed: {metric.name} has no usual least difference that matters"
+        )
+    if not comparison.pairs:
+        raise InputError(
+            f"{options.experiment} has one arm, and planning needs pairs of trials of two"
+        )
+    level = ERROR_RATE / options.questions
+    lines = [*comparison.sentences, *texts(comparison.remarks), *experiment.warnings]
+    for baseline, arm in comparison.pairs:
+        try:
+            components = _components(trials, baseline, arm, metric)
+        except InputError as error:
+            if len(comparison.pairs) == 1:  # with several, the others may be planned for
+                raise
+            lines.append(str(error))
+            continue
+        planned = _lines(components, metric, difference, level)
+        lines += [f"{arm} against {baseline}", *planned]
+    seeds = sorted({trial.seed for trial in trials})
+    lines.append(PLANNED.format(100 * level))
+    lines.append(NEW_TRIALS.format(", ".join(map(str, seeds))))
+    print("\n".join(lines))
+    return 0
+
+
+def _components(
+    trials: Sequence[TrialResult], baseline: Arm, arm: Arm, metric: Quantity
+) -> Components:
+    """The variation of two arms' differences; raises InputError if their trials cannot tell."""
+    paired = interval_of(trials, baseline, arm, metric.key).pairs
+    arms = f"{baseline} and {arm}"
+    if not paired.rows:
+        reason = next(map(str, paired.left_out), "they share no scene and seed")
+        raise InputError(f"no trials of {arms} can be paired in {metric.name}: {reason}")
+    try:
+        components = estimate_components([row.arm - row.baseline for row in paired.rows])
+    except InputError as error:
+        raise InputError(f"{arms}: {error}") from None
+    if not components.within:
+        raise InputError(
+            f"{arms}: differences in {metric.name} do not vary between seeds, so nothing tells how "
+            "many would show one"
+        )
+    return components
+
+
+def _lines(components: Components, metric: Quantity, difference: float, level: float) -> list[str]:
+    digits, between = f".{metric.decimals + 1}f", ""
+    if components.between is not None:
+        between = f", between scenes by {components.between:{digits}}"
+    these = sweep_designs(difference, components, level)
+    lines = [
+        f"  differences in {metric.name} vary between seeds by "
+        f"{components.within:{digits}}{between} (from {counted(components.trials, 'pair')} on "
+        f"{counted(components.scenes, 'scene')})",
+        _designs_line("these scenes", these, difference),
+    ]
+    for first in these[:1]:
+        low, high = deviation_range(components)
+        least, most = (
+            100 * sweep_power(first, difference, replace(components, within=end), level)
+            for end in (high, low)
+        )
+        lines.append(
+            "  the pilot knows the variation between seeds only within "
+            f"{low / components.within:.2f} to {high / components.within:.2f} times "
+            f"({100 * UNSURE:.0f} % of pilots): so {first.scenes} × {first.seeds} sees it in "
+            f"{least:.0f} to {most:.0f} of 100 cases"
+        )
+    group = f"scenes like these (from {MIN_SCENES} scenes on)"
+    if components.between is None:
+        return [*lines, f"  for {group}: run pilot trials on a second scene"]
+    return [*lines, _designs_line(group, designs_like_these(difference, components), difference)]
+
+
+def _designs_line(group: str, designs: Sequence[Design], difference: float) -> str:
+    shown = [f"{one.scenes} × {one.seeds} ({one.trials} trials)" for one in designs[:MAX_DESIGNS]]
+    what = f"  to see {difference:g} on {group}, scenes × seeds"
+    return f"{what}: {', '.join(shown) or 'none that can be run'}"
+
+
+# ---- ablation
+
+
 def ablate(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 0; raises InputError for bad input."""
     from gsbench.pipeline.parts import Parts  # here, for a quick answer to --help
 
-    options = ArgumentParser(
-        "ablate",
-        "It writes an experiment with a grid for each combination (docs/claims.md).",
-        {
-            "settings* KEY=VALUE": "as of a sweep: densify=volumetric seed=0,1,2 …",
-            "--switches A,B": ("only these; default: all declared", names, ()),
-            "--out FILE": ("such as conf/experiment/parts.yaml; default: print it", path),
-        },
-    ).parse_args(argv)
+    options = options_of("ablate", argv)
     words = list(options.settings)
     if strange := [word for word in words if word.startswith(("~", "hydra.", "+experiment="))]:
         raise InputError(f"{strange[0]}: ablate writes an experiment, so give it plain KEY=VALUE")
