@@ -1,11 +1,11 @@
 """`gsbench sync` beside a sweep: what it is told, what it sends, and what a bad tracker costs."""
 
-import json
 import logging
 import os
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import psutil
 import pytest
@@ -14,7 +14,7 @@ from gsbench.system.locks import hold
 from gsbench.tracking import Mirror, beside, connect
 from gsbench.tracking.beside import permissions, send_beside
 from gsbench.tracking.sync import MirrorError
-from tests.helpers import write
+from tests.helpers import read_json, write
 from tests.tracking.helpers import (
     STATE,
     begun_trial,
@@ -37,15 +37,10 @@ class Process:
 
     def __init__(self, command, **how):
         self.command, self.how, self.killed = command, how, False
-        self.told, self.stdin, self.returncode = [], self, None
+        file = Path(command[-1].removeprefix("--beside="))
+        self.told, self.stdin, self.returncode = [read_json(file)], self, None
         self.made.append(self)
         how["stderr"].write(self.said)
-
-    def write(self, content):
-        self.told.append(json.loads(content))
-
-    def flush(self):
-        pass
 
     def poll(self):
         return self.returncode
@@ -89,11 +84,12 @@ def test_one_process_is_told_which_trials_are_to_be_sent(processes, tmp_path):
             [False, True, False],
             [False] * 3,
         ]
-        assert (told["pause"], told["allowed"]) == (0.2, [])
+        assert (told["pause"], told["patience"], told["allowed"]) == (0.2, 2.5, [])
     (process,) = processes
     assert process.told[1:] == ["the end"]
     assert process.how["env"]["GSBENCH_RUNS"] == str(tmp_path)
-    assert process.command[1:] == ["-P", "-m", "gsbench", "sync", "--beside=2.5"]
+    assert process.command[1:-1] == ["-P", "-m", "gsbench", "sync"]
+    assert not Path(process.command[-1].removeprefix("--beside=")).exists()
 
 
 @pytest.mark.parametrize("soon", [True, False])
@@ -191,9 +187,10 @@ def sent(monkeypatch):
     return found
 
 
-def told(folders, pause=60.0):
+def told(folders, pause=60.0, patience=1e6):
     trials = {str(folder): beside._stamps(folder) for folder in folders}
-    return json.dumps({"trials": trials, "pause": pause, "allowed": []}) + "\n"
+    content = {"trials": trials, "pause": pause, "patience": patience, "allowed": []}
+    return write(folders[0].parents[4] / "told.json", content)
 
 
 def wait_until(condition):
@@ -203,14 +200,10 @@ def wait_until(condition):
         time.sleep(0.01)
 
 
-FOR_EVER = 1e6
-
-
 def test_a_trial_is_sent_from_its_beginning_to_its_end_and_at_once_when_it_ends(sent, tmp_path):
     trials = [tracked(tmp_path, seed) for seed in range(3)]
 
     def lines():
-        yield told([one.folder for one in trials])
         for one, seed in zip(trials, "01", strict=False):
             with hold(one.folder / ".lock", "a trial"):
                 write(one.folder / "config.yaml", one.values)
@@ -219,10 +212,11 @@ def test_a_trial_is_sent_from_its_beginning_to_its_end_and_at_once_when_it_ends(
                 time.sleep(0.1)  # as long as it works, it goes on
             wait_until(lambda seed=seed: sent.count([seed]) == 2)
         write(trials[2].folder / "config.yaml", trials[2].values)
+        yield ""
 
     for one in trials:
         one.folder.mkdir(parents=True)
-    send_beside(lines(), FOR_EVER)
+    send_beside(told([one.folder for one in trials]), lines())
     assert sent[:4] == [["0"], ["0"], ["1"], ["1"]]
     assert {*map(tuple, sent[4:])} == {("2",)}
 
@@ -231,11 +225,11 @@ def test_trials_are_sent_every_while_although_none_ends(sent, tmp_path):
     one = tracked(tmp_path)
 
     def lines():
-        yield told([one.folder], pause=0.02)
         write(one.folder / "config.yaml", one.values)
         wait_until(lambda: sent.count(["0"]) > 2)
+        yield ""
 
-    send_beside(lines(), FOR_EVER)
+    send_beside(told([one.folder], pause=0.02), lines())
 
 
 def test_a_trial_that_runs_again_is_sent_although_it_has_results_of_an_earlier_run(sent, tmp_path):
@@ -244,13 +238,29 @@ def test_a_trial_that_runs_again_is_sent_although_it_has_results_of_an_earlier_r
     earlier = told([folder])
 
     def lines():
-        yield earlier
         time.sleep(0.1)
         assert sent == []
         os.utime(folder / "config.yaml")
+        yield ""
 
-    send_beside(lines(), FOR_EVER)
+    send_beside(earlier, lines())
     assert {*map(tuple, sent)} == {("0",)}
+
+
+def test_a_trial_that_failed_and_is_run_again_by_another_sweep_is_sent_again(sent, tmp_path):
+    folder, values = begun_trial(tmp_path)
+
+    def lines():
+        write(folder / "failed.json", "{}")
+        wait_until(lambda: sent == [["0"]])
+        time.sleep(0.1)
+        assert sent == [["0"]]
+        (folder / "failed.json").unlink()
+        write_trial(folder, values)
+        wait_until(lambda: len(sent) > 1)
+        yield ""
+
+    send_beside(told([folder]), lines())
 
 
 def test_the_error_of_the_last_send_is_raised_and_those_before_are_not(monkeypatch, tmp_path):
@@ -264,11 +274,11 @@ def test_the_error_of_the_last_send_is_raised_and_those_before_are_not(monkeypat
     monkeypatch.setattr(beside, "SECONDS_BETWEEN_LOOKS", 0.01)
 
     def lines():
-        yield told([tracked(tmp_path).folder], pause=0.02)
         wait_until(lambda: len(answers) >= 2)
+        yield ""
 
     with pytest.raises(MirrorError) as error:
-        send_beside(lines(), FOR_EVER)
+        send_beside(told([tracked(tmp_path).folder], pause=0.02), lines())
     assert str(error.value) == f"no {len(answers)}"
 
 
@@ -321,12 +331,11 @@ def test_no_process_is_left_by_a_tracker_that_never_answers(tmp_path, caplog):
 @pytest.mark.slow
 def test_a_process_whose_sweep_was_killed_ends_soon_though_its_tracker_hangs(tmp_path):
     folder, _ = begun_trial(tmp_path)
-    code = "import sys, time; from gsbench.tracking import beside; "
-    code += "beside.sync = lambda *given: time.sleep(600); beside.send_beside(sys.stdin, 0.5)"
-    words = [sys.executable, "-c", code]
+    code = "import pathlib, sys, time; from gsbench.tracking import beside; "
+    code += "beside.sync = lambda *given: time.sleep(600); "
+    code += "beside.send_beside(pathlib.Path(sys.argv[1]), sys.stdin)"
+    words = [sys.executable, "-c", code, str(told([folder], pause=0.1, patience=0.5))]
     with subprocess.Popen(words, env=child_environment(), stdin=subprocess.PIPE) as child:
-        child.stdin.write(told([folder], pause=0.1).encode())
-        child.stdin.flush()
         with pytest.raises(subprocess.TimeoutExpired):
             child.wait(10)
         child.stdin.close()

@@ -2,8 +2,8 @@
 
 Why a process: a tracker's client may hang in a socket, a lock or a C library for any time, and
 crash the interpreter when it exits. A process can be killed, and harms no trial. It lives as long
-as the sweep, because importing MLflow takes 4 CPU-seconds, and a send a tenth of one. It looks at
-the trials' files, so it is told of them only once.
+as the sweep, because importing MLflow takes 4 CPU-seconds, and a send a tenth of one. A file tells
+it of the trials, whose files it looks at; its standard input ends with the sweep.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
-from gsbench.parsing import one_line
+from gsbench.parsing import one_line, read_json
 from gsbench.runs.layout import CONFIG, FAILED, RESULTS
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.isolate import describe_exit
@@ -49,6 +49,7 @@ class Mirror:
 
     _process: subprocess.Popen[bytes] | None = None
     _said: IO[bytes]  # the process's error output
+    _file = Path()  # which tells the process of the trials
     _fault = ""
 
     def __init__(self, trials: Sequence[Trial]) -> None:
@@ -58,9 +59,10 @@ class Mirror:
         told = {
             "trials": {str(trial.folder): _stamps(trial.folder) for trial in self._trials},
             "pause": min((one["flush_seconds"] for one in options), default=0.0),
+            "patience": self._patience,
             "allowed": permissions(trial.values for trial in self._trials),
         }
-        self._told = f"{json.dumps(told)}\n".encode()
+        self._told = json.dumps(told)
 
     def __enter__(self) -> None:
         self._ended = threading.Event()
@@ -79,8 +81,11 @@ class Mirror:
             return
         try:
             self._said = tempfile.TemporaryFile()  # noqa: SIM115 - until the process ends
+            with tempfile.NamedTemporaryFile("w", prefix="gsbench-", delete=False) as file:
+                file.write(self._told)
+            self._file = Path(file.name)
             self._process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "gsbench", "sync", f"--beside={self._patience}"],
+                [sys.executable, "-P", "-m", "gsbench", "sync", f"--beside={self._file}"],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.DEVNULL,
                 stderr=self._said,
@@ -88,9 +93,7 @@ class Mirror:
                 # Ctrl-C must reach only the trials' process, which then ends this one
                 start_new_session=True,
             )
-            self._process.stdin.write(self._told)  # type: ignore[union-attr]
-            self._process.stdin.flush()  # type: ignore[union-attr]
-        except OSError as error:  # it could not start, or has just crashed
+        except OSError as error:
             self._fault = str(error)
 
     def __exit__(self, kind: type[BaseException] | None, error: object, trace: object) -> None:
@@ -98,9 +101,10 @@ class Mirror:
             return
         self._ended.set()
         self._keeper.join()
-        self._start()
+        is_stopped = kind is not None and not issubclass(kind, Exception)
+        if not is_stopped:
+            self._start()
         if (process := self._process) is not None:
-            is_stopped = kind is not None and not issubclass(kind, Exception)
             try:
                 with suppress(BrokenPipeError):
                     process.stdin.close()  # type: ignore[union-attr]
@@ -111,6 +115,7 @@ class Mirror:
             finally:  # also where a signal interrupts the wait
                 process.kill()
                 process.wait()
+                self._file.unlink(missing_ok=True)  # if it was killed before it read this
         if self._fault:
             log.warning(
                 "tracking: %s; the files are complete, `gsbench sync` sends them later", self._fault
@@ -125,19 +130,21 @@ class Mirror:
         return one_line(lines[-1]).removeprefix("gsbench: ") if code else ""
 
 
-def send_beside(lines: Iterator[str], patience: float) -> None:
-    """Send the trials that the first of ``lines`` names, as `Mirror` writes it, until these end.
+def send_beside(file: Path, lines: Iterable[str]) -> None:
+    """Send the trials that the file names, as `Mirror` writes it, until ``lines`` end.
 
-    Then all are sent once more; if that takes longer than ``patience`` seconds, the process ends.
-    So it ends soon after the sweep, even if that was killed. Raises the error of the last send.
+    Then all are sent once more; if that takes longer than the file's ``patience``, the process
+    ends. So it ends soon after the sweep, even if that was killed. The file is removed. Raises the
+    error of the last send.
     """
-    told, stop = json.loads(next(lines)), threading.Event()
+    told, stop = read_json(file), threading.Event()
+    file.unlink()
 
     def end() -> None:
         for _ in lines:
             pass
         stop.set()
-        time.sleep(min(patience, threading.TIMEOUT_MAX))
+        time.sleep(min(told["patience"], threading.TIMEOUT_MAX))
         os._exit(1)
 
     threading.Thread(target=end, daemon=True).start()
@@ -152,9 +159,10 @@ def send_beside(lines: Iterator[str], patience: float) -> None:
         # while the tracker refuses, a beginning or an end makes no further tries
         is_new = not fault and (ended or not set(begun) <= set(shown))
         if is_last or is_new or time.monotonic() - sent >= told["pause"]:
-            sent, shown, fault = time.monotonic(), begun, _send(begun, allowed)
+            shown, fault = begun, _send(begun, allowed)
+            sent = time.monotonic()
             for folder in () if fault else ended:
-                del left[folder]
+                left[folder] = now[folder]  # another sweep may run it again
     if fault is not None:
         raise fault
 

@@ -157,7 +157,7 @@ def sync(argv: Sequence[str], runs: Path) -> int:
     homes = [experiment_home(runs, name) for name in names]
     try:
         if options.beside is not None:
-            send_beside(sys.stdin, options.beside)
+            send_beside(options.beside, sys.stdin)
             return 0
         places = [place for home in homes for place in sorted(trial_folders(home))]
         folders = [TrialFolder(Path(place)) for place in places]
