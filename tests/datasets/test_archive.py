@@ -229,3 +229,19 @@ def test_a_file_that_changes_between_requests_is_detected(served, tmp_path):
         os.truncate(served.folder / "file.zip", 1000)
         with refusal("416"):
             with_retries(lambda: extract_only(archive, tmp_path / "out", 1), url, PATIENT)
+
+
+def test_offsets_beyond_four_gigabytes_are_read(tmp_path):
+    """The real archive has 12.5 GB and needs zip64; a sparse file takes no space."""
+    file = tmp_path / "large.zip"
+    with file.open("wb") as stream:
+        stream.truncate(5 << 30)
+        stream.seek(5 << 30)
+        with zipfile.ZipFile(stream, "w") as archive:
+            archive.writestr("garden/a.JPG", b"far out")
+    with serve(tmp_path) as server, open_archive_at(f"{server.url}/large.zip", PATIENT) as remote:
+        assert remote.getinfo("garden/a.JPG").header_offset == 5 << 30
+        assert remote.read("garden/a.JPG") == b"far out"
+        assert server.sent < 1_000_000
+    with open_archive_at(str(file), PATIENT) as local:
+        assert local.read("garden/a.JPG") == b"far out"

@@ -88,7 +88,7 @@ def test_dataset_needs_points_and_a_model(courtyard, bare_photos, tmp_path):
     with refusal("has no points: use init=sfm"):
         Dataset().run(courtyard, tmp_path)
     for made in (Dataset(), Random()):
-        with refusal("no COLMAP model came with these photos"):
+        with refusal(f"init={made.name} needs cameras"):
             made.run(bare_photos, tmp_path)
 
 
@@ -106,6 +106,8 @@ def test_random_draws_points_and_colours_around_the_training_cameras_alone(tmp_p
     assert len(np.unique(clouds[0].colors)) == 256
     assert_array_equal(clouds[0].points, clouds[1].points)
     assert not np.allclose(clouds[0].points, clouds[2].points)
+    with refusal("training cameras of scene hand are all at one place"):
+        Random().cloud(capture, model_of(np.zeros((4, 3))))
 
 
 def test_random_needs_cameras(bare_photos, courtyard, tmp_path):

@@ -267,6 +267,17 @@ def test_stored_views_that_were_changed_are_prepared_again(name, make_scene, tmp
     assert_array_equal(first.train[0].image, again.train[0].image)
 
 
+def test_a_photograph_that_changed_its_size_since_it_was_prepared_is_refused(make_scene, tmp_path):
+    capture, store = read_colmap(make_scene()), tmp_path / "cache"
+    load_scene(capture, capture.model, Store(store))
+    file = capture.images / capture.train_names[0]
+    with Image.open(file) as image:
+        smaller = image.resize((image.width // 2, image.height // 2))
+    smaller.save(file)
+    with refusal("changed after it was prepared: run again"):
+        load_scene(capture, capture.model, Store(store))
+
+
 def test_centred_moves_the_principal_point_only(make_scene, tmp_path):
     capture = read_colmap(make_scene(params=[50, 51, 18, 16]))
     used = loaded(capture, tmp_path)

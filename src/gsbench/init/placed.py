@@ -60,6 +60,11 @@ class PlacedCloud(Initializer):
         work_dir: Path | None = None,
     ) -> InitReport:
         """Write model and report without a ``work_dir``. Raises ``InputError`` without cameras."""
+        if reference is None and capture.model is None:
+            raise InputError(
+                f"init={self.name} needs cameras and scene {capture.name} came without: make them "
+                "with init=sfm first"
+            )
         output_dir.mkdir(parents=True, exist_ok=True)
         return run_isolated(self.build, capture, output_dir, reference, what=self.name)
 
@@ -161,11 +166,17 @@ class Random(PlacedCloud):
     def cloud(self, capture: Capture, model: pycolmap.Reconstruction) -> PointCloud:
         from gsbench.init.colmap.models import training_centers, training_extent
 
+        # Equal points would make the search for neighbours before training quadratic.
+        extent = training_extent(model, capture)
+        if extent == 0:
+            raise InputError(
+                f"init=random: the training cameras of scene {capture.name} are all at one place"
+            )
         generator = np.random.default_rng(self.seed)
         center = training_centers(model, capture).mean(axis=0)
         cube = generator.uniform(-1.0, 1.0, (self.count, 3))
         colors = generator.integers(0, 256, (self.count, 3), dtype=np.uint8)
-        return PointCloud(center + self.size * training_extent(model, capture) * cube, colors)
+        return PointCloud(center + self.size * extent * cube, colors)
 
 
 def points_in_view(

@@ -128,6 +128,8 @@ def load_scene(
         }
         if DEPTH in pictures:
             pictures[DEPTH] *= np.float32(capture.normalization.scale)
+        if image.shape[:2] != (camera.height, camera.width):
+            raise InputError(f"{folder}: {name} changed after it was prepared: run again")
         if principal_point == "centred":
             camera = replace(camera, cx=camera.width / 2, cy=camera.height / 2)
         mask = None
@@ -308,6 +310,8 @@ def prepare_chunk(images: Sequence[ImageToPrepare]) -> list[Camera]:
 def prepare_image(image: ImageToPrepare) -> Camera:
     """Read, undistort if needed, shrink and write one image; returns its final camera."""
     pixels = read_image(image.source)  # [H, W, 3]
+    if pixels.shape[:2] != (image.camera.height, image.camera.width):
+        raise InputError(f"{image.source}: the image changed its size while it was read: run again")
     if image.camera.distorted:
         pixels, camera = undistort(pixels, image.camera)
     else:

@@ -58,9 +58,10 @@ def keep_training_points(
     Positions do not change. Colours are read again, from the photographs in the folder ``images``.
     """
     before = model.num_points3D()
+    kept = set(names)
     for name, image in posed_images(model).items():
-        for index, seen in enumerate(image.points2D):
-            if name not in names and seen.has_point3D():
+        for index, seen in enumerate(image.points2D if name not in kept else ()):
+            if seen.has_point3D():
                 model.delete_observation(image.image_id, index)  # and its point, if one is left
     for point_id, point in list(model.points3D.items()):
         # an image may see a point twice
