@@ -78,13 +78,15 @@ def test_results_settings_and_views_are_read_back(tmp_path):
     assert compare(back).sentences == compare(there).sentences
 
 
-def test_an_archive_tells_that_an_earlier_gsbench_was_asked(tmp_path):
+@pytest.mark.parametrize("name", ["declared.jsonl", "ledger.jsonl"])
+def test_an_archive_tells_that_an_earlier_gsbench_was_asked_but_not_what(tmp_path, name):
     write_runs(tmp_path / "runs")
-    (tmp_path / "runs/exp/declared.jsonl").write_text("{}")
+    (tmp_path / "runs/exp" / name).write_text('{"words": ["tracking.uri=http://me:pw@host"]}')
     file = tmp_path / "exp.zip"
     write_archive(loaded(tmp_path / "runs"), file)
+    assert not any(b"me:pw" in content for content in members(file).values())
     (answer,) = compare(unpack_archive(file, tmp_path / "other")).answers
-    assert "declared.jsonl" in answer.sentence
+    assert name in answer.sentence
 
 
 def test_an_archive_is_a_runs_folder_with_a_list_of_checksums(tmp_path):

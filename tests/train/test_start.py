@@ -71,6 +71,17 @@ def test_a_correct_cloud_is_in_view_agrees_and_causes_no_warning(scene, cloud, c
     assert not caplog.records
 
 
+def test_colour_agreement_is_relative_to_all_pairs_of_points(scene, cloud):
+    points, colors = cloud
+    swapped = colors[:, ::-1]
+    facts, _ = check_start(points, swapped, scene)
+    # The photographs show a point's own colour up to half a pixel, so these differences are close
+    # to those that are measured.
+    own = np.abs(swapped.astype(int) - colors).mean()
+    pairs = np.abs(swapped[:, None].astype(int) - colors[None]).mean()
+    assert facts.color_agreement == pytest.approx(1 - own / pairs, abs=0.05)
+
+
 @pytest.mark.parametrize("level", [0, 1, 128, 255])
 def test_a_cloud_of_one_colour_causes_a_warning(scene, cloud, level):
     points, colors = cloud

@@ -25,8 +25,8 @@ from gsbench.runs.layout import DECLARED, LEDGER, TUNING
 
 # why nothing is tested where an earlier gsbench wrote what was asked, which is not read
 EARLIER = {
-    LEDGER: "the ledger of an earlier gsbench decided",
     DECLARED: "an earlier gsbench wrote down what was asked",
+    LEDGER: "the ledger of an earlier gsbench decided",
 }
 
 

@@ -74,9 +74,9 @@ def write_archive(
     files, kept, home = dict[str, bytes](), list[TrialResult](), experiment.folder
     if (home / COMMANDS).is_file():
         files[f"{home.name}/{COMMANDS}"] = _shared_commands(home)
-    for name in ASKED_EARLIER:  # not read, but a reader must see that something was asked
-        if (home / name).is_file():
-            files[f"{home.name}/{name}"] = read_bytes(home / name)
+    for name in ASKED_EARLIER:
+        if (home / name).is_file():  # that something was asked is told, not what: it may be private
+            files[f"{home.name}/{name}"] = b""
     for trial in (*experiment.trials, *experiment.older):
         try:
             files |= _of_trial(trial, pictures)
