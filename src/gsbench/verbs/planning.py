@@ -7,12 +7,14 @@ may have no effect while another is off (the scales of children if nothing is sp
 differ only in such switches are trained once.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from graphlib import CycleError, TopologicalSorter
 from itertools import chain, combinations
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import yaml
 
@@ -33,17 +35,16 @@ from gsbench.analysis.quantities import Quantity, quantity
 from gsbench.analysis.results import Arm, TrialResult, load_experiment
 from gsbench.analysis.statistics import MIN_SCENES
 from gsbench.analysis.verdicts import interval_of
-from gsbench.app.command import compose_trials
-from gsbench.config.compose import Trial
-from gsbench.config.overrides import value_text
 from gsbench.errors import InputError
 from gsbench.files import own_output, write_text
-from gsbench.launch.batch import check_parts
 from gsbench.runs.commands import ERROR_RATE
 from gsbench.runs.experiments import DEFAULT_METRIC
 from gsbench.settings import Switch, check_values
 from gsbench.verbs.arguments import options_of
 from gsbench.words import command, counted, did_you_mean
+
+if TYPE_CHECKING:
+    from gsbench.config.compose import Trial
 
 MAX_DESIGNS = 5  # combinations of scenes and seeds that `plan` shows
 PLANNED = "Planned for a sweep: each question errs in {:.3g} %; all seeds are judged at once."
@@ -165,9 +166,13 @@ def _designs_line(group: str, designs: Sequence[Design], difference: float) -> s
 
 def ablate(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 0; raises InputError for bad input."""
-    from gsbench.pipeline.parts import Parts  # here, for a quick answer to --help
-
     options = options_of("ablate", argv)
+    # here, since `plan` needs no Hydra and --help no torch
+    from gsbench.app.command import compose_trials
+    from gsbench.config.overrides import value_text
+    from gsbench.launch.batch import check_parts
+    from gsbench.pipeline.parts import Parts
+
     words = list(options.settings)
     if strange := [word for word in words if word.startswith(("~", "hydra.", "+experiment="))]:
         raise InputError(f"{strange[0]}: ablate writes an experiment, so give it plain KEY=VALUE")

@@ -212,11 +212,10 @@ def recompose(
 
 def declare(argv: Sequence[str], runs: Path) -> int:
     """Run the verb; raises InputError for a wrong sweep."""
-    options = options_of("declare", argv)
+    options_of("declare", argv)
     from gsbench.app.command import compose_trials  # here, since it loads Hydra
 
-    folders = [f"--config-dir={folder}" for folder in options.config_dir]
-    words, _, _ = parse([*folders, *options.settings])
+    words, _, _ = parse(argv)  # the words of a command
     trials = compose_trials(words, multirun=True)
     if any(trial.values["launch"]["stop_when_decided"] for trial in trials):
         check_looks(trials, planned_rows(trials))
