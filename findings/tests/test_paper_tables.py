@@ -49,7 +49,9 @@ def test_what_lies_beside_the_archive_has_its_trials(experiment):
     assert rows.keys() == results.keys() == regions_of(f"{experiment}_regions.npz").keys()
     for trial, row in rows.items():
         assert int(row["gaussians"]) == results[trial]["num_gaussians"]
-        assert 0.5 < float(row["share_below_threshold"]) < 1
+        # Free growth is stopped by its limit, with many volumes that eq. 7 would still split.
+        least = 0.9 if "-adc-" in trial else 0.2
+        assert least < float(row["share_below_threshold"]) < 1
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
