@@ -8,8 +8,9 @@
 the experiment is there. It then trains one after the other what has no result yet, and can be
 killed and started again at any time. ``save`` writes the archive, with all trials so far, and
 beside it what archives lack and a machine that is gone cannot tell: ``EXPERIMENT.csv`` (CPU time,
-the share of volumes below V_th) and ``EXPERIMENT_regions.npz`` (the mean squared errors of regions
-of 32 px by trial and view, `gsbench.analysis.images.region_errors`).
+the share of volumes below V_th) and, where the archive has no ``regions.json``,
+``EXPERIMENT_regions.npz`` (the mean squared errors of regions of 32 px by trial and view,
+`gsbench.analysis.images.region_errors`).
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from PIL import Image
 
 from gsbench.analysis.images import region_errors
 from gsbench.claims.archive import unpack_archive
+from gsbench.runs.layout import REGIONS
 
 FINDINGS = Path(__file__).resolve().parents[1]
 LINE = re.compile(r"^(\w+) +(?P<scene>\S+?)/\S+-(?P<densify>\S+) seed (?P<seed>\d+) \(\w+\)")
@@ -133,13 +135,15 @@ def save(clone: Path, experiment: str) -> None:
             count, share = share_below(model)
             values = (name, str(spent.get(name, "")), str(count), f"{share:.6f}")
             rows[name] = dict(zip(FIELDS, values, strict=True))
-            of_views = regions_of(results.parent)
-            regions |= {f"{name}/{view}": errors for view, errors in of_views.items()}
+            if not (results.parent / REGIONS).exists():
+                of_views = regions_of(results.parent)
+                regions |= {f"{name}/{view}": errors for view, errors in of_views.items()}
     with table.open("w", newline="") as stream:
         writer = csv.DictWriter(stream, FIELDS, lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows.values())
-    np.savez_compressed(maps, **regions)
+    if regions:
+        np.savez_compressed(maps, **regions)
     PAGE.write_text(with_state(PAGE.read_text(encoding="utf-8"), experiment), encoding="utf-8")
 
 
