@@ -75,7 +75,6 @@ READS_ITSELF = {
     "init/base.py",
     "runs/keys.py",  # text of this very process
     "runs/package_code.py",  # tables of the package
-    "tracking/beside.py",  # text of its own processes
     "system/install.py",  # files that pip wrote about the package
     "claims/archive.py",  # archives, which anybody may have made
     "config/schema.py",  # of the package

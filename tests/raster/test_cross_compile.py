@@ -23,7 +23,14 @@ TARGETS = {  # triple, processor
     "apple": ("arm64-apple-macosx", "apple-m1"),
 }
 # They only count and move numbers.
-FREE_OF_VECTORS = {"sort_by_depth", "start_tiles", "fill_shards", "balance_tiles", "pair_shards"}
+FREE_OF_VECTORS = {
+    "sort_by_depth",
+    "start_tiles",
+    "fill_shards",
+    "balance_tiles",
+    "pair_shards",
+    "place_rows",
+}
 
 
 @cache
