@@ -179,9 +179,9 @@ def hold_out(
     """Divide sorted ``names`` by ``rule``.
 
     ``lists`` are the resolved names of the training and the test list, ``cameras`` those of
-    `arrange_cameras` by name, for sectors. With ``rule.validation``,
-    the test views are dropped and the training views are divided again. Raises InputError if no
-    view is left for training or for testing.
+    `arrange_cameras` by name, for sectors. With ``rule.validation``, the test views are dropped and
+    the training views are divided again. Raises InputError if no view is left for training or for
+    testing.
     """
     train, test, description = _divide(names, rule, lists, cameras)
     if not rule.validation:

@@ -49,7 +49,7 @@ class Mirror:
 
     _process: subprocess.Popen[bytes] | None = None
     _said: IO[bytes]  # the process's error output
-    _file = Path()  # which tells the process of the trials
+    _file: Path | None = None  # which tells the process of the trials
     _fault = ""
 
     def __init__(self, trials: Sequence[Trial]) -> None:
@@ -81,9 +81,10 @@ class Mirror:
             return
         try:
             self._said = tempfile.TemporaryFile()  # noqa: SIM115 - until the process ends
-            with tempfile.NamedTemporaryFile("w", prefix="gsbench-", delete=False) as file:
-                file.write(self._told)
-            self._file = Path(file.name)
+            if self._file is None:
+                with tempfile.NamedTemporaryFile("w", prefix="gsbench-", delete=False) as file:
+                    self._file = Path(file.name)
+                    file.write(self._told)
             self._process = subprocess.Popen(
                 [sys.executable, "-P", "-m", "gsbench", "sync", f"--beside={self._file}"],
                 stdin=subprocess.PIPE,
@@ -104,18 +105,21 @@ class Mirror:
         is_stopped = kind is not None and not issubclass(kind, Exception)
         if not is_stopped:
             self._start()
-        if (process := self._process) is not None:
-            try:
+        process = self._process
+        try:
+            if process is not None:
                 with suppress(BrokenPipeError):
                     process.stdin.close()  # type: ignore[union-attr]
                 process.wait(min(self._patience, SECONDS_TO_STOP) if is_stopped else self._patience)
                 self._fault = self._reason(process.returncode)
-            except subprocess.TimeoutExpired:
-                self._fault = "the tracker is slow"
-            finally:  # also where a signal interrupts the wait
+        except subprocess.TimeoutExpired:
+            self._fault = "the tracker is slow"
+        finally:  # also where a signal interrupts the wait
+            if process is not None:
                 process.kill()
                 process.wait()
-                self._file.unlink(missing_ok=True)  # if it was killed before it read this
+            if self._file is not None:
+                self._file.unlink(missing_ok=True)
         if self._fault:
             log.warning(
                 "tracking: %s; the files are complete, `gsbench sync` sends them later", self._fault
@@ -134,15 +138,15 @@ def send_beside(file: Path, lines: Iterable[str]) -> None:
     """Send the trials that the file names, as `Mirror` writes it, until ``lines`` end.
 
     Then all are sent once more; if that takes longer than the file's ``patience``, the process
-    ends. So it ends soon after the sweep, even if that was killed. The file is removed. Raises the
-    error of the last send.
+    ends. So it ends soon after the sweep, even if that was killed, and removes the file then.
+    Raises the error of the last send.
     """
     told, stop = read_json(file), threading.Event()
-    file.unlink()
 
     def end() -> None:
         for _ in lines:
             pass
+        file.unlink(missing_ok=True)
         stop.set()
         time.sleep(min(told["patience"], threading.TIMEOUT_MAX))
         os._exit(1)
@@ -189,9 +193,9 @@ def permissions(configurations: Iterator[dict[str, Any]]) -> list[str]:
 
 
 def _stamps(folder: Path) -> list[int]:
-    """When the trial's files that show its beginning and its end were changed; 0 without one.
+    """The times of change of the files that show a trial's beginning and its end; 0 without one.
 
-    The times are only compared with each other, since a file system may have a clock of its own.
+    They are only compared with each other, since a file system may have a clock of its own.
     """
     stamps = []
     for name in (CONFIG, RESULTS, FAILED):

@@ -112,7 +112,6 @@ _count = number(Annotated[int, Interval(ge=1, le=1_000_000_000)])
 READERS: dict[str, Callable[[str], Any]] = {
     "text": str,
     "int": int,
-    "float": float,
     "path": path,
     "names": names,
     "condition": _condition,

@@ -153,12 +153,12 @@ def sync(argv: Sequence[str], runs: Path) -> int:
     if unread := [word for word in words if key_of(word) != PERMISSIONS]:
         raise InputError(f"sync reads only {PERMISSIONS}, not {unread[0]}")
     allow_modules(allowed := typed_permissions(words))
-    names = [experiment] if experiment else list_experiments(runs)
-    homes = [experiment_home(runs, name) for name in names]
     try:
         if options.beside is not None:
             send_beside(options.beside, sys.stdin)
             return 0
+        names = [experiment] if experiment else list_experiments(runs)
+        homes = [experiment_home(runs, name) for name in names]
         places = [place for home in homes for place in sorted(trial_folders(home))]
         folders = [TrialFolder(Path(place)) for place in places]
         for line in send_missing(folders, options.uri, allowed):
