@@ -1,5 +1,6 @@
 """Fixtures that all tests share."""
 
+import gc
 import importlib.util
 import os
 import subprocess
@@ -54,6 +55,13 @@ def pytest_make_collect_report(collector):
     name = collector.nodeid.replace("/", ".")
     with FileLock(common / f"{name}.lock", poll_interval=0.01):
         return (yield)
+
+
+def pytest_collection_finish():
+    """Collect garbage less often, and not in what imports have made: it took a sixth of the time."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(10_000)
 
 
 @pytest.fixture(scope="session")
