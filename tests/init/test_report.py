@@ -16,10 +16,10 @@ from gsbench.init.colmap.models import (
     align_poses,
     common_poses,
     compare_poses,
-    posed_images,
     training_extent,
 )
 from gsbench.init.report import make_report, measure_gauge, write_result
+from gsbench.scene.colmap import posed_images
 from gsbench.scene.types import Capture
 from tests.init.models import add_point, camera_at, model_with
 
