@@ -254,7 +254,7 @@ def pixels_of_view(picture: Pixels, lens: CameraModel, view: Camera, source: Pat
         return resized(picture, view.width, view.height)
     middles = [np.arange(side, dtype=np.float64) + 0.5 for side in (view.width, view.height)]
     pixels = grid(*middles)  # [H W, 2]
-    rays = rays_through(pixels, view.fx, view.fy, view.cx, view.cy)
+    rays = rays_through(pixels, *view.params)
     seen: Any = as_colmap(lens).img_from_cam(rays)  # [H W, 2] px
     places = seen / (lens.width, lens.height)  # in 0..1
     inside = ((places >= 0) & (places < 1)).all(axis=1)  # False for a ray without a place

@@ -171,8 +171,7 @@ def write_model(folder: Path, cameras: Mapping[str, Camera], cloud: Cloud | None
     """
     frames = {}
     for name, camera in cameras.items():
-        params = (camera.fx, camera.fy, camera.cx, camera.cy)
-        pinhole = CameraModel("PINHOLE", camera.width, camera.height, params)
+        pinhole = CameraModel("PINHOLE", camera.width, camera.height, camera.params)
         frames[name] = pinhole, camera.rotation, camera.translation
     write_frames(folder, frames, cloud)
 

@@ -135,5 +135,6 @@ def same_pixels(one: View, other: View) -> bool:
         return False
     both = np.ones(one.image.shape[:2], bool)
     for mask in (one.mask, other.mask):
-        both = both if mask is None else both & mask
+        if mask is not None:
+            both &= mask
     return bool(both.any()) and np.array_equal(one.image[both], other.image[both])

@@ -52,10 +52,10 @@ class Camera:
             raise ValueError(
                 f"camera: width and height must be at least 1 px, got {self.width}x{self.height}"
             )
-        in_px = self.fx, self.fy, self.cx, self.cy
-        if not np.isfinite(in_px).all() or min(self.fx, self.fy) <= 0:
+        if not np.isfinite(self.params).all() or min(self.fx, self.fy) <= 0:
             raise ValueError(
-                f"camera: fx, fy, cx and cy must be finite, and fx and fy positive, got {in_px}"
+                "camera: fx, fy, cx and cy must be finite, and fx and fy positive, got "
+                f"{self.params}"
             )
         rotation = np.asarray(self.rotation, dtype=np.float64)
         translation = np.asarray(self.translation, dtype=np.float64)
@@ -66,6 +66,11 @@ class Camera:
             raise ValueError("camera: translation must be three finite numbers")
         object.__setattr__(self, "rotation", rotation)
         object.__setattr__(self, "translation", translation)
+
+    @property
+    def params(self) -> tuple[float, ...]:
+        """The intrinsics in px, in the order of COLMAP's PINHOLE."""
+        return self.fx, self.fy, self.cx, self.cy
 
     @property
     def center(self) -> Array:

@@ -82,5 +82,5 @@ def render_view(layout: Layout, camera: Camera, seed: int) -> ByteArray:
     """Render one photograph, [H, W, 3] uint8 sRGB; a matt surface has one colour in all views."""
     image = np.empty((camera.height, camera.width, 3), dtype=np.uint8)
     pose = np.ascontiguousarray(camera.rotation), np.ascontiguousarray(camera.center)
-    render(layout, *pose, (camera.fx, camera.fy, camera.cx, camera.cy), image, seed)
+    render(layout, *pose, camera.params, image, seed)
     return image
