@@ -5,7 +5,7 @@ import logging
 import pytest
 
 from gsbench.events import RefineEvent
-from gsbench.train.growth import BLOCKED_ITERATIONS, RUNAWAY_ROUNDS, GrowthWatch
+from gsbench.train.records import BLOCKED_ITERATIONS, RUNAWAY_ROUNDS, GrowthWatch
 
 
 def warnings(caplog, events):

@@ -10,13 +10,13 @@ from gsbench.analysis.differences import ingredients
 from gsbench.densify import EdgeAware
 from gsbench.runs.config_hash import config_hash
 from gsbench.scene.types import View
-from gsbench.train.resolution import (
+from gsbench.train.views import (
     Resolution,
     ScaledViews,
     ScaleSchedule,
+    Targets,
     scale_schedule,
 )
-from gsbench.train.views import Targets
 from tests.config.test_schema import composed
 from tests.train.conftest import orbit_camera
 from tests.train.lab import CPU, EVENTS, METRICS, STATEFUL, StopError, options, same, small, stop_at

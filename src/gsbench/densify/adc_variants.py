@@ -12,7 +12,7 @@ from torch import Tensor
 from gsbench.densify.adc import ADC, Grown
 from gsbench.densify.base import Refinement, Rule, Statistic
 from gsbench.densify.budget import admit
-from gsbench.densify.formulas import faded, quantile, standard_normal
+from gsbench.densify.scores import faded, quantile, standard_normal
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import RenderOutput
 from gsbench.settings import OpenFraction
@@ -216,9 +216,7 @@ class SteepGS(ADC):
         values = refinement.gaussians.values
         over, large = self.candidates(refinement)
         log_scales = values.log_scales - math.log(self.split_shrink) * large.unsqueeze(-1)
-        return Grown.halved(
-            values, over, log_scales, faded(values.opacity_logits, self.opacity_factor)
-        )
+        return Grown.halved(values, over, log_scales, self.opacity_factor)
 
     def grow_by_gradient(self, refinement: Refinement) -> None:
         """Replace each candidate by two halves."""
