@@ -120,17 +120,21 @@ def weights(size, smaller):
     return triangle / triangle.sum(1, keepdims=True)
 
 
+def reduced(view, scale):
+    """The camera and the picture of a view with sides divided by ``scale``."""
+    cameras, targets = ScaledViews([view], Targets([view], CPU), CPU, None).at(scale)
+    return cameras[0], targets.get(0)
+
+
 @pytest.mark.parametrize("scale, height, width", [(2, 16, 20), (3, 10, 13), (8, 4, 5)])
 def test_a_small_picture_is_filtered_and_its_camera_is_resized(scale, height, width):
     camera = orbit_camera(0.3)
     (image,) = soft_pictures(1, camera.height, camera.width, 5)
-    view = View("a.png", camera, image)
-    cameras, targets = ScaledViews([view], Targets([view], CPU), CPU, None).at(scale)
-    small = cameras[0]
+    small, picture = reduced(View("a.png", camera, image), scale)
     assert (small.width, small.height) == (width, height)
     rows, columns = weights(camera.height, height), weights(camera.width, width)
     expected = np.einsum("ih,hwc,jw->ijc", rows, image / 1.0, columns)
-    assert np.abs(targets.get(0).numpy() - expected).max() <= 0.5 + 1e-4
+    assert np.abs(picture.numpy() - expected).max() <= 0.5 + 1e-4
     x, y, z = camera.rotation @ np.array([0.1, -0.2, 0.3]) + camera.translation
     across = (camera.fx * x / z + camera.cx) / camera.width
     down = (camera.fy * y / z + camera.cy) / camera.height
@@ -140,9 +144,9 @@ def test_a_small_picture_is_filtered_and_its_camera_is_resized(scale, height, wi
 
 def test_a_picture_keeps_at_least_one_pixel():
     view = View("a.png", orbit_camera(0.0, 5, 3), np.full((3, 5, 3), 7, np.uint8))
-    cameras, targets = ScaledViews([view], Targets([view], CPU), CPU, None).at(8)
-    assert (cameras[0].width, cameras[0].height) == (1, 1)
-    assert targets.get(0).tolist() == [[[7, 7, 7]]]
+    camera, picture = reduced(view, 8)
+    assert (camera.width, camera.height) == (1, 1)
+    assert picture.tolist() == [[[7, 7, 7]]]
 
 
 def scheduled(scene):

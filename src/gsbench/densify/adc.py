@@ -92,8 +92,11 @@ class ADC(Budgeted):
         return self.gradient == "absolute"
 
     def observe(self, step: int, render: RenderOutput) -> None:
-        if step >= self.stop:
-            return
+        if step < self.stop:
+            self.gather(render)
+
+    def gather(self, render: RenderOutput) -> None:
+        """Gather the statistics of an iteration within the window."""
         visible, statistics = render.visible, self.statistics
         statistics["gradient_sum"] += torch.where(visible, self.screen_gradient(render), 0.0)
         statistics["visible_count"] += visible
