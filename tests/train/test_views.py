@@ -13,7 +13,7 @@ from gsbench.densify import EdgeAware, NoDensifier
 from gsbench.densify.scores import blended_sums
 from gsbench.eval.ssim import ssim_map
 from gsbench.raster.reference import ReferenceRasterizer
-from gsbench.runs.config_hash import config_hash
+from gsbench.runs.code import config_hash
 from gsbench.scene.types import View
 from gsbench.train.loss import photometric_loss
 from gsbench.train.views import (
