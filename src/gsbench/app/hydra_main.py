@@ -30,7 +30,7 @@ from gsbench.config.permissions import ALLOWED
 from gsbench.config.schema import register_schemas
 from gsbench.config.trust import load_callbacks
 from gsbench.errors import InputError
-from gsbench.runs.nested import targets_in
+from gsbench.runs.configuration import targets_in
 from gsbench.system.install import conf_dir
 
 FOLDER = ".hydra"  # below the runs folder

@@ -18,7 +18,7 @@ from gsbench.config.explain import explained
 from gsbench.config.hydra_setup import config_loader, hydra_config, hydra_ready
 from gsbench.config.overrides import is_sweep, parse_word
 from gsbench.errors import InputError
-from gsbench.launch.outcomes import Outcome
+from gsbench.launch.jobs import Outcome
 from gsbench.logs import set_up_logging
 from gsbench.pipeline.metric_facts import facts_for
 

@@ -19,7 +19,7 @@ from omegaconf.grammar_parser import parse
 from gsbench.errors import InputError
 from gsbench.external.settings import program_of
 from gsbench.parsing import table_beside
-from gsbench.runs.nested import TARGET, entries_of
+from gsbench.runs.configuration import TARGET, entries_of
 from gsbench.system.programs import allowed_modules
 from gsbench.words import did_you_mean
 

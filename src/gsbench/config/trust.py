@@ -26,8 +26,8 @@ from gsbench.config.permissions import (
     permission_advice,
 )
 from gsbench.errors import InputError
-from gsbench.runs.nested import TARGET, entries_of, targets_in
-from gsbench.runs.user_code import PERMISSIONS
+from gsbench.runs.code import PERMISSIONS
+from gsbench.runs.configuration import TARGET, entries_of, targets_in
 
 OWN_RUNS = "${oc.env:GSBENCH_RUNS,runs}"
 
