@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 COLUMNS = ("method", "scene", "seed")
 Sign = Literal[-1, 0, 1]
 DIRECTIONS: dict[str, Sign] = {"": 0, "higher": 1, "lower": -1}
-BETTER = {sign: word for word, sign in DIRECTIONS.items()}
+BETTER: dict[int, str] = {sign: word for word, sign in DIRECTIONS.items()}
 
 
 class Declared(Record):
