@@ -287,6 +287,11 @@ class Training(Record):
     evaluated_from: Literal["model", "renders"] | None = None
     trained_by: ExternalTrainer | None = None
 
+    @property
+    def was_given(self) -> bool:
+        """Return whether the model of another program was given, so that nothing was trained."""
+        return self.trained_by is None and not self.iterations
+
 
 class Evaluation(Record):
     """The metrics of a trial; fields as in `TrialRecord`."""
