@@ -13,7 +13,6 @@ from gsbench.runs import keys, layout
 from gsbench.runs.code import config_hash, user_modules
 from gsbench.runs.configuration import arm_hash, flatten, sha256_of
 from gsbench.runs.store import StoredResult, read_manifest
-from gsbench.runs.trial_files import read_rows
 from gsbench.runs.trial_record import (
     FROM_MODEL,
     FROM_RENDERS,
@@ -26,6 +25,7 @@ from gsbench.runs.trial_record import (
     Training,
     TrialRecord,
     TwinViews,
+    read_rows,
     split_text,
 )
 from gsbench.scene.rules import settle

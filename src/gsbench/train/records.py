@@ -13,7 +13,7 @@ from torch import Tensor
 from gsbench.densify.volumetric import log_volume
 from gsbench.files import write_text
 from gsbench.raster.staged import Readback
-from gsbench.runs.trial_files import whole_lines
+from gsbench.runs.trial_record import whole_lines
 
 PHOTOMETRIC = ("loss", "l1", "ssim")  # what the built-in loss gives
 SMOOTHING = 0.9  # weight of the previous mean in the smoothed loss

@@ -21,7 +21,7 @@ from gsbench.analysis.verdicts import Verdict
 from gsbench.errors import InputError
 from gsbench.events import RefineEvent
 from gsbench.runs import layout
-from gsbench.runs.trial_files import Histogram
+from gsbench.runs.trial_record import Histogram
 
 EVENT_CAUSES = (*RefineEvent.GROWN, "relocated", *RefineEvent.PRUNED)
 CURVES = (  # key of metrics.jsonl, title, y axis
