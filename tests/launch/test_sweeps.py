@@ -291,7 +291,7 @@ def fake_trial(monkeypatch):
 
 
 def sweep():
-    return composed(["name=x", "densify=adc", "seed=0,1,2"])
+    return composed(split("name=x densify=adc seed=0,1,2 tracking=none"))
 
 
 def test_failed_trial_does_not_stop_the_others(fake_trial, capsys):
