@@ -12,10 +12,10 @@ from gsbench.errors import TrainingError
 from gsbench.external.exchange import (
     collect_model,
     collect_renders,
-    run_program,
     write_test_cameras,
     write_training_views,
 )
+from gsbench.external.run import run_program
 from gsbench.external.settings import fill_placeholders, split_command
 from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.init.base import PointCloud

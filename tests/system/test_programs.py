@@ -18,7 +18,7 @@ SOURCES = {file.relative_to(SRC).as_posix(): file.read_text("utf-8") for file in
 # "own": an empty folder; "neutral": gsbench's; "current": the current folder, since the user's
 # relative paths count from there. A Python starts with -P, and imports nothing from there.
 STARTS = {
-    ("external/exchange.py", "watch", "subprocess.Popen"): "own",
+    ("external/run.py", "watch", "subprocess.Popen"): "own",
     ("launch/slurm.py", "make_executor", "submitit.SlurmExecutor"): "current",
     ("launch/jobs.py", "run_local", "submitit.LocalExecutor"): "current",
     ("pipeline/steps/external.py", "check_version", "subprocess.run"): "own",

@@ -11,7 +11,7 @@ import psutil
 import pytest
 
 from gsbench.errors import TrainingError
-from gsbench.external.exchange import run_program
+from gsbench.external.run import run_program
 from tests.processes import heed_interrupts, is_running
 
 pytestmark = pytest.mark.skipif(
@@ -87,7 +87,7 @@ def test_a_daemon_ends_with_gsbench_however_that_ends(tmp_path, sign):
         textwrap.dedent(f"""
         import os, sys
         from pathlib import Path
-        from gsbench.external.exchange import run_program
+        from gsbench.external.run import run_program
         program = {DAEMON!r} + "\\ndaemon('mark')\\ntime.sleep(600)"
         here = Path({str(tmp_path)!r})
         run_program([sys.executable, "-c", program], here / "log", here, dict(os.environ), None)

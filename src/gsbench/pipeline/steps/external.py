@@ -15,13 +15,12 @@ from typing import TYPE_CHECKING, Any
 from gsbench.densify import Lineage
 from gsbench.errors import InputError, TrainingError
 from gsbench.external.exchange import (
-    ProgramResult,
     collect_model,
     collect_renders,
-    run_program,
     write_test_cameras,
     write_training_views,
 )
+from gsbench.external.run import ProgramResult, run_program
 from gsbench.external.settings import (
     DATA,
     FOLDERS,
