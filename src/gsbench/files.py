@@ -112,6 +112,12 @@ def writable_output(out: Path) -> Iterator[None]:
         ) from error
 
 
+def user_cache(name: str) -> Path:
+    """The folder ``name`` of gsbench's in the user's cache, which may not be there yet."""
+    cache = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    return Path(cache, "gsbench", name)
+
+
 OUTPUTS = ".gsbench-outputs"  # in a folder of the user's: the sha256 of what gsbench wrote there
 
 

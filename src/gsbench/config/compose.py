@@ -4,6 +4,7 @@ Words go one way: Hydra composes once for each choice of groups, the values of s
 set in a copy, and the resolved copy is checked: a trial.
 """
 
+import os
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -23,6 +24,7 @@ from gsbench.config.explain import explained, not_a_setting
 from gsbench.config.groups import GROUPS
 from gsbench.config.hydra_setup import (
     CONFIG_NAME,
+    composed_once,
     config_loader,
     hydra_config,
     hydra_ready,
@@ -122,6 +124,7 @@ class Composer:
             self.config[PERMISSIONS] = list(self.allowed)
         with open_dict(self.config):
             self.config.hydra = self._choose(values).hydra
+            self.config.hydra.runtime.cwd = os.getcwd()
 
     def settings(self, words: Sequence[str]) -> DictConfig:
         """The configuration of ``words`` without Hydra's node; trials check what it may run."""
@@ -212,7 +215,7 @@ class Composer:
 
     def _choose(self, words: Sequence[str]) -> DictConfig:
         """Hydra's composition of the choices among ``words``, checked; do not change it."""
-        key = tuple(_choices(words).values())  # composing takes 0.1 s
+        key = tuple(_choices(words).values())
         if key not in self._chosen:
             with hydra_ready():
                 self._chosen[key] = self._compose(key, words)
@@ -231,11 +234,12 @@ class Composer:
                 raise InputError(not_a_setting(key, self._choose([]), words))
             check_choice(choice, str(parse_word(choice).value()))
         with explained([*self.hydra_words, *words]):
+            if not self.hydra_words:  # all files are gsbench's own
+                return composed_once(tuple(choices))
             config = self._composed(choices)
-        if self.hydra_words:  # else all files are gsbench's own
-            # for the check, which tells what is in a word from what a file sets
-            config.hydra.overrides.task = list(map(key_of, words))
-            check_permitted(config, self.allowed)
+        # for the check, which tells what is in a word from what a file sets
+        config.hydra.overrides.task = list(map(key_of, words))
+        check_permitted(config, self.allowed)
         return config
 
     def _composed(self, words: Sequence[str]) -> DictConfig:

@@ -8,18 +8,23 @@ syntax does. Loads no torch.
 import ast
 import hashlib
 import json
+import platform
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
 import yaml
 
-from gsbench.parsing import DamagedError, SafeLoader, read_json
+from gsbench.files import user_cache, write_json
+from gsbench.parsing import DamagedError, SafeLoader, read_if_sound, read_json
 
 PACKAGE = Path(__file__).resolve().parents[1]
 RELEASED = "released.json"  # in gsbench's folder: the digests of all packages at the release
 AS_RELEASED = "released"  # the state of a package that equals the release
 DIGEST_CHARACTERS = 16
+SYNTAX_DIGESTS = "syntax-1.json"  # another number if `syntax_of` changes
+MAX_KEPT = 500  # digests in that file
 
 
 def states_of(packages: Iterable[str]) -> dict[str, str]:
@@ -48,10 +53,25 @@ def state_of(package: str) -> str:
     """The state of a package as this process first found it; see `states_of`."""
     released, contents = _released().get(package) or {}, _first_contents(package)
     # the usual case of an installed gsbench, without parsing
-    if released.get("bytes") == _digest(contents):
+    if released.get("bytes") == (digest := _digest(contents)):
         return AS_RELEASED
-    digest = _digest({name: syntax_of(content, name) for name, content in contents.items()})
+    digest = _digest_of_syntax(contents, f"{platform.python_version()} {digest}")
     return AS_RELEASED if digest == released.get("syntax") else digest
+
+
+def _digest_of_syntax(contents: Mapping[str, bytes], key: str) -> str:
+    """The digest of the syntax of files, which the user's cache keeps by a ``key`` of them.
+
+    Parsing all of gsbench takes a second.
+    """
+    file = user_cache("code") / SYNTAX_DIGESTS
+    known = read_if_sound(file, dict[str, str]) or {}
+    if key not in known:
+        known[key] = _digest({name: syntax_of(content, name) for name, content in contents.items()})
+        with suppress(OSError):  # only slower without
+            file.parent.mkdir(parents=True, exist_ok=True)
+            write_json(file, dict(list(known.items())[-MAX_KEPT:]))
+    return known[key]
 
 
 def _contents(package: str) -> dict[str, bytes]:
