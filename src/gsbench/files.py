@@ -281,12 +281,13 @@ def checked_runs_folder(name: str) -> Path:
     return folder
 
 
-def make_runs_folder(folder: Path) -> None:
+def make_runs_folder(name: str | Path) -> None:
     """Make the runs folder, and check that it can be written to.
 
     Raises OSError if the disk is full or writing is forbidden (see `storage_errors`), else
-    InputError.
+    InputError, as `checked_runs_folder` does.
     """
+    folder = checked_runs_folder(str(name))
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(prefix=".probe-", dir=folder):

@@ -260,13 +260,7 @@ def test_permission_for_a_module_covers_gsbenchs_classes_in_it():
 
 @pytest.mark.parametrize(
     "settings, said",
-    [
-        ({"_target_": "mine.Popen", "args": "true"}, "is subprocess.Popen"),
-        ({"_target_": "mine.Mine"}, "is not a class of hydra.experimental.callback.Callback"),
-        ({"_target_": "mine.Calls", "in": {"_target_": "mine.Popen"}}, "is subprocess.Popen"),
-        ({"_target_": "mine.Calls", "in": {"_target_": "mine.os.mkdir"}}, "cannot be imported"),
-        ({"size": 3}, "hydra.callbacks.x names no _target_"),
-    ],
+    table(__file__, "callbacks"),
 )
 def test_callbacks_must_be_classes_of_an_allowed_module(settings, said, capsys, monkeypatch):
     run = [*experiment({"hydra.callbacks.x": settings}), "allow_targets=[mine]"]

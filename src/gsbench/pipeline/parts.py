@@ -27,8 +27,7 @@ from gsbench.runs.nested import GSBENCH, TARGET, targets_in
 from gsbench.runs.user_code import UserCode, user_modules
 from gsbench.scene.options import SceneConfig
 from gsbench.scene.record import SceneReader
-from gsbench.system.device import select_device
-from gsbench.system.resources import available_threads
+from gsbench.system.resources import available_threads, select_device
 from gsbench.train.ideas import Ideas
 from gsbench.train.options import TrainConfig
 from gsbench.train.proof import Proven, create_proven
