@@ -18,8 +18,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from gsbench.runs.config_hash import config_hash
-from gsbench.runs.nested import sha256_of
+from gsbench.runs.code import config_hash
+from gsbench.runs.configuration import sha256_of
 from gsbench.runs.trial_folder import TrialFolder
 from tests.trials import record_of
 

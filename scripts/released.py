@@ -6,8 +6,8 @@ python scripts/released.py
 import itertools
 
 from gsbench.files import write_json
+from gsbench.runs.code import PACKAGE, RELEASED, digests_at_release
 from gsbench.runs.keys import CODE_OF_STAGE
-from gsbench.runs.package_code import PACKAGE, RELEASED, digests_at_release
 
 
 def main() -> None:

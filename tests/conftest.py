@@ -42,6 +42,20 @@ def script(name, folder="scripts"):
     return module
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(collector):
+    """Let one worker of the tests read a file first, which compiles it and all that it imports.
+
+    The others follow, and read what Python kept: two workers compile a fresh clone once.
+    """
+    if "PYTEST_XDIST_WORKER" not in os.environ:
+        return (yield)
+    common = Path(collector.config.getoption("basetemp")).parent  # the folder of all workers
+    name = collector.nodeid.replace("/", ".")
+    with FileLock(common / f"{name}.lock", poll_interval=0.01):
+        return (yield)
+
+
 @pytest.fixture(scope="session")
 def shared():
     """The folder with development data beside the checkout; skips if it is absent."""

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from gsbench.app.command import compose_trials
 from gsbench.config.schema import GROUP_SCHEMAS
 from gsbench.errors import InputError
-from gsbench.runs.config_hash import config_hash
+from gsbench.runs.code import config_hash
 from gsbench.settings import check_values, option_fields
 from tests.helpers import table
 

@@ -7,10 +7,8 @@
 ``train`` first unpacks ``findings/archives/EXPERIMENT.zip`` into ``$GSBENCH_RUNS``, if nothing of
 the experiment is there. It then trains one after the other what has no result yet, and can be
 killed and started again at any time. ``save`` writes the archive, with all trials so far, and
-beside it what archives lack and a machine that is gone cannot tell: ``EXPERIMENT.csv`` (CPU time,
-the share of volumes below V_th) and, where the archive has no ``regions.json``,
-``EXPERIMENT_regions.npz`` (the mean squared errors of regions of 32 px by trial and view,
-`gsbench.analysis.images.region_errors`).
+beside it ``EXPERIMENT.csv`` with what archives lack and a machine that is gone cannot tell: CPU
+time, and the share of volumes below V_th.
 """
 
 from __future__ import annotations
@@ -28,19 +26,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from PIL import Image
 
-from gsbench.analysis.images import region_errors
 from gsbench.claims.archive import unpack_archive
-from gsbench.runs.layout import REGIONS
 
 FINDINGS = Path(__file__).resolve().parents[1]
 LINE = re.compile(r"^(\w+) +(?P<scene>\S+?)/\S+-(?P<densify>\S+) seed (?P<seed>\d+) \(\w+\)")
 THRESHOLD = 0.03  # V_th of the paper
 PAGE = FINDINGS / "paper_tables.md"
 STATE, END = "<!-- state {} -->", "<!-- end -->"  # around the table of an experiment
-PICTURES = ("renders", "ground_truth")
 MEASURED = "measured_here.csv"  # in the experiment's folder: CPU time of each training
 FIELDS = ("trial", "cpu_seconds", "gaussians", "share_below_threshold")
 
@@ -100,15 +93,6 @@ def share_below(model: Path) -> tuple[int, float]:
     return len(volumes), float((volumes <= THRESHOLD).mean())
 
 
-def regions_of(folder: Path) -> dict[str, NDArray[np.float32]]:
-    """The errors of the regions of a trial's test views, by view."""
-    found = {}
-    for path in sorted((folder / "renders").glob("*.png")):
-        pair = (np.asarray(Image.open(folder / kind / path.name)) for kind in PICTURES)
-        found[path.stem] = region_errors(*pair).astype(np.float32)
-    return found
-
-
 def save(clone: Path, experiment: str) -> None:
     home = Path(os.environ["GSBENCH_RUNS"]) / experiment
     archives = FINDINGS / "archives"
@@ -116,12 +100,11 @@ def save(clone: Path, experiment: str) -> None:
         clone, "export", "--results", experiment, "--out", str(archives / f"{experiment}.zip")
     )
     print(exported.stdout, end="")
-    table, maps = archives / f"{experiment}.csv", archives / f"{experiment}_regions.npz"
+    table = archives / f"{experiment}.csv"
     rows = dict[str, dict[str, str]]()
     if table.exists():
         with table.open() as stream:
             rows = {row["trial"]: row for row in csv.DictReader(stream)}
-    regions = dict(np.load(maps)) if maps.exists() else {}
     spent = Counter[str]()  # a training that was killed and continued has several lines
     if (home / MEASURED).exists():
         for line in (home / MEASURED).read_text().split():
@@ -135,15 +118,10 @@ def save(clone: Path, experiment: str) -> None:
             count, share = share_below(model)
             values = (name, str(spent.get(name, "")), str(count), f"{share:.6f}")
             rows[name] = dict(zip(FIELDS, values, strict=True))
-            if not (results.parent / REGIONS).exists():
-                of_views = regions_of(results.parent)
-                regions |= {f"{name}/{view}": errors for view, errors in of_views.items()}
     with table.open("w", newline="") as stream:
         writer = csv.DictWriter(stream, FIELDS, lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows.values())
-    if regions:
-        np.savez_compressed(maps, **regions)
     PAGE.write_text(with_state(PAGE.read_text(encoding="utf-8"), experiment), encoding="utf-8")
 
 

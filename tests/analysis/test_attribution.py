@@ -16,7 +16,7 @@ from gsbench.analysis.differences import (
     ingredients_note,
     is_mixed,
 )
-from gsbench.runs.config_hash import config_hash
+from gsbench.runs.code import config_hash
 from gsbench.runs.experiments import Arm
 from tests.analysis.helpers import loaded, page_of, table_of
 from tests.conftest import ROOT, script

@@ -5,12 +5,12 @@ from itertools import chain
 import numpy as np
 
 from gsbench.errors import GsbenchError
-from gsbench.launch.outcomes import Outcome, outcome_of_error, outcome_of_results
+from gsbench.launch.jobs import Outcome, outcome_of_error, outcome_of_results
 from gsbench.launch.record import record
+from gsbench.runs.code import states_of
 from gsbench.runs.commands import digest_of, read_history
 from gsbench.runs.keys import CODE_OF_STAGE
 from gsbench.runs.layout import RESULTS
-from gsbench.runs.package_code import states_of
 from gsbench.runs.trial_record import record_from
 from tests.trials import bare_trial, write_as
 

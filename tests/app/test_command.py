@@ -11,7 +11,7 @@ from gsbench.app.command import one_trial_per_scene, summarize
 from gsbench.app.sweep import check_sweep_settings
 from gsbench.config.compose import Trial
 from gsbench.errors import GsbenchError, InputError
-from gsbench.launch.outcomes import Outcome
+from gsbench.launch.jobs import Outcome
 from gsbench.launch.record import record
 from gsbench.runs.commands import read_history
 from gsbench.runs.trial_folder import TrialFolder

@@ -15,7 +15,7 @@ from gsbench.app import command, hydra_app, hydra_main, sweep
 from gsbench.app.hydra_app import Goal, Job, goal_of, words_without_sweeper
 from gsbench.app.hydra_main import words_for_files, words_for_new_folder
 from gsbench.errors import GsbenchError, InputError
-from gsbench.launch.outcomes import Outcome
+from gsbench.launch.jobs import Outcome
 from tests.app.stand_ins import done, trial
 from tests.helpers import refusal, table
 from tests.trials import write_results

@@ -11,7 +11,7 @@ from gsbench.config.build import build
 from gsbench.config.compose import compose_one
 from gsbench.config.groups import options
 from gsbench.densify.volumetric import Volumetric
-from gsbench.runs.config_hash import config_hash
+from gsbench.runs.code import config_hash
 from gsbench.settings import Switch
 from gsbench.verbs.planning import (
     choose_switches,

@@ -18,7 +18,7 @@ from gsbench.config.compose import compose_one
 from gsbench.config.overrides import key_of, parse_word
 from gsbench.config.schema import check, plain, register_schemas
 from gsbench.pipeline.parts import build_metrics
-from gsbench.runs.config_hash import config_hash
+from gsbench.runs.code import config_hash
 from gsbench.system.install import conf_dir
 from gsbench.train.options import STEPS
 from tests.helpers import refusal, table

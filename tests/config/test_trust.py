@@ -17,7 +17,7 @@ from gsbench.config.build import build
 from gsbench.config.command_words import typed_permissions
 from gsbench.config.compose import compose_one
 from gsbench.config.trust import ALLOWED, foreign_variables, load_class
-from gsbench.runs.user_code import module_digest
+from gsbench.runs.code import module_digest
 from gsbench.system.programs import allow_modules
 from tests.helpers import refusal, table, write
 from tests.strange import BOMB, ask, experiment

@@ -16,8 +16,13 @@ import torch
 from PIL import Image
 
 from gsbench.cli import run
+from gsbench.densify import DensifyContext
+from gsbench.gaussians.paper_values import LearningRates
+from gsbench.gaussians.trainable import TrainableGaussians
+from gsbench.raster.base import RenderOutput
 from gsbench.scene.colmap import read_model
 from tests.conftest import ROOT
+from tests.gaussians.helpers import random_gaussians
 from tests.helpers import read_json
 
 pytestmark = pytest.mark.slow
@@ -201,12 +206,6 @@ def _llff(model):
 )
 def test_the_densifiers_of_the_document_resume_to_the_bit(folder, file, name, options):
     """They pass the checklist of the document."""
-    from gsbench.densify import DensifyContext
-    from gsbench.gaussians.paper_values import LearningRates
-    from gsbench.gaussians.trainable import TrainableGaussians
-    from gsbench.raster.base import RenderOutput
-    from tests.gaussians.helpers import random_gaussians
-
     cls = getattr(importlib.import_module(file), name)
 
     def rounds(state, first, last):
@@ -243,11 +242,6 @@ def test_the_densifiers_of_the_document_resume_to_the_bit(folder, file, name, op
 
 def test_the_governed_densifier_of_the_document_ends_at_its_limit(folder):
     from largest import SplitLargest
-
-    from gsbench.densify import DensifyContext
-    from gsbench.gaussians.paper_values import LearningRates
-    from gsbench.gaussians.trainable import TrainableGaussians
-    from tests.gaussians.helpers import random_gaussians
 
     gaussians, rng = random_gaussians(100), torch.Generator().manual_seed(0)
     densifier = SplitLargest(

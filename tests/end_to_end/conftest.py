@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
+from functools import partial
 from shlex import split
 
 import pytest
@@ -11,8 +12,12 @@ from filelock import FileLock
 
 from gsbench.cli import run
 from gsbench.files import file_sha256
+from gsbench.init import Sfm
+from gsbench.init.base import MODEL_FOLDER
+from gsbench.scene.courtyard.render import render_courtyard
 from tests.helpers import read_json, words_of
 from tests.processes import completed, heed_interrupts
+from tests.scene.captures import read_colmap
 
 # A whole trial in seconds: a small courtyard, its exact cameras, a random cloud, few iterations,
 # nothing downloaded.
@@ -44,10 +49,7 @@ def finished_runs(environment, tmp_path_factory):
     runs = common_folder(tmp_path_factory) / "finished-runs"
     with FileLock(f"{runs}.lock"):
         if not (runs / "complete").exists():
-            completed(
-                [sys.executable, "-m", "gsbench.cli", *FINISHED_SWEEP],
-                env=environment | {"GSBENCH_RUNS": str(runs)},
-            )
+            program(environment, runs, *FINISHED_SWEEP)
             (runs / "complete").touch()
     return runs
 
@@ -76,19 +78,20 @@ def environment(tmp_path_factory):
     }
 
 
-@pytest.fixture
-def gsbench(environment, tmp_path):
+def program(environment, runs, *arguments, code=0, timeout=900, cwd=None, **changes):
     """Call ``gsbench`` with arguments, as `completed`; words in capitals are of its environment.
 
-    Its runs folder is that of the test. The time limit is for a busy machine.
+    The time limit is for a busy machine.
     """
-    own = environment | {"GSBENCH_RUNS": str(tmp_path / "runs")}
+    command = [sys.executable, "-m", "gsbench.cli", *words_of(*arguments)]
+    own = environment | {"GSBENCH_RUNS": str(runs)} | changes
+    return completed(command, code, cwd=cwd, env=own, timeout=timeout)
 
-    def run(*arguments, code=0, timeout=900, cwd=tmp_path, **changes):
-        command = [sys.executable, "-m", "gsbench.cli", *words_of(*arguments)]
-        return completed(command, code, cwd=cwd, env=own | changes, timeout=timeout)
 
-    return run
+@pytest.fixture
+def gsbench(environment, tmp_path):
+    """Call `program` in the folder of the test, with the runs folder there."""
+    return partial(program, environment, tmp_path / "runs", cwd=tmp_path)
 
 
 def trial_of(settings, runs, capture, *words):
@@ -97,6 +100,15 @@ def trial_of(settings, runs, capture, *words):
     assert run([*settings, *place, *words]) == 0
     (folder,) = {path.parent for path in (runs / capture.name).glob("*/*/*/results.json")}
     return folder
+
+
+def render_with_points(folder, views):
+    """Write a COLMAP folder of the courtyard, with the points that structure from motion finds."""
+    render_courtyard(folder, views, width=192, height=144)
+    sfm = Sfm(threads=1, first_octave=0, max_num_features=1500, two_view_tracks=True)
+    sfm.run(read_colmap(folder), folder.with_name("sfm"))
+    shutil.rmtree(folder / "sparse")
+    shutil.copytree(folder.with_name("sfm") / MODEL_FOLDER, folder / "sparse/0")
 
 
 # Keys that differ between two runs of the same trial: times, and the places and times of its input
@@ -128,6 +140,13 @@ def start(environment, tmp_path):
     return run
 
 
+def checksums(trial, names, *folders):
+    """The checksums of files of a trial, and of all that lie in ``folders`` of it."""
+    files = [trial / name for name in names]
+    files += [file for folder in folders for file in (trial / folder).iterdir()]
+    return {file.relative_to(trial): file_sha256(file) for file in files}
+
+
 def results_of(runs, name):
     """The results of a sweep without times, with checksums of models, pictures and tables."""
     found = {}
@@ -136,11 +155,8 @@ def results_of(runs, name):
         results["init_report"].pop("seconds", None)
         for of_the_sweep in ("experiment", "questions"):
             results.pop(of_the_sweep, None)
-        files = [
-            path.with_name(name) for name in split("point_cloud.ply per_view.csv events.jsonl")
-        ]
-        files += sorted(path.parent.glob("renders/*.png"))
-        results["files"] = {file.name: file_sha256(file) for file in files}
+        names = split("point_cloud.ply per_view.csv events.jsonl")
+        results["files"] = checksums(path.parent, names, "renders")
         found[f"{path.parent.parent.name}/{path.parent.name}"] = results
     return found
 

@@ -5,7 +5,7 @@ from shlex import split
 
 import pytest
 
-from gsbench.runs.package_code import PACKAGE
+from gsbench.runs.code import PACKAGE
 from gsbench.system.install import conf_dir
 from tests.end_to_end.conftest import SMALL
 from tests.helpers import read_json

@@ -1,11 +1,6 @@
 """On a fresh machine, one command downloads all data of the paper's sweep."""
 
-import os
-import signal
-import subprocess
-import sys
 import time
-from shlex import split
 
 import pytest
 
@@ -48,19 +43,18 @@ def test_after_fetch_table1_misses_no_data(gsbench, server, tmp_path):
     assert (tmp_path / "data/tandt/truck/images/IMG_0001.JPG").is_file()
 
 
-def test_a_killed_fetch_continues(server, tmp_path, environment, gsbench):
+def test_a_killed_fetch_continues(server, tmp_path, start, gsbench):
     def slowly(_, __, body):
         time.sleep(0.05)
         return body
 
     server.manners = Manners(damage=slowly)
-    command = [sys.executable, *split("-m gsbench.cli fetch mipnerf360 --mirror"), server.url]
-    process = subprocess.Popen(command, cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL)
+    process = start("fetch", "mipnerf360", "--mirror", server.url)
     deadline = time.monotonic() + 60
     while not list((tmp_path / "data/.fetch").glob("*/*/*.JPG")) and time.monotonic() < deadline:
         time.sleep(0.01)
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
+    process.kill()
+    process.communicate()
     server.manners = Manners()
     gsbench("fetch mipnerf360 --mirror", server.url)
     for name, content in archive_content("garden", photos=2).items():

@@ -6,7 +6,7 @@ from shlex import split
 
 import pytest
 
-from tests.end_to_end.conftest import SMALL
+from tests.end_to_end.conftest import SMALL, program
 from tests.processes import completed
 
 pytestmark = pytest.mark.slow
@@ -44,10 +44,8 @@ def good(tmp_path_factory, environment):
     """The archive of the good version, and the runs folder with its trials."""
     home = tmp_path_factory.mktemp("good")
     write_class(home, 0, worse=False)
-    own = environment | {"GSBENCH_RUNS": str(home / "runs")}
-    for words in (["-m", *WORDS, "name=good", "seed=0,1,2"], split("export --results good")):
-        command = [sys.executable, "-m", "gsbench.cli", *words]
-        completed(command, cwd=home, env=own)
+    for words in (["-m", *WORDS, "name=good", "seed=0,1,2"], ["export --results good"]):
+        program(environment, home / "runs", *words, cwd=home)
     return home
 
 

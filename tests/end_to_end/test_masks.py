@@ -16,7 +16,7 @@ from gsbench.init.base import MODEL_FOLDER
 from gsbench.scene.beside import read_mask
 from gsbench.scene.colmap import read_model
 from gsbench.scene.courtyard.render import render_courtyard
-from tests.end_to_end.conftest import trial_of
+from tests.end_to_end.conftest import checksums, trial_of
 from tests.helpers import read_json
 from tests.scene.captures import read_colmap
 
@@ -60,12 +60,6 @@ def captures(tmp_path_factory):
 trial = partial(trial_of, QUICK)
 
 
-def bits(folder):
-    pictures = [file for kind in ("renders", "masks") for file in (folder / kind).iterdir()]
-    files = [*(folder / name for name in SAME), *pictures]
-    return {file.relative_to(folder): file_sha256(file) for file in files}
-
-
 @pytest.mark.parametrize(
     "words",
     [
@@ -78,7 +72,8 @@ def bits(folder):
 )
 def test_ignored_pixels_do_not_change_one_bit_of_a_trial(captures, tmp_path, words):
     folders = [trial(tmp_path, capture, *words) for capture in captures]
-    assert bits(folders[0]) == bits(folders[1])
+    bits = [checksums(folder, SAME, "renders", "masks") for folder in folders]
+    assert bits[0] == bits[1]
     clean, noisy = (read_json(folder / "results.json") for folder in folders)
     assert clean["hashes"]["data"] != noisy["hashes"]["data"]
     for key in split("metrics num_init_points num_gaussians causes events"):
@@ -93,8 +88,7 @@ def test_ignored_pixels_do_not_change_one_bit_of_a_trial(captures, tmp_path, wor
 def _points(folder):
     """The digests of the trial's initial cloud and cameras."""
     key = read_json(folder / "results.json")["hashes"]["init"]
-    model = folder.parents[3] / f"store/init/{key}" / MODEL_FOLDER
-    return {path.name: file_sha256(path) for path in model.iterdir()}
+    return checksums(folder.parents[3] / f"store/init/{key}", [], MODEL_FOLDER)
 
 
 def test_without_masks_the_noise_changes_the_trial(captures, tmp_path):

@@ -5,10 +5,10 @@ import html
 import os
 import re
 import signal
-import subprocess
 import sys
 import time
 import zipfile
+from functools import partial
 from pathlib import Path
 from shlex import split
 
@@ -22,8 +22,9 @@ from gsbench.datasets.catalog import read_catalog
 from gsbench.scene.courtyard.render import render_courtyard
 from gsbench.view.trials import find_trial, load_viewed
 from tests.datasets.server import serve
+from tests.end_to_end.conftest import program
 from tests.helpers import read_json, write
-from tests.processes import completed, heed_interrupts, is_running
+from tests.processes import is_running
 
 pytestmark = pytest.mark.slow
 
@@ -69,6 +70,7 @@ def trainers(tmp_path_factory):
 def home(tmp_path_factory, environment, trainers):
     """A folder with a fetched scene, and a sweep of an arm of gsbench and two of other programs."""
     home = tmp_path_factory.mktemp("home")
+    train = partial(program, environment, home / "runs", cwd=home)
     courtyard = home / "courtyard"
     render_courtyard(courtyard, views=12, width=96, height=72, seed=0)
     (archives := home / "archives").mkdir()
@@ -79,9 +81,9 @@ def home(tmp_path_factory, environment, trainers):
             name = file.relative_to(courtyard).as_posix().replace("images/", "images_4/")
             content.write(file, f"{archive.scenes['garden']}/{name}")
     with serve(archives) as server:
-        program(environment, home, "fetch", "mipnerf360", "garden", "--mirror", server.url)
+        train("fetch mipnerf360 garden --mirror", server.url)
     sweep = split("densify=adc,cloud,painter seed=0,1 name=three scene=garden eval.maps=true")
-    program(environment, home, "--config-dir", str(trainers), "-m", *QUICK, *sweep)
+    train("--config-dir", trainers, "-m", *QUICK, *sweep)
     return home
 
 
@@ -96,15 +98,6 @@ def pids_in(log):
     """The ids of the trainer and its child, as it printed them."""
     lines = [line.split() for line in log.read_text().splitlines()]
     return [int(word) for first, *rest in filter(None, lines) if first == "pids" for word in rest]
-
-
-def program(environment, home, *words):
-    done = completed(
-        [sys.executable, "-m", "gsbench.cli", *words],
-        cwd=home,
-        env=environment | {"GSBENCH_RUNS": str(home / "runs")},
-    )
-    return done.stdout
 
 
 def trial(home, arm, seed=0):
@@ -278,17 +271,9 @@ def test_a_program_that_hangs_is_ended_with_its_child(trainers, tmp_path, monkey
 
 
 @pytest.fixture
-def hanging(environment, trainers, tmp_path):
+def hanging(start, trainers, tmp_path):
     """gsbench with a trainer that hangs and ignores SIGTERM; ids of the trainer and its child."""
-    words = [*own(trainers), *COURTYARD, *HANG]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "gsbench.cli", *words],
-        cwd=tmp_path,
-        env=environment | {"GSBENCH_RUNS": str(tmp_path / "runs")},
-        stderr=subprocess.PIPE,
-        text=True,
-        preexec_fn=heed_interrupts,
-    )
+    process = start(*own(trainers), *COURTYARD, *HANG, new_group=True)
     pids = []
     deadline = time.monotonic() + 300
     while not pids and process.poll() is None and time.monotonic() < deadline:

@@ -10,13 +10,8 @@ import pytest
 from numpy.testing import assert_array_equal
 from PIL import Image
 
-from gsbench.files import file_sha256
-from gsbench.init import Sfm
-from gsbench.init.base import MODEL_FOLDER
-from gsbench.scene.courtyard.render import render_courtyard
-from tests.end_to_end.conftest import trial_of
+from tests.end_to_end.conftest import checksums, render_with_points, trial_of
 from tests.helpers import read_json
-from tests.scene.captures import read_colmap
 
 pytestmark = pytest.mark.slow
 
@@ -33,10 +28,7 @@ def captures(tmp_path_factory):
     """A COLMAP folder with points from all views; a copy with noise as every eighth photograph."""
     folder = tmp_path_factory.mktemp("captures")
     clean, noisy = folder / "clean", folder / "noisy"
-    render_courtyard(clean, views=12, width=192, height=144)
-    Sfm(threads=1, first_octave=0, max_num_features=1500).run(read_colmap(clean), folder / "sfm")
-    shutil.rmtree(clean / "sparse")
-    shutil.copytree(folder / f"sfm/{MODEL_FOLDER}", clean / "sparse/0")
+    render_with_points(clean, views=12)
     shutil.copytree(clean, noisy)
     rng = np.random.default_rng(0)
     for name in sorted(path.name for path in (noisy / "images").iterdir())[::8]:
@@ -47,10 +39,7 @@ def captures(tmp_path_factory):
 
 
 trial = partial(trial_of, QUICK)
-
-
-def bits(folder):
-    return {name: file_sha256(folder / name) for name in TRAINED}
+bits = partial(checksums, names=TRAINED)
 
 
 SIFT = "sfm init.first_octave=0 init.max_num_features=1500 init.two_view_tracks=true"

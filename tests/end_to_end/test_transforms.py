@@ -1,7 +1,6 @@
 """A COLMAP scene that other code wrote as transforms.json has the same cameras and training."""
 
 import math
-import shutil
 from shlex import split
 
 import numpy as np
@@ -10,14 +9,11 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
-from gsbench.cli import run
-from gsbench.init import Sfm
-from gsbench.init.base import MODEL_FOLDER
 from gsbench.pipeline.steps.scene import CaptureSource
 from gsbench.runs.store import Store
-from gsbench.scene.courtyard.render import render_courtyard
 from gsbench.scene.load import load_scene
 from gsbench.scene.options import SceneConfig
+from tests.end_to_end.conftest import render_with_points, trial_of
 from tests.helpers import read_json, write
 from tests.scene.captures import read_colmap
 
@@ -65,25 +61,16 @@ def as_nerfstudio(model, folder):
 def scene(tmp_path_factory):
     """A folder with a COLMAP model with points, and the same as transforms.json."""
     folder = tmp_path_factory.mktemp("transforms") / "yard"
-    render_courtyard(folder, views=10, width=192, height=144)
-    sfm = Sfm(threads=1, first_octave=0, max_num_features=1500, two_view_tracks=True)
-    sfm.run(read_colmap(folder), folder.parent / "sfm")
-    shutil.rmtree(folder / "sparse")
-    shutil.copytree(folder.parent / f"sfm/{MODEL_FOLDER}", folder / "sparse/0")
+    render_with_points(folder, views=10)
     as_nerfstudio(pycolmap.Reconstruction(folder / "sparse/0"), folder)
     return folder
 
 
-def trial(runs, kind, folder, *words):
-    place = [f"scene={kind}", f"scene.path={folder}", f"runs={runs}", f"name={kind}"]
-    assert run([*QUICK, *place, *words]) == 0
-    (found,) = {path.parent for path in (runs / kind).glob("*/*/*/results.json")}
-    return found
-
-
 def test_a_training_from_transforms_json_equals_that_from_colmap(scene, tmp_path):
-    colmap = trial(tmp_path, "colmap", scene)
-    read = trial(tmp_path, "transforms", scene)
+    colmap, read = (
+        trial_of(QUICK, tmp_path / kind, scene, f"scene={kind}")
+        for kind in ("colmap", "transforms")
+    )
     first, second = (read_json(folder / "results.json") for folder in (colmap, read))
     assert first["num_init_points"] == second["num_init_points"] > 100
     assert first["scene_extent"] == pytest.approx(second["scene_extent"], rel=1e-9)

@@ -20,7 +20,7 @@ from gsbench.external.settings import fill_placeholders, split_command
 from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.init.base import PointCloud
 from gsbench.normalization import IDENTITY, Normalization
-from gsbench.runs.config_hash import config_hash
+from gsbench.runs.code import config_hash
 from gsbench.scene.types import Camera, View
 from tests.config.test_schema import composed
 from tests.gaussians.helpers import differences, random_gaussians

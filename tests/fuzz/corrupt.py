@@ -4,6 +4,9 @@ Files are cut, flipped, doubled, or filled with NaN, infinities, zeros or huge c
 """
 
 import struct
+import time
+
+SLOW_SECONDS = 20.0
 
 NAN, INFINITE = float("nan"), float("inf")
 VALUES = (
@@ -13,6 +16,19 @@ VALUES = (
     *(b"\xff" * 8, b"\0" * 32, struct.pack("<I", 2**32 - 1), struct.pack("<i", -1)),
 )
 WORDS = (*b"nan inf -1 0 99999999999999999999 x 1e400 - \xff".split(), b"", b"1 2 3", b"\n")
+
+
+def cases(folder, first, count):
+    """Yield the numbers of the cases, none of which may hang.
+
+    ``FOLDER/current`` has the present one.
+    """
+    for case in range(first, first + count):
+        (folder / "current").write_text(str(case))
+        started = time.monotonic()
+        yield case
+        taken = time.monotonic() - started
+        assert taken < SLOW_SECONDS, f"case {case} took {taken:.0f} s"
 
 
 def corrupt(data, rng):

@@ -15,7 +15,6 @@ import logging
 import os
 import shutil
 import sys
-import time
 from collections import Counter
 from pathlib import Path
 from random import Random
@@ -38,11 +37,10 @@ from gsbench.tracking.sinks import Run
 from gsbench.tracking.trial import TrackedTrial
 from gsbench.verbs.results import explain_cell
 from gsbench.verbs.trials import lines_of
-from tests.fuzz.corrupt import corrupt
+from tests.fuzz.corrupt import cases, corrupt
 from tests.helpers import read_json, write, write_lines
 from tests.trials import record_of, search_record, trial_values
 
-SLOW_SECONDS = 20.0
 DONE, FAILED, EXPERIMENT = "sfm-adc", "sfm-volumetric", "exp"
 NAMES = (
     "results.json",
@@ -320,17 +318,14 @@ def main(folder, first, count, only):
     assert warnings.count == 0
     found = Counter()
     kinds = Counter()
-    for case in range(first, first + count):
+    for case in cases(folder, first, count):
         rng = Random(case)
         name = only or NAMES[case % len(NAMES)]
         path = places[name]
         sound, stamp = path.read_bytes(), path.stat()
         kinds[damage(path, sound, rng)] += 1
-        (folder / "current").write_text(f"{case} {name}")
-        started, warnings.count = time.perf_counter(), 0
+        warnings.count = 0
         noticed = look(runs, places) + warnings.count
-        taken = time.perf_counter() - started
-        assert taken < SLOW_SECONDS, f"took {taken:.0f} s"
         found["noticed" if noticed else "read"] += 1
         if path.is_dir() and not path.is_symlink():
             path.rmdir()

@@ -74,7 +74,7 @@ READS_ITSELF = {
     "launch/estimates.py",  # text of this process
     "init/base.py",
     "runs/keys.py",  # text of this very process
-    "runs/package_code.py",  # tables of the package
+    "runs/code.py",  # tables of the package
     "system/install.py",  # files that pip wrote about the package
     "claims/archive.py",  # archives, which anybody may have made
     "config/schema.py",  # of the package

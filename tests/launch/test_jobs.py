@@ -21,16 +21,16 @@ from gsbench.files import DiskFullError
 from gsbench.launch import jobs
 from gsbench.launch import slurm as slurm_jobs
 from gsbench.launch.jobs import (
+    Outcome,
     TrialJob,
     check_job_links,
     collect,
     new_job_folder,
     run_one,
 )
-from gsbench.launch.outcomes import Outcome
 from gsbench.launch.states import QueuedJob, current_user, read_submission, record_submission
+from gsbench.runs.code import config_hash
 from gsbench.runs.commands import digest_of
-from gsbench.runs.config_hash import config_hash
 from gsbench.system.locks import BusyError
 from gsbench.system.stopping import Stopped
 from tests.helpers import refusal, write

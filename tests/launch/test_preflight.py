@@ -14,7 +14,7 @@ from gsbench.launch.batch import (
     need_no_check,
     run_batch,
 )
-from gsbench.launch.outcomes import Outcome
+from gsbench.launch.jobs import Outcome
 from gsbench.runs.commands import read_history
 from tests.helpers import refusal, table
 from tests.launch.test_jobs import SLURM, nothing

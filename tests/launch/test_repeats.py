@@ -6,8 +6,7 @@ import pytest
 
 from gsbench.errors import InputError
 from gsbench.launch import jobs
-from gsbench.launch.jobs import run_serial
-from gsbench.launch.outcomes import setting_in
+from gsbench.launch.jobs import run_serial, setting_in
 from gsbench.runs.layout import BUILDING, CURVES, FAILED
 from tests.helpers import write, write_lines
 from tests.trials import bare_trial

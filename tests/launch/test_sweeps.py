@@ -19,12 +19,12 @@ from gsbench.files import DiskFullError
 from gsbench.launch import estimates, jobs
 from gsbench.launch.batch import run_batch
 from gsbench.launch.estimates import FinishedTrials, describe_plan
-from gsbench.launch.outcomes import Outcome
+from gsbench.launch.jobs import Outcome
 from gsbench.launch.record import record
 from gsbench.launch.states import states_of_experiment
 from gsbench.logs import set_up_logging
+from gsbench.runs.code import config_hash
 from gsbench.runs.commands import drop, read_history
-from gsbench.runs.config_hash import config_hash
 from gsbench.runs.keys import TRAIN, Step
 from gsbench.runs.store import Store
 from gsbench.runs.trial_folder import TrialFolder
@@ -280,7 +280,7 @@ def fake_trial(monkeypatch):
             raise error
         folder = TrialFolder.of(trial.values).path
         if error is not None and not isinstance(error, BusyError):
-            from gsbench.launch.outcomes import outcome_of_error
+            from gsbench.launch.jobs import outcome_of_error
 
             return outcome_of_error(folder, error)
         finish(trial.values)
@@ -291,7 +291,7 @@ def fake_trial(monkeypatch):
 
 
 def sweep():
-    return composed(["name=x", "densify=adc", "seed=0,1,2"])
+    return composed(split("name=x densify=adc seed=0,1,2 tracking=none"))
 
 
 def test_failed_trial_does_not_stop_the_others(fake_trial, capsys):

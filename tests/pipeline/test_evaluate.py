@@ -21,9 +21,9 @@ from gsbench.pipeline.steps.evaluate import evaluate_step, measure_speed, one_co
 from gsbench.raster.contract import CASES
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.runs import keys
+from gsbench.runs.code import UserCode
 from gsbench.runs.keys import INIT, TRAIN, Step
 from gsbench.runs.store import Store
-from gsbench.runs.user_code import UserCode
 from gsbench.scene.types import ANGLE, COUNTED, DISTANCE, Scene, View
 from gsbench.train.trainer import snapshot_file
 from tests.helpers import read_json

@@ -14,7 +14,7 @@ from gsbench.pipeline.steps import scene as scene_module
 from gsbench.pipeline.steps.scene import CaptureSource
 from gsbench.pipeline.trial import TrialSteps
 from gsbench.runs import keys
-from gsbench.runs.config_hash import config_hash
+from gsbench.runs.code import config_hash
 from gsbench.runs.store import Store
 from gsbench.scene.types import Capture
 from gsbench.system.programs import allowed_modules

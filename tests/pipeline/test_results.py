@@ -13,8 +13,8 @@ from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER, REPORT_FILE
 from gsbench.pipeline.results import cloud_hash, results_of, versions
 from gsbench.pipeline.trial import source_files
 from gsbench.raster.reference import ReferenceRasterizer
+from gsbench.runs.configuration import sha256_of
 from gsbench.runs.keys import EVALUATE, INIT, STAGES, TRAIN, Step
-from gsbench.runs.nested import sha256_of
 from gsbench.runs.store import Store
 from gsbench.scene.types import Capture
 from gsbench.train.proof import Proven

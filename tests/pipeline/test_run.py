@@ -14,7 +14,7 @@ from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.normalization import IDENTITY, Normalization
 from gsbench.pipeline import trial as trials
 from gsbench.pipeline.trial import _publish, _recorded_failures, run_trial
-from gsbench.runs.config_hash import config_hash
+from gsbench.runs.code import config_hash
 from gsbench.runs.keys import CAPTURE, EVALUATE, GROUND_TRUTH, INIT, TRAIN, Step
 from gsbench.runs.store import StoredResult
 from gsbench.runs.trial_folder import TrialFolder

@@ -5,10 +5,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
 
-from gsbench.runs import keys, nested
+from gsbench.runs import configuration, keys
+from gsbench.runs.code import UserCode
+from gsbench.runs.configuration import flatten, targets_in
 from gsbench.runs.keys import Stage, options_of, rasterizer_inputs, step_of
-from gsbench.runs.nested import flatten, targets_in
-from gsbench.runs.user_code import UserCode
 from tests.helpers import refusal
 
 
@@ -75,7 +75,7 @@ def test_a_step_has_the_differing_packages_and_checks_for_edits_only_if_it_start
 
 
 def test_the_example_in_the_docstring_holds():
-    assert doctest.testmod(nested).failed == 0
+    assert doctest.testmod(configuration).failed == 0
 
 
 def test_empty_mappings_are_kept_only_if_asked():

@@ -12,8 +12,8 @@ from gsbench.analysis.results import load_experiment
 from gsbench.launch.states import states_of_experiment
 from gsbench.parsing import DamagedError
 from gsbench.runs import freshness
-from gsbench.runs.config_hash import config_hash
-from gsbench.runs.nested import sha256_of
+from gsbench.runs.code import config_hash
+from gsbench.runs.configuration import sha256_of
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.view.trials import model_file
 from tests.fuzz.records import EXPERIMENT, write_trial

@@ -16,7 +16,7 @@ from gsbench.config.compose import compose_one
 from gsbench.errors import InputError
 from gsbench.pipeline.parts import Parts
 from gsbench.pipeline.steps.scene import CaptureSource
-from gsbench.runs.user_code import UserCode
+from gsbench.runs.code import UserCode
 from gsbench.scene.colmap import read_model
 from gsbench.scene.options import SceneConfig
 from gsbench.scene.record import Photograph, RawCapture, read_own

@@ -8,7 +8,8 @@ import pytest
 from PIL import Image
 
 from gsbench.config.compose import compose_one
-from gsbench.runs.config_hash import arm_hash, config_hash
+from gsbench.runs.code import config_hash
+from gsbench.runs.configuration import arm_hash
 from gsbench.runs.trial_record import TwinViews
 from gsbench.scene import rules
 from gsbench.scene.options import SceneConfig

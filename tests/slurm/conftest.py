@@ -1,5 +1,5 @@
-"""The environment of the program, as in the end-to-end tests."""
+"""The program, as in the end-to-end tests."""
 
-from tests.end_to_end.conftest import environment
+from tests.end_to_end.conftest import environment, gsbench, start
 
-__all__ = ["environment"]
+__all__ = ["environment", "gsbench", "start"]

@@ -9,7 +9,6 @@ import re
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 from shlex import split
@@ -42,7 +41,7 @@ class Broken(ADC):
         return super().refine(step, gaussians, rng)
 """
 # seconds per iteration: a trial of 300 does not fit into Slurm's shortest time limit, a minute
-PAUSE = 0.2
+PAUSE, LONG_PAUSE = "0.2", "0.4"
 SWEEP = [*split("--config-dir conf -m"), *SMALL]
 SWEEP += split("name=cluster densify=slow allow_targets=[slow] tracking=none")
 # Slurm sends its signal up to half a minute before the five seconds.
@@ -76,18 +75,6 @@ def place(tmp_path):
     return tmp_path
 
 
-def start(place, environment, runs, *words, pause=0):
-    command, variables = called(environment, runs, words, pause)
-    output = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-    return subprocess.Popen(command, cwd=place, env=variables, **output)
-
-
-def called(environment, runs, words, pause=0):
-    """A command line of gsbench and its variables."""
-    variables = environment | {"GSBENCH_RUNS": str(runs), "PAUSE": str(pause)}
-    return [sys.executable, "-m", "gsbench.cli", *words], variables
-
-
 def models(runs):
     return {
         path.parent.name: path.read_bytes() for path in runs.glob("cluster/*/*/*/point_cloud.ply")
@@ -102,13 +89,11 @@ def queue():
     return completed(split("squeue --me -h -r -o %i")).stdout.split()
 
 
-def test_a_requeued_sweep_ends_with_the_models_of_an_undisturbed_one(place, environment):
-    whole = start(place, environment, place / "whole", *SWEEP, "seed=0,1")
-    output, _ = whole.communicate(timeout=300)
-    assert whole.returncode == 0, output
+def test_a_requeued_sweep_ends_with_the_models_of_an_undisturbed_one(place, gsbench, start):
+    gsbench(*SWEEP, "seed=0,1", GSBENCH_RUNS=str(place / "whole"))
 
     runs = place / "runs"
-    first = start(place, environment, runs, *SWEEP, "seed=0,1", *CLUSTER, pause=PAUSE)
+    first = start(*SWEEP, "seed=0,1", *CLUSTER, PAUSE=PAUSE)
     deadline = time.monotonic() + 120
     while (
         len(list(runs.glob("store/train/.*.partial/metrics.jsonl"))) < 2
@@ -125,7 +110,7 @@ def test_a_requeued_sweep_ends_with_the_models_of_an_undisturbed_one(place, envi
     assert first.returncode == 130
     assert "the jobs stay in Slurm" in output
 
-    second = start(place, environment, runs, *SWEEP, "seed=0,1", *CLUSTER, pause=PAUSE)
+    second = start(*SWEEP, "seed=0,1", *CLUSTER, PAUSE=PAUSE)
     output, _ = second.communicate(timeout=280)
     logs = job_logs(runs)
     assert second.returncode == 0, output + logs
@@ -143,29 +128,23 @@ def test_a_requeued_sweep_ends_with_the_models_of_an_undisturbed_one(place, envi
     assert logs.count("going on from iteration") >= 2, logs
 
 
-def gsbench(place, environment, *words, pause=0):
-    """Run the program to its end; its output is in stdout, its log lines in stderr."""
-    command, variables = called(environment, place / "runs", words, pause)
-    return completed(command, code=None, cwd=place, env=variables, timeout=240)
-
-
-def states(place, environment):
+def states(gsbench):
     """The state of each arm by ``gsbench status``."""
-    listing = json.loads(gsbench(place, environment, "status", "cluster", "--json").stdout)
+    listing = json.loads(gsbench("status cluster --json", code=None).stdout)
     return {
         Path(trial["folder"]).parent.name.removeprefix("random-"): trial["state"]
         for trial in listing
     }
 
 
-def wait_for_states(place, environment, **wanted):
+def wait_for_states(place, gsbench, **wanted):
     deadline = time.monotonic() + 240
-    while (found := states(place, environment)) != wanted:
+    while (found := states(gsbench)) != wanted:
         assert time.monotonic() < deadline, (found, job_logs(place / "runs"))
         time.sleep(1)
 
 
-def test_status_and_retry_manage_a_sweep_that_was_left_to_slurm(place, environment):
+def test_status_and_retry_manage_a_sweep_that_was_left_to_slurm(place, gsbench):
     (place / "broken").touch()
     sweep = [
         *SWEEP,
@@ -177,66 +156,50 @@ def test_status_and_retry_manage_a_sweep_that_was_left_to_slurm(place, environme
     ]
 
     # The first trial must still train when the sweep is given again, also on a busy machine.
-    first = gsbench(place, environment, *sweep, pause=2 * PAUSE)
-    assert first.returncode == 0, first.stderr
+    first = gsbench(*sweep, PAUSE=LONG_PAUSE)
     assert re.fullmatch(r"Slurm job \d+: 2 trials; see gsbench status cluster\n", first.stdout)
     array = first.stdout.split()[2].rstrip(":")
     assert {job.split("_")[0] for job in queue()} == {array}
-    wait_for_states(place, environment, slow="running", broken="queued")
-    listing = gsbench(place, environment, "status", "cluster")
-    assert listing.returncode == 0
+    wait_for_states(place, gsbench, slow="running", broken="queued")
+    listing = gsbench("status cluster")
     assert f"Slurm job {array}_1, pending (" in listing.stdout
-    assert "nothing to retry" in gsbench(place, environment, "retry", "cluster").stdout
-    assert (
-        "2 trials: 1 queued, 1 running" in gsbench(place, environment, *sweep, "--dry-run").stdout
-    )
+    assert "nothing to retry" in gsbench("retry cluster").stdout
+    assert "2 trials: 1 queued, 1 running" in gsbench(*sweep, "--dry-run").stdout
 
-    second = gsbench(place, environment, *sweep, pause=2 * PAUSE)
-    assert (second.returncode, second.stdout) == (0, first.stdout), second.stderr
+    second = gsbench(*sweep, PAUSE=LONG_PAUSE)
+    assert second.stdout == first.stdout
     assert len(list(place.glob("runs/.jobs/cluster/*/*_submission.sh"))) == 1, (
         "the trials were submitted a second time"
     )
 
-    wait_for_states(place, environment, slow="done", broken="failed")
-    listing = gsbench(place, environment, "status", "cluster")
-    assert listing.returncode == 1
+    wait_for_states(place, gsbench, slow="done", broken="failed")
+    listing = gsbench("status cluster", code=1)
     assert "it is broken" in listing.stdout
     (place / "broken").unlink()
-    again = gsbench(place, environment, "retry", "cluster", "allow_targets=[slow]")
-    assert again.returncode == 0, again.stderr
+    again = gsbench("retry cluster allow_targets=[slow]")
     assert re.fullmatch(r"Slurm job \d+: 1 trial; see gsbench status cluster\n", again.stdout)
     assert again.stdout.split()[2].rstrip(":") != array
-    wait_for_states(place, environment, slow="done", broken="done")
+    wait_for_states(place, gsbench, slow="done", broken="done")
     assert not list(place.glob("runs/cluster/*/*/*/.submitted.json"))
 
 
-def test_a_cancelled_job_is_missing_and_can_run_without_slurm(place, environment):
+def test_a_cancelled_job_is_missing_and_can_run_without_slurm(place, gsbench):
     later = [*CLUSTER, "launch.wait=false", "launch.sbatch={begin: now+1hour}"]
-    done = gsbench(place, environment, *SWEEP, *later)
-    assert done.returncode == 0, done.stderr
-    job = done.stdout.split()[2].rstrip(":")
-    assert states(place, environment) == {"slow": "queued"}
+    job = gsbench(*SWEEP, *later).stdout.split()[2].rstrip(":")
+    assert states(gsbench) == {"slow": "queued"}
     completed(["scancel", job])
-    wait_for_states(place, environment, slow="missing")
-    assert (
-        f"Slurm job {job} has ended, log: "
-        in gsbench(place, environment, "status", "cluster").stdout
-    )
-    words = ["launch=serial", "allow_targets=[slow]"]  # launch=serial has no launch.wait
-    again = gsbench(place, environment, "retry", "cluster", *words)
-    assert again.returncode == 0, again.stderr
-    assert states(place, environment) == {"slow": "done"}
+    wait_for_states(place, gsbench, slow="missing")
+    ended = gsbench("status cluster", code=None)
+    assert f"Slurm job {job} has ended, log: " in ended.stdout
+    gsbench("retry cluster launch=serial allow_targets=[slow]")  # launch=serial has no launch.wait
+    assert states(gsbench) == {"slow": "done"}
 
 
-def test_failed_trial_and_killed_job_are_reported(place, environment):
+def test_failed_trial_and_killed_job_are_reported(place, gsbench, start):
     runs = place / "runs"
-    slow = start(
-        place, environment, runs, *SWEEP, "seed=0", *CLUSTER, "launch.timeout_min=10", pause=PAUSE
-    )
-    bad = start(place, environment, runs, *SWEEP, "seed=1,2", "densify.split_size=-1", *CLUSTER)
-    output, _ = bad.communicate(timeout=120)
-    assert bad.returncode == 2, output
-    assert "densify.split_size" in output
+    slow = start(*SWEEP, "seed=0", *CLUSTER, "launch.timeout_min=10", PAUSE=PAUSE)
+    bad = gsbench(*SWEEP, "seed=1,2", "densify.split_size=-1", *CLUSTER, code=2)
+    assert "densify.split_size" in bad.stderr
     deadline = time.monotonic() + 120
     while (
         not list(runs.glob("store/train/.*.partial/metrics.jsonl")) and time.monotonic() < deadline
@@ -247,7 +210,7 @@ def test_failed_trial_and_killed_job_are_reported(place, environment):
     ]
     job = read_json(folder / ".submitted.json")["job"]
     holder = read_json(folder / ".lock.holder")
-    status = gsbench(place, environment, "status", "cluster")
+    status = gsbench("status cluster", code=None)
     assert "running" in status.stdout
     assert f"Slurm job {holder['slurm']}" in status.stdout
     os.kill(holder["pid"], signal.SIGKILL)

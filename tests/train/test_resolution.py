@@ -8,7 +8,7 @@ import pytest
 
 from gsbench.analysis.differences import ingredients
 from gsbench.densify import EdgeAware
-from gsbench.runs.config_hash import config_hash
+from gsbench.runs.code import config_hash
 from gsbench.scene.types import View
 from gsbench.train.resolution import (
     Resolution,

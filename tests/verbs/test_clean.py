@@ -5,10 +5,9 @@ import time
 
 import pytest
 
-from gsbench.runs.cleaning import free, stored
 from gsbench.runs.keys import Step
 from gsbench.runs.layout import STORE
-from gsbench.runs.store import Store
+from gsbench.runs.store import Store, free, stored
 from gsbench.system.locks import hold
 from tests.helpers import refusal, write
 from tests.runs.toy import TOY, build

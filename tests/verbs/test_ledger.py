@@ -15,11 +15,10 @@ from gsbench.claims.ledger import read_ledger
 from gsbench.cli import run
 from gsbench.launch import record as writing
 from gsbench.runs import commands
+from gsbench.runs.code import states_of, user_modules
 from gsbench.runs.keys import CODE_OF_STAGE
 from gsbench.runs.layout import COMMANDS
-from gsbench.runs.package_code import states_of
 from gsbench.runs.trial_record import Code
-from gsbench.runs.user_code import user_modules
 from gsbench.verbs import ledger as verb
 from tests.composed import composed
 from tests.conftest import script

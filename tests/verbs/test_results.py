@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from gsbench.runs.package_code import AS_RELEASED
+from gsbench.runs.code import AS_RELEASED
 from gsbench.verbs.results import _origin, explain, explain_cell, report, tables
 from tests.helpers import refusal, table
 from tests.trials import write_runs

@@ -21,8 +21,7 @@ from gsbench.analysis.quantities import Quantity, metric_keys
 from gsbench.analysis.results import Experiment, TrialResult, group_by
 from gsbench.analysis.trial_result import Planned, Trained
 from gsbench.errors import InputError
-from gsbench.runs.config_hash import is_hashed
-from gsbench.runs.nested import SHOWN
+from gsbench.runs.configuration import SHOWN, is_hashed
 from gsbench.words import value_words
 
 if TYPE_CHECKING:

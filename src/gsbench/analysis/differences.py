@@ -15,9 +15,8 @@ from gsbench.analysis.results import Arm, TrialPair, TrialResult, group_by
 from gsbench.analysis.trial_result import Trained, canonical
 from gsbench.gaussians.paper_values import RATES
 from gsbench.parsing import table_beside
-from gsbench.runs.config_hash import is_ignored, is_ingredient, is_of_scene
+from gsbench.runs.configuration import SHOWN, is_ignored, is_ingredient, is_of_scene
 from gsbench.runs.freshness import Part
-from gsbench.runs.nested import SHOWN
 from gsbench.words import counted, some_of
 
 Versions = dict[str, list[TrialResult]]  # version -> the trials that it made

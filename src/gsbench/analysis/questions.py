@@ -27,7 +27,7 @@ from gsbench.analysis.statistics import ALPHA, MIN_SCENES, sign_test_needs
 from gsbench.analysis.trial_result import Trained, canonical, seeds_text
 from gsbench.errors import InputError
 from gsbench.runs.commands import Digest, History, Place, Question, code_in
-from gsbench.runs.config_hash import is_ignored, is_of_scene
+from gsbench.runs.configuration import is_ignored, is_of_scene
 from gsbench.runs.experiments import Arm
 from gsbench.words import counted, some_of
 

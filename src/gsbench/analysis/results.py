@@ -19,13 +19,13 @@ from gsbench.analysis.trial_result import TrialResult as TrialResult
 from gsbench.errors import InputError
 from gsbench.files import require_no_links
 from gsbench.parsing import DamagedError, one_line
+from gsbench.runs.code import edited
 from gsbench.runs.commands import Digest, History, Question, code_in, read_history
+from gsbench.runs.configuration import SHOWN
 from gsbench.runs.experiments import Arm as Arm
 from gsbench.runs.experiments import experiment_home, trial_folders
 from gsbench.runs.freshness import Change, code_changes
 from gsbench.runs.layout import CONFIG, FAILED, PER_VIEW, RESULTS, SEED
-from gsbench.runs.nested import SHOWN
-from gsbench.runs.package_code import edited
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import UnfinishedError
 from gsbench.words import command, counted, some_of

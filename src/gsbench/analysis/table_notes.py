@@ -9,8 +9,8 @@ from gsbench.analysis.notes import Note
 from gsbench.analysis.results import TrialResult, group_by
 from gsbench.analysis.trial_result import seeds_text
 from gsbench.events import FEWEST_ROUNDS
+from gsbench.runs.configuration import SHOWN
 from gsbench.runs.layout import EVENTS
-from gsbench.runs.nested import SHOWN
 from gsbench.runs.trial_record import FROM_MODEL, FROM_RENDERS
 from gsbench.words import counted
 

@@ -11,11 +11,10 @@ from typing import Any
 
 from gsbench.parsing import DamagedError, lines_in
 from gsbench.runs.commands import Digest, make_digest, shared_hash
-from gsbench.runs.config_hash import is_hashed, is_ignored
+from gsbench.runs.configuration import SHOWN, flatten, is_hashed, is_ignored
 from gsbench.runs.experiments import QUESTIONS, Arm, trial_key, unix_time
 from gsbench.runs.freshness import Part, code_of
 from gsbench.runs.layout import CONFIG, RESULTS
-from gsbench.runs.nested import SHOWN, flatten
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS, TrialRecord, split_text
 from gsbench.system.machine import kind_of_machine

@@ -24,7 +24,7 @@ from gsbench.errors import InputError
 from gsbench.eval.options import EvalConfig
 from gsbench.launch.batch import check_parts, missing_folders, need_no_check, run_batch
 from gsbench.launch.estimates import describe_plan
-from gsbench.launch.outcomes import Outcome
+from gsbench.launch.jobs import Outcome
 from gsbench.launch.record import check_questions, forget_refused
 from gsbench.words import command, counted
 

@@ -30,8 +30,7 @@ from gsbench.config.schema import check, plain
 from gsbench.errors import GsbenchError, InputError
 from gsbench.files import checked_runs_folder, storage_errors
 from gsbench.launch.batch import begin
-from gsbench.launch.jobs import check_job_links
-from gsbench.launch.outcomes import Outcome, outcome_of_error
+from gsbench.launch.jobs import Outcome, check_job_links, outcome_of_error
 from gsbench.logs import set_up_logging
 from gsbench.runs.experiments import DEFAULT_METRIC, metric_and_question
 from gsbench.system.programs import allow_modules

@@ -24,7 +24,7 @@ from gsbench.config.overrides import key_of
 from gsbench.config.schema import register_schemas
 from gsbench.config.trust import ALLOWED, load_callbacks
 from gsbench.errors import InputError
-from gsbench.runs.nested import targets_in
+from gsbench.runs.configuration import targets_in
 from gsbench.system.install import conf_dir
 
 FOLDER = ".hydra"  # below the runs folder

@@ -17,7 +17,7 @@ from gsbench.config.compose import Composer, Trial, config_loader, hydra_config,
 from gsbench.config.explain import explained
 from gsbench.config.overrides import is_sweep, parse_word
 from gsbench.errors import InputError
-from gsbench.launch.outcomes import Outcome
+from gsbench.launch.jobs import Outcome
 from gsbench.logs import set_up_logging
 from gsbench.pipeline.metric_facts import facts_for
 

@@ -32,6 +32,7 @@ from gsbench.config.schema import TUNE, TuneSettings
 from gsbench.errors import GsbenchError, InputError
 from gsbench.eval.facts import known_keys
 from gsbench.files import make_runs_folder, write_json
+from gsbench.runs.configuration import flatten
 from gsbench.runs.experiments import (
     DEFAULT_METRIC,
     SearchPoint,
@@ -40,7 +41,6 @@ from gsbench.runs.experiments import (
     metric_and_question,
 )
 from gsbench.runs.layout import TUNING
-from gsbench.runs.nested import flatten
 from gsbench.settings import check_values
 from gsbench.system.install import require_package
 from gsbench.words import command, counted, did_you_mean, listed

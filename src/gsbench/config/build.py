@@ -19,8 +19,8 @@ from gsbench.config.trust import (
 )
 from gsbench.errors import InputError
 from gsbench.external.settings import External
-from gsbench.runs.nested import GSBENCH, targets_in
-from gsbench.runs.user_code import module_digest, unnamed_modules
+from gsbench.runs.code import module_digest, unnamed_modules
+from gsbench.runs.configuration import GSBENCH, targets_in
 from gsbench.settings import check_values, unknown_setting
 from gsbench.words import did_you_mean
 

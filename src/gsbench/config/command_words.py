@@ -13,8 +13,8 @@ from gsbench.config.overrides import bare_key, is_sweep, key_of, parse_word
 from gsbench.config.search_path import search_path, searched_folders
 from gsbench.config.trust import reading
 from gsbench.errors import InputError
-from gsbench.runs.config_hash import READING, WITHOUT_EFFECT, is_hashed, purpose
-from gsbench.runs.user_code import PERMISSIONS
+from gsbench.runs.code import PERMISSIONS
+from gsbench.runs.configuration import READING, WITHOUT_EFFECT, is_hashed, purpose
 from gsbench.words import did_you_mean
 
 OPTIONS = (

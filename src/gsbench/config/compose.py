@@ -35,8 +35,8 @@ from gsbench.config.search_path import (
 )
 from gsbench.config.trust import MADE_NODES, check_composed, check_permissions, check_texts
 from gsbench.errors import InputError
+from gsbench.runs.code import PERMISSIONS
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.runs.user_code import PERMISSIONS
 from gsbench.settings import check_values
 from gsbench.system.install import conf_dir
 from gsbench.system.programs import allow_modules

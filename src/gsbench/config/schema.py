@@ -24,8 +24,8 @@ from gsbench.config.trust import is_external
 from gsbench.errors import InputError
 from gsbench.eval.options import EvalConfig
 from gsbench.raster.executors import RasterConfig
+from gsbench.runs.configuration import GSBENCH, entries_of
 from gsbench.runs.layout import IN_RUNS
-from gsbench.runs.nested import GSBENCH, entries_of
 from gsbench.scene.options import SceneConfig
 from gsbench.settings import (
     FOLDER_RULE,

@@ -24,8 +24,8 @@ from omegaconf.grammar_parser import parse
 from gsbench.errors import InputError
 from gsbench.external.settings import program_of
 from gsbench.parsing import table_beside
-from gsbench.runs.nested import TARGET, entries_of, targets_in
-from gsbench.runs.user_code import PERMISSIONS
+from gsbench.runs.code import PERMISSIONS
+from gsbench.runs.configuration import TARGET, entries_of, targets_in
 from gsbench.system.programs import allowed_modules
 from gsbench.words import did_you_mean
 

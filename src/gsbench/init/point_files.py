@@ -8,7 +8,6 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from gsbench.errors import InputError
@@ -99,6 +98,8 @@ def _read_table(path: Path) -> Columns:
     Names may come first, also behind ``//`` or ``#``. A line of one number is the count of points,
     with which each scan of a ``.pts`` file begins.
     """
+    import pandas as pd  # here, since it is slow to import
+
     text = without_byte_order_mark(path.read_bytes()).decode(errors="replace")
     if "POINT3D_ID" in text[:1000]:
         raise ValueError(OF_COLMAP)

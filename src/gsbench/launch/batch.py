@@ -11,15 +11,14 @@ from gsbench.config.schema import COMPONENTS
 from gsbench.errors import InputError
 from gsbench.files import FORBIDDEN, checked_runs_folder, make_runs_folder, storage_errors
 from gsbench.launch.estimates import unavailable_now
-from gsbench.launch.jobs import run_local, run_serial
-from gsbench.launch.outcomes import Outcome, outcome_of_results
+from gsbench.launch.jobs import Outcome, outcome_of_results, run_local, run_serial
 from gsbench.launch.record import asked_metrics, record
 from gsbench.launch.slurm import run_slurm
+from gsbench.runs.code import PERMISSIONS
 from gsbench.runs.freshness import Change
 from gsbench.runs.keys import STAGES, VIEWS
 from gsbench.runs.layout import STORE
 from gsbench.runs.store import Store
-from gsbench.runs.user_code import PERMISSIONS
 from gsbench.system.stopping import stop_on_signals
 from gsbench.tracking import Mirror
 from gsbench.tracking.sync import make_sink

@@ -28,9 +28,9 @@ from gsbench.launch.states import (
     summary_of,
 )
 from gsbench.parsing import DamagedError
+from gsbench.runs.configuration import Values, sha256_of
 from gsbench.runs.experiments import experiment_home
 from gsbench.runs.layout import CURVES, RESULTS, TRIAL_GLOB
-from gsbench.runs.nested import Values, sha256_of
 from gsbench.runs.trial_files import read_rows
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.scene.images import image_size

@@ -39,9 +39,9 @@ from gsbench.runs.commands import (
     drop,
     read_history,
 )
+from gsbench.runs.configuration import flatten
 from gsbench.runs.experiments import DEFAULT_METRIC, QUESTIONS, metric_and_question
 from gsbench.runs.layout import ASKED, RESULTS, SEED, TUNING
-from gsbench.runs.nested import flatten
 from gsbench.settings import check_values
 from gsbench.words import did_you_mean
 

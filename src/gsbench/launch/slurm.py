@@ -13,12 +13,12 @@ from gsbench.config.compose import Trial
 from gsbench.errors import InputError
 from gsbench.launch.jobs import (
     SECONDS_BETWEEN_POLLS,
+    Outcome,
     TrialJob,
     collect,
     new_job_folder,
     say_last,
 )
-from gsbench.launch.outcomes import Outcome
 from gsbench.launch.states import (
     ask_queue,
     current_user,

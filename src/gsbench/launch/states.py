@@ -19,7 +19,7 @@ from gsbench.errors import InputError
 from gsbench.files import write_json
 from gsbench.parsing import Record, read_if_sound
 from gsbench.runs.commands import PlannedTrial
-from gsbench.runs.config_hash import determining_settings
+from gsbench.runs.configuration import determining_settings
 from gsbench.runs.experiments import trial_folders
 from gsbench.runs.layout import CONFIG, FAILED, LOCK, RESULTS, SEED, SUBMITTED
 from gsbench.runs.trial_folder import State, TrialFolder

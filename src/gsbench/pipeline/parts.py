@@ -22,9 +22,9 @@ from gsbench.external.settings import External
 from gsbench.init.base import Initializer
 from gsbench.raster import EXECUTORS, Rasterizer
 from gsbench.raster.executors import AUTO, lacks, resolve
+from gsbench.runs.code import UserCode, user_modules
+from gsbench.runs.configuration import GSBENCH, TARGET, targets_in
 from gsbench.runs.experiments import AT, metric_and_question
-from gsbench.runs.nested import GSBENCH, TARGET, targets_in
-from gsbench.runs.user_code import UserCode, user_modules
 from gsbench.scene.options import SceneConfig
 from gsbench.scene.record import SceneReader
 from gsbench.system.resources import available_threads, select_device

@@ -10,8 +10,8 @@ from gsbench.events import sum_events
 from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER, REPORT_FILE
 from gsbench.parsing import read_json, read_typed
 from gsbench.runs import keys, layout
-from gsbench.runs.config_hash import arm_hash, config_hash
-from gsbench.runs.nested import flatten, sha256_of
+from gsbench.runs.code import config_hash, user_modules
+from gsbench.runs.configuration import arm_hash, flatten, sha256_of
 from gsbench.runs.store import StoredResult, read_manifest
 from gsbench.runs.trial_files import read_rows
 from gsbench.runs.trial_record import (
@@ -28,7 +28,6 @@ from gsbench.runs.trial_record import (
     TwinViews,
     split_text,
 )
-from gsbench.runs.user_code import user_modules
 from gsbench.scene.rules import settle
 from gsbench.scene.types import Capture, Scene
 from gsbench.system.install import version_of

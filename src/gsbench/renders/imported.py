@@ -29,6 +29,7 @@ from gsbench.files import atomic, file_sha256, write_text
 from gsbench.pipeline.results import versions
 from gsbench.pipeline.steps.evaluate import summary_of, write_per_view
 from gsbench.renders.sources import ReferenceImages
+from gsbench.runs.code import states_of
 from gsbench.runs.commands import (
     Command,
     History,
@@ -37,10 +38,9 @@ from gsbench.runs.commands import (
     read_history,
     shared_hash,
 )
+from gsbench.runs.configuration import flatten, sha256_of
 from gsbench.runs.keys import CODE_OF_STAGE, EVALUATE
 from gsbench.runs.layout import CONFIG, GROUND_TRUTH, IN_RUNS, MASKS, PER_VIEW, RENDERS, SEED
-from gsbench.runs.nested import flatten, sha256_of
-from gsbench.runs.package_code import states_of
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS, RENDERS_ALONE, Code, TrialRecord
 from gsbench.scene.images import png_name

@@ -29,7 +29,7 @@ from gsbench.renders.sources import (
     pictures_in,
     reference_images_of,
 )
-from gsbench.runs.user_code import PERMISSIONS
+from gsbench.runs.code import PERMISSIONS
 from gsbench.scene.names import Matching, match_by_order, match_pictures
 from gsbench.system.programs import allow_modules
 from gsbench.system.resources import available_threads, select_device

@@ -33,14 +33,12 @@ from gsbench.parsing import (
     parse_typed,
     read_bytes,
 )
-from gsbench.runs.config_hash import config_hash
+from gsbench.runs.code import config_hash, edited, states_of, user_modules
+from gsbench.runs.configuration import SHOWN, Values, sha256_of
 from gsbench.runs.experiments import Arm, list_experiments, make_home
 from gsbench.runs.keys import CODE_OF_STAGE
 from gsbench.runs.layout import COMMANDS, SEED
-from gsbench.runs.nested import SHOWN, Values, sha256_of
-from gsbench.runs.package_code import edited, states_of
 from gsbench.runs.trial_record import FROM_RENDERS
-from gsbench.runs.user_code import user_modules
 from gsbench.settings import ARM_BYTES, is_folder_name
 from gsbench.system.locks import hold
 from gsbench.words import counted

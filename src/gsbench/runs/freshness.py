@@ -16,10 +16,9 @@ from typing import Any, Literal
 from gsbench.files import file_sha256
 from gsbench.parsing import DamagedError, read_bytes
 from gsbench.runs import layout
-from gsbench.runs.config_hash import config_hash
+from gsbench.runs.code import config_hash, state_of
+from gsbench.runs.configuration import Values, sha256_of
 from gsbench.runs.keys import STAGES
-from gsbench.runs.nested import Values, sha256_of
-from gsbench.runs.package_code import state_of
 from gsbench.runs.store import read_manifest
 from gsbench.runs.trial_files import MadeOf, Stamp
 from gsbench.runs.trial_record import Code, TrialRecord

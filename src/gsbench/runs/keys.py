@@ -1,7 +1,7 @@
 """Stages and steps of a trial, and the keys under which the store keeps their results.
 
 A step is a stage with its inputs. Its key is known before it runs: the inputs contain the keys of
-earlier steps, and the code of gsbench (`package_code`) and of the user (`user_code`). Loads neither
+earlier steps, and the code of gsbench and of the user (`gsbench.runs.code`). Loads neither
 Hydra nor torch.
 """
 
@@ -13,10 +13,15 @@ from pathlib import Path
 from typing import Any
 
 from gsbench.errors import InputError
-from gsbench.runs.config_hash import WITHOUT_EFFECT
-from gsbench.runs.nested import sha256_of
-from gsbench.runs.package_code import changed_since_asked, edited, states_of
-from gsbench.runs.user_code import NO_USER_CODE, UserCode, has_changed_since_import
+from gsbench.runs.code import (
+    NO_USER_CODE,
+    UserCode,
+    changed_since_asked,
+    edited,
+    has_changed_since_import,
+    states_of,
+)
+from gsbench.runs.configuration import WITHOUT_EFFECT, sha256_of
 from gsbench.settings import option_fields
 
 

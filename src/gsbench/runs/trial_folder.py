@@ -35,8 +35,9 @@ from gsbench.parsing import (
     read_yaml,
 )
 from gsbench.runs import layout
+from gsbench.runs.code import PERMISSIONS, config_hash
 from gsbench.runs.commands import make_digest, remember_result, shared_hash
-from gsbench.runs.config_hash import config_hash
+from gsbench.runs.configuration import Values, sha256_of
 from gsbench.runs.freshness import (
     Change,
     changed_files,
@@ -44,7 +45,6 @@ from gsbench.runs.freshness import (
     damaged_entries,
     origin_of,
 )
-from gsbench.runs.nested import Values, sha256_of
 from gsbench.runs.trial_files import (
     Building,
     Configuration,
@@ -55,7 +55,6 @@ from gsbench.runs.trial_files import (
     read_rows,
 )
 from gsbench.runs.trial_record import TrialRecord, UnfinishedError, record_from
-from gsbench.runs.user_code import PERMISSIONS
 from gsbench.system.locks import is_held
 from gsbench.words import as_line, command
 

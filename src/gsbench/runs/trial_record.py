@@ -50,7 +50,7 @@ class Budget(Record):
 class Code(Record):
     """The versions of the code: sha256 of a user's modules (``sources``), and of the stages.
 
-    ``packages`` has the states of gsbench's packages (`gsbench.runs.package_code`). ``commit`` is
+    ``packages`` has the states of gsbench's packages (`gsbench.runs.code`). ``commit`` is
     that of the checkout that trained; ``edited`` says whether files that git tracks had changed.
     """
 

@@ -16,8 +16,8 @@ from gsbench.config.trust import foreign_address
 from gsbench.errors import InputError
 from gsbench.files import write_json
 from gsbench.parsing import one_line, read_if_sound
+from gsbench.runs.configuration import GSBENCH
 from gsbench.runs.layout import CONFIG, FAILED, LOG
-from gsbench.runs.nested import GSBENCH
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import BusyError, hold
 from gsbench.system.programs import own_folder

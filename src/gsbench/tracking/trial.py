@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from gsbench.eval.facts import find_metric
 from gsbench.runs import layout
 from gsbench.runs.commands import read_history
+from gsbench.runs.configuration import flatten, sha256_of
 from gsbench.runs.keys import TRAIN
-from gsbench.runs.nested import flatten, sha256_of
 from gsbench.runs.trial_files import read_rows
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import TrialRecord

@@ -22,6 +22,7 @@ from gsbench.errors import GsbenchError, InputError
 from gsbench.eval.options import EvalConfig
 from gsbench.files import make_runs_folder
 from gsbench.launch.record import planned_rows
+from gsbench.runs.code import config_hash
 from gsbench.runs.commands import (
     BASELINE,
     ERROR_RATE,
@@ -33,7 +34,6 @@ from gsbench.runs.commands import (
     append,
     command_now,
 )
-from gsbench.runs.config_hash import config_hash
 from gsbench.runs.layout import IN_RUNS
 from gsbench.settings import is_folder_name
 from gsbench.verbs import VERBS

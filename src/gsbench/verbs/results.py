@@ -35,8 +35,8 @@ from gsbench.analysis.table_formats import FORMATS, csv_of
 from gsbench.analysis.tables import build_table, format_cell
 from gsbench.errors import InputError
 from gsbench.files import own_output, writable_output, write_text
+from gsbench.runs.code import edited
 from gsbench.runs.experiments import list_experiments
-from gsbench.runs.package_code import edited
 from gsbench.verbs.arguments import options_of
 from gsbench.words import some_of, split_outside_brackets
 

@@ -15,10 +15,10 @@ from gsbench.config.command_words import typed_permissions
 from gsbench.config.overrides import key_of
 from gsbench.errors import GsbenchError, InputError
 from gsbench.files import require_no_links
+from gsbench.runs.code import PERMISSIONS
 from gsbench.runs.experiments import experiment_home, list_experiments, trial_folders
 from gsbench.runs.layout import DATABASE
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.runs.user_code import PERMISSIONS
 from gsbench.system.install import require_package
 from gsbench.system.isolate import end_descendants
 from gsbench.system.programs import allow_modules, own_folder, safe_environment

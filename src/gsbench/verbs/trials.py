@@ -31,12 +31,12 @@ from gsbench.launch.states import (
     states_of_experiment,
     summary_of,
 )
-from gsbench.runs.cleaning import Stored, free, stored
+from gsbench.runs.code import PERMISSIONS
 from gsbench.runs.commands import PlannedTrial, drop, read_history
 from gsbench.runs.experiments import experiment_home, list_experiments, trial_folders
+from gsbench.runs.store import Stored, free, stored
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS
-from gsbench.runs.user_code import PERMISSIONS
 from gsbench.system.locks import is_held
 from gsbench.system.programs import allow_modules
 from gsbench.verbs.arguments import options_of

@@ -28,9 +28,9 @@ from gsbench.pipeline.steps.external import external_step
 from gsbench.pipeline.steps.scene import init_step
 from gsbench.pipeline.steps.train import _log_normalization, train_step
 from gsbench.raster.reference import ReferenceRasterizer
+from gsbench.runs.code import UserCode
 from gsbench.runs.keys import INIT, Step
 from gsbench.runs.store import Store
-from gsbench.runs.user_code import UserCode
 from gsbench.scene.colmap import model_points, read_model, write_model
 from gsbench.scene.types import Capture, Scene, View
 from gsbench.system.programs import SAFE_PATH

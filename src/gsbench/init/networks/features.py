@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbench.files import DAMAGE, atomic, file_sha256
-from gsbench.runs.nested import sha256_of
+from gsbench.runs.configuration import sha256_of
 from gsbench.scene.types import Capture
 
 Size = NDArray[np.int64] | tuple[int, int]

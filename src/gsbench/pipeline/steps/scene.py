@@ -18,11 +18,11 @@ from gsbench.init.placed import GREY
 from gsbench.init.point_files import read_points
 from gsbench.logs import Progress, progress
 from gsbench.normalization import IDENTITY
+from gsbench.runs.code import NO_USER_CODE, UserCode
+from gsbench.runs.configuration import sha256_of
 from gsbench.runs.keys import CAPTURE, GROUND_TRUTH, INIT, Step, options_of, step_of
 from gsbench.runs.layout import MASKS
-from gsbench.runs.nested import sha256_of
 from gsbench.runs.store import Store
-from gsbench.runs.user_code import NO_USER_CODE, UserCode
 from gsbench.scene.beside import (
     IMAGES,
     digests,

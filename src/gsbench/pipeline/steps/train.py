@@ -22,7 +22,7 @@ from gsbench.init import read_cloud
 from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER
 from gsbench.logs import progress
 from gsbench.pipeline.steps.scene import Views
-from gsbench.runs.config_hash import is_ingredient
+from gsbench.runs.configuration import is_ingredient
 from gsbench.runs.keys import TRAIN, Step, options_of, rasterizer_inputs, step_of
 from gsbench.runs.layout import LINEAGE, POINT_CLOUD, TRAINING
 from gsbench.runs.trial_record import InitialCloud, Oddity

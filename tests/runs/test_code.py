@@ -10,23 +10,21 @@ from itertools import chain
 
 import pytest
 
-from gsbench.runs import package_code, user_code
-from gsbench.runs.config_hash import config_hash
-from gsbench.runs.keys import CODE_OF_STAGE
-from gsbench.runs.package_code import (
+from gsbench.runs import code
+from gsbench.runs.code import (
     AS_RELEASED,
     PACKAGE,
     changed_since_asked,
+    config_hash,
     edited,
-    states_of,
-    syntax_of,
-)
-from gsbench.runs.user_code import (
     has_changed_since_import,
     module_digest,
+    states_of,
+    syntax_of,
     unnamed_modules,
     user_modules,
 )
+from gsbench.runs.keys import CODE_OF_STAGE
 from gsbench.system.programs import allow_modules, allowed_modules
 from tests.conftest import script
 from tests.helpers import write
@@ -70,7 +68,7 @@ def package(tmp_path, monkeypatch):
     copy = shutil.copytree(
         PACKAGE, tmp_path / "gsbench", ignore=shutil.ignore_patterns("__pycache__", "*.json")
     )
-    monkeypatch.setattr(package_code, "PACKAGE", copy)
+    monkeypatch.setattr(code, "PACKAGE", copy)
     again()
     yield copy
     again()
@@ -78,7 +76,7 @@ def package(tmp_path, monkeypatch):
 
 def again():
     """Forget what this process has read, as in a new process."""
-    for cached in (package_code._released, package_code.state_of, package_code._first_contents):
+    for cached in (code._released, code.state_of, code._first_contents):
         cached.cache_clear()
 
 
@@ -167,7 +165,7 @@ def test_the_next_process_notices_an_edit_but_not_a_comment(package):
 
 def test_the_digest_of_a_package_is_the_recorded_one(tmp_path, monkeypatch):
     """Recorded before the code of the digests was moved: stores of edited checkouts stay valid."""
-    monkeypatch.setattr(package_code, "PACKAGE", tmp_path)
+    monkeypatch.setattr(code, "PACKAGE", tmp_path)
     (tmp_path / "pack/inner").mkdir(parents=True)
     for name in ("pack/b.py", "pack/inner/deep.py", "one.py"):
         (tmp_path / name).write_text(
@@ -185,9 +183,7 @@ def test_released_code_adds_nothing_to_keys(package, monkeypatch):
     script("released").main()
     again()
     with monkeypatch.context() as patch:
-        patch.setattr(
-            package_code, "syntax_of", lambda source: pytest.fail("a released package is parsed")
-        )
+        patch.setattr(code, "syntax_of", lambda source: pytest.fail("a released package is parsed"))
         released = states_of(CODE_OF_STAGE["train"])
     assert set(released.values()) == {AS_RELEASED}
     assert edited(released) == {}
@@ -207,7 +203,7 @@ def test_the_users_cache_keeps_digests_and_may_be_damaged(package, tmp_path, mon
     before = states_of(["train"])
     again()
     with monkeypatch.context() as patch:
-        patch.setattr(package_code, "syntax_of", lambda *_: pytest.fail("it is parsed again"))
+        patch.setattr(code, "syntax_of", lambda *_: pytest.fail("it is parsed again"))
         assert changed(before) == []
     (kept,) = (tmp_path / "cache").rglob("*.json")
     for damaged in ("{", '{"a": 1}'):
@@ -326,9 +322,9 @@ def test_imported_modules_that_are_not_named_are_listed(home):
 def test_a_module_whose_file_is_gone_has_no_digest(tmp_path):
     spec = importlib.util.spec_from_file_location("passing", tmp_path / "passing.py")
     assert spec is not None
-    assert user_code._digest_on_disk(spec) is None
+    assert code._digest_on_disk(spec) is None
     (tmp_path / "passing.py").write_text(CLASS)
-    assert user_code._digest_on_disk(spec) == hashlib.sha256(syntax_of(CLASS.encode())).hexdigest()
+    assert code._digest_on_disk(spec) == hashlib.sha256(syntax_of(CLASS.encode())).hexdigest()
 
 
 def test_a_new_file_is_found_even_if_its_folder_keeps_its_time(home):

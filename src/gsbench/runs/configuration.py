@@ -1,14 +1,62 @@
-"""Purpose of each setting (purposes.yaml), and the hash of those that determine a result.
+"""Configurations as nested values, and the purpose of each setting (purposes.yaml)."""
 
-The hash names a trial's folder.
-"""
-
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
 from functools import cache
 from typing import Any
 
 from gsbench.parsing import table_beside
-from gsbench.runs.nested import GSBENCH, TARGET, Values, flatten, sha256_of
-from gsbench.runs.user_code import user_modules
+
+Values = Mapping[str, Any]  # the resolved configuration of a trial
+TARGET = "_target_"  # the key of a class's import path
+GSBENCH = "gsbench."  # prefix of the import paths of gsbench's own classes
+SHOWN = 8  # characters of a hash in messages
+
+
+def sha256_of(values: Any) -> str:
+    """sha256 of canonical JSON: sorted keys, no spaces, floats by repr."""
+    return hashlib.sha256(
+        json.dumps(values, sort_keys=True, separators=(",", ":")).encode()
+    ).hexdigest()
+
+
+def flatten(mapping: Mapping[str, Any], keep_empty: bool = False) -> dict[str, Any]:
+    """Nested mappings as one mapping with dotted keys; ``keep_empty`` keeps empty mappings.
+
+    Examples:
+        >>> flatten({"a": {"b": 1, "c": {}}, "d": [2]})
+        {'a.b': 1, 'd': [2]}
+    """
+    flat: dict[str, Any] = {}
+    for key, value in mapping.items():
+        if isinstance(value, Mapping) and (value or not keep_empty):
+            flat |= {f"{key}.{name}": inner for name, inner in flatten(value, keep_empty).items()}
+        else:
+            flat[str(key)] = value
+    return flat
+
+
+def targets_in(values: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Yield every ``_target_`` at any depth, also in lists, as (keys to its mapping, target)."""
+    return (
+        (inner, value)
+        for inner, key, value in entries_of(values, place)
+        if key == TARGET and value is not None
+    )
+
+
+def entries_of(
+    values: Any, place: tuple[str, ...] = ()
+) -> Iterator[tuple[tuple[str, ...], str, Any]]:
+    """Yield every entry at any depth, also in lists, as (keys that lead there, key, value)."""
+    if isinstance(values, Mapping | list | tuple):
+        for key, value in values.items() if isinstance(values, Mapping) else enumerate(values):
+            yield place, str(key), value
+            yield from entries_of(value, (*place, str(key)))
+
+
+# ---- the purpose of settings
 
 BOOKKEEPING, READING, PLACE = "bookkeeping", "reading", "place"
 PURPOSES = {
@@ -51,15 +99,6 @@ def is_ingredient(key: str) -> bool:
 def is_of_scene(key: str) -> bool:
     """Return whether each scene of an arm may have its own value."""
     return key in OF_A_SCENE or ("." in key and is_of_scene(key.rpartition(".")[0]))
-
-
-def config_hash(values: Values) -> str:
-    """sha256 of the settings and the user's code that determine a result, without the seed.
-
-    Names, devices, folders, tracking and launchers do not change it.
-    """
-    modules = user_modules(values)
-    return sha256_of(determining_settings(values) | ({"code": modules} if modules else {}))
 
 
 def determining_settings(values: Values) -> dict[str, Any]:
