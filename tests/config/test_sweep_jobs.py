@@ -31,6 +31,7 @@ def compositions(monkeypatch):
         return real(self, config_name, overrides, **settings)
 
     monkeypatch.setattr(ConfigLoaderImpl, "load_configuration", counted)
+    compose.composed_once.cache_clear()  # as in a new process
     return asked
 
 
