@@ -24,6 +24,7 @@ from gsbench.datasets.catalog import SceneFiles
 from gsbench.downloads import FetchError, RetryPolicy, with_retries
 from gsbench.errors import InputError
 from tests.datasets.server import Manners, serve
+from tests.datasets.tables import TABLES
 from tests.helpers import refusal, write
 
 PATIENT = RetryPolicy(timeout=0.3, tries=3, pause=0.01)
@@ -110,12 +111,7 @@ def test_a_member_without_a_name_is_skipped():
 
 @pytest.mark.parametrize(
     "names, said",
-    [
-        (("s/images/a", "s/images/a/b.jpg"), "images/a is a file and a folder in one"),
-        (("s/images/a/b/c.jpg", "s/images/a"), "images/a is a file and a folder in one"),
-        (("s/images/" + "x" * 252 + ".jpg",), "a name that no file can have"),
-        (("s/images/a\nb.jpg",), "a name that no file can have"),
-    ],
+    TABLES["names that no files can have"],
 )
 def test_names_that_cannot_be_files_together_are_refused(names, said):
     with open_archive(io.BytesIO(packed(*names)), "x.zip") as archive, refusal(said):
@@ -174,38 +170,21 @@ def fetched(server, target):
     return target.read_bytes()
 
 
-@pytest.mark.parametrize(
-    "manners",
-    [
-        Manners(),
-        Manners(cut_every=30_000, cuts=2),
-        Manners(stall_every=100_000, cuts=2),
-        Manners(fail_first=2),
-        Manners(redirect=True),
-    ],
-)
+@pytest.mark.parametrize("manners", TABLES["manners of a server"])
 def test_a_member_is_fetched_whole_and_alone(served, tmp_path, manners):
-    served.manners = manners
+    served.manners = Manners(**manners)
     assert fetched(served, tmp_path / "out") == np.random.default_rng(6).bytes(300_000)
-    if not manners.cut_every and not manners.stall_every:
+    if "cuts" not in manners:
         assert served.sent < 400_000  # the other member is not sent
 
 
-@pytest.mark.parametrize(
-    "manners, kind, said",
-    [
-        (Manners(cut_every=100), FetchError, r"3 failures in a row .*cut.*same command again"),
-        (Manners(stall_every=1), FetchError, "no answer in time"),
-        (Manners(status={"/file.zip": 403}), InputError, r"403 Forbidden.*--mirror"),
-        (Manners(status={"/file.zip": 503}), FetchError, r"3 failures in a row .*503"),
-        (Manners(ranges=False), InputError, "whole files only.*--mirror FOLDER"),
-        (Manners(claimed_size=590_000), (FetchError, InputError, DamagedMemberError), None),
-        (Manners(shift=7), DamagedMemberError, None),
-    ],
-)
-def test_faults_of_the_server_are_reported(served, tmp_path, manners, kind, said):
-    served.manners = manners
-    with pytest.raises(kind, match=said):
+ERRORS = {error.__name__: error for error in (FetchError, InputError, DamagedMemberError)}
+
+
+@pytest.mark.parametrize("manners, kinds, said", TABLES["faults of a server"])
+def test_faults_of_the_server_are_reported(served, tmp_path, manners, kinds, said):
+    served.manners = Manners(**manners)
+    with pytest.raises(tuple(map(ERRORS.get, kinds)), match=said):
         fetched(served, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 

@@ -13,6 +13,7 @@ from gsbench.downloads import RetryPolicy
 from gsbench.system.install import conf_dir
 from tests.datasets.conftest import archive_content, write_archive
 from tests.datasets.server import Manners
+from tests.datasets.tables import TABLES
 
 BAD_INPUT, FAILED = 2, 1
 
@@ -162,19 +163,7 @@ def test_the_list_tells_which_scenes_are_here(fetch, data, capsys, said):
     assert "images_4 is missing" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    "words, said",
-    [
-        (["mipnerf"], "no data set 'mipnerf'; did you mean mipnerf360?"),
-        (["garden"], "garden is a scene: gsbench fetch mipnerf360 garden"),
-        (["mipnerf360", "gardn"], "has no scene 'gardn'; did you mean garden?"),
-        (["mipnerf360", "garden", "--images", "images_16"], "no files below garden/images_16"),
-        *(
-            (["mipnerf360", "garden", "--mirror", place], "neither an http(s) address nor a folder")
-            for place in ("ftp://x", "http://[::1", "a\0b")
-        ),
-    ],
-)
+@pytest.mark.parametrize("words, said", TABLES["unknown names and addresses"])
 def test_unknown_names_and_addresses_are_refused(archives, data, capsys, words, said):
     mirror = [] if "--mirror" in words else ["--mirror", str(archives)]
     assert run(["fetch", *words, *mirror]) == BAD_INPUT

@@ -22,6 +22,7 @@ from gsbench.init.networks.models import (
 )
 from gsbench.weights import MissingWeightsError, load_state
 from tests.helpers import refusal
+from tests.init.tables import TABLES
 from tests.scene.courtyard.surfaces import surface_distance
 
 CPU = torch.device("cpu")
@@ -185,9 +186,7 @@ def test_disk_is_loaded_from_its_published_layout(tmp_path):
     assert (keypoints < torch.tensor([101, 75])).all()
 
 
-@pytest.mark.parametrize(
-    "extractor, threshold, radius", [("superpoint", 0.0005, 3), ("aliked", 0.2, 2), ("disk", 0, 2)]
-)
+@pytest.mark.parametrize("extractor, threshold, radius", TABLES["detection by extractor"])
 def test_detection_settings_are_the_extractors_own_unless_given(extractor, threshold, radius):
     """The defaults are those of deep-image-matching and the authors."""
     own = Dim(extractor=extractor)

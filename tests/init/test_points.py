@@ -206,9 +206,7 @@ def test_a_missing_file_is_refused_and_photos_without_cameras_need_a_reference(
     assert Points(path=tmp_path / "a.xyz").needs_reference(replace(bare_photos))
 
 
-@pytest.mark.parametrize(
-    "shape, kind", [((4, 2), "float64"), ((4,), "float64"), ((4, 3), "float32")]
-)
+@pytest.mark.parametrize("shape, kind", TABLES["arrays that are no points"])
 def test_a_cloud_refuses_points_of_another_shape_or_type(shape, kind):
     with pytest.raises(ValueError, match="points must be"):
         PointCloud(np.zeros(shape, kind), np.zeros(shape, np.uint8))

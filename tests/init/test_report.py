@@ -16,12 +16,13 @@ from gsbench.init.colmap.models import (
     align_poses,
     common_poses,
     compare_poses,
-    posed_images,
     training_extent,
 )
 from gsbench.init.report import make_report, measure_gauge, write_result
+from gsbench.scene.colmap import posed_images
 from gsbench.scene.types import Capture
 from tests.init.models import add_point, camera_at, model_with
+from tests.init.tables import TABLES
 
 NAMES = ("a.png", "b.png", "c.png", "d.png")
 CENTERS = np.array([[1.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0], [0, 5.0, 0]])  # d is held out
@@ -94,9 +95,7 @@ def test_doubts_about_a_model_are_measured_and_recorded(capture):
     assert report.to_dict()["oddities"][0]["rule"] == "few-placed"
 
 
-@pytest.mark.parametrize(
-    "focal, view", [(1140.0, 5.02), (1150.0, 4.98), (13.5, 149.8), (13.2, 150.4)]
-)
+@pytest.mark.parametrize("focal, view", TABLES["fields of view"])
 def test_a_field_of_view_outside_5_to_150_degrees_gives_a_warning(capture, focal, view):
     """Along the longest side, 100 px, it is 2 atan(50 / focal)."""
     assert math.degrees(2 * math.atan(50 / focal)) == pytest.approx(view, abs=0.05)

@@ -36,14 +36,7 @@ def reprojection_errors(model):
     return errors
 
 
-@pytest.mark.parametrize(
-    "model, params",
-    [
-        ("SIMPLE_PINHOLE", [160, 80, 60]),
-        ("PINHOLE", [160, 150, 79, 61]),
-        ("OPENCV", [160, 150, 79, 61, 0.05, 0, 0.001, 0]),
-    ],
-)
+@pytest.mark.parametrize("model, params", TABLES["cameras of larger photographs"])
 def test_cameras_follow_smaller_files(make_scene, model, params):
     # 162/4 = 40.5, 121/4 = 30.25
     root = make_scene(size=(41, 30), camera_size=(162, 121), model=model, params=params)
@@ -211,14 +204,7 @@ def test_each_file_of_a_model_with_rigs_is_read_to_its_end(rigs, stem):
             read_model(rigs)
 
 
-@pytest.mark.parametrize(
-    "stem, start, at, said",
-    [
-        ("rigs", 33, 7, "a sensor of rig 1"),
-        ("rigs", 98, 17, "a sensor of rig 1"),
-        ("frames", 16, 2, "frame 1"),
-    ],
-)
+@pytest.mark.parametrize("stem, start, at, said", TABLES["quaternions of rigs"])
 def test_a_zero_quaternion_of_a_rig_or_a_frame_is_refused(rigs, stem, start, at, said):
     """The quaternion at byte ``start``, or at word ``at`` of a text line, becomes zero."""
     (file,) = rigs.glob(f"{stem}.*")

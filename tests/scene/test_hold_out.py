@@ -142,14 +142,7 @@ def test_a_setting_that_the_kind_of_scene_does_not_read_is_refused(kind, changes
         SceneConfig(name="a", kind=kind, path=path, **changes)
 
 
-@pytest.mark.parametrize(
-    "settings, said",
-    [
-        ({"kind": "colmap"}, "scene.path is not set"),
-        ({"kind": "courtyard", "path": "/a"}, "built-in courtyard"),
-        ({"kind": "courtyard", "downscale": 20}, "at least 16 px are needed"),
-    ],
-)
+@pytest.mark.parametrize("settings, said", TABLES["paths and sizes refused"])
 def test_the_courtyard_alone_has_no_path_and_views_have_a_least_size(settings, said):
     with refusal(said):
         SceneConfig(name="a", **settings)

@@ -142,9 +142,7 @@ def test_a_dangling_link_is_named(photos, tmp_path):
         read_photos(tmp_path)
 
 
-@pytest.mark.parametrize(
-    "form", ["DDS", "JPEG2000", "GIF", "ICNS", "PPM", "TGA", "PCX", "SGI", "PDF", "EPS"]
-)
+@pytest.mark.parametrize("form", TABLES["formats refused"])
 def test_other_formats_are_refused_whatever_their_name(form, tmp_path):
     Image.new("RGB", (16, 16)).save(tmp_path / "a.bin", format=form)
     for suffix in IMAGE_SUFFIXES:

@@ -22,7 +22,7 @@ from tests.scene.tables import TABLES
 
 WIDTH, HEIGHT = 200, 150
 # Parameters beyond the focal length of 150 px and the centre, where small ones do not fit.
-OWN_EXTRA = {"FOV": [0.3], "EUCM": [0.5, 1.1], "SIMPLE_DIVISION": [-0.1], "DIVISION": [-0.1]}
+OWN_EXTRA = TABLES["distortions of their own"]
 PLAIN = {"INVALID", "PINHOLE", "SIMPLE_PINHOLE", "EQUIRECTANGULAR"}
 MODELS = sorted(set(pycolmap.CameraModelId.__members__) - PLAIN)
 

@@ -168,7 +168,7 @@ def test_a_photograph_without_changes_is_copied(tmp_path, mask, alpha, backdrop,
             assert_allclose(picture, np.broadcast_to(expected, (6, 8, 3)), atol=1)
 
 
-@pytest.mark.parametrize("width, height", [(25, 18), (10, 9), (20, 12), (17, 13)])
+@pytest.mark.parametrize("width, height", TABLES["sizes of masks"])
 def test_a_resized_pixel_counts_if_all_pixels_in_its_area_count(width, height):
     """A pixel belongs to the area that its centre is in; on an edge, to either side."""
     counts = np.random.default_rng(1).random((36, 50)) > 0.05

@@ -367,16 +367,14 @@ def test_a_focal_length_that_contradicts_the_field_of_view_is_used_with_one_line
     assert caplog.text.count("its focal length is 50 px, but its field of view means 132.") == 1
 
 
-@pytest.mark.parametrize("cx, cy, refused", [(40, 30, True), (10, 7, True), (40, 15, False)])
+@pytest.mark.parametrize("cx, cy, refused", TABLES["principal points"])
 def test_a_principal_point_of_a_larger_photograph_asks_for_its_size(tmp_path, cx, cy, refused):
     with refusal("another size than 40x30 px: add w and h" if refused else None):
         found = cameras(tmp_path, w=None, h=None, cx=cx, cy=cy)
         assert found["images/2.png"].params[2:] == (cx, cy)
 
 
-@pytest.mark.parametrize(
-    "said", [{"k3": 0.05}, {"camera_model": "FULL_OPENCV", "k3": 0.05, "k4": 0.02, "k6": 0.01}]
-)
+@pytest.mark.parametrize("said", TABLES["higher coefficients"])
 def test_higher_coefficients_distort_as_in_opencv(tmp_path, said):
     """OpenCV: (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)."""
     capture = capture_of(write(tmp_path, k1=0.1, k2=-0.02, **said))

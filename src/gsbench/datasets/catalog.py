@@ -9,6 +9,7 @@ from functools import cache
 from pathlib import Path
 
 import yaml
+from pydantic import TypeAdapter
 
 from gsbench.errors import InputError
 from gsbench.parsing import table_beside
@@ -71,14 +72,9 @@ def wanted_files(scene: str, images: str | None = None) -> SceneFiles:
 
 def read_catalog() -> dict[str, PublicDataset]:
     """The data sets of gsbench's catalogue by name."""
-    datasets = {}
-    for name, entry in table_beside(__file__, "catalog.yaml").items():
-        archives = tuple(
-            Archive(archive["url"], archive["scenes"], archive.get("size", ""))
-            for archive in entry.pop("archives")
-        )
-        datasets[name] = PublicDataset(name=name, archives=archives, **entry)
-    return datasets
+    rows = table_beside(__file__, "catalog.yaml").items()
+    reader = TypeAdapter(PublicDataset)
+    return {name: reader.validate_python({"name": name, **row}) for name, row in rows}
 
 
 def data_dir() -> Path:

@@ -11,12 +11,11 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from annotated_types import Interval
-from numpy.typing import NDArray
 
 from gsbench.errors import InputError
 from gsbench.logs import Progress, no_progress
 from gsbench.runs.trial_record import Oddity
-from gsbench.scene.types import Capture
+from gsbench.scene.types import Array, ByteArray, Capture
 
 # below the output folder: where COLMAP users and 3DGS trainers look for a model
 MODEL_FOLDER = Path("sparse", "0")
@@ -57,8 +56,8 @@ class Timer:
 class PointCloud:
     """Coloured points: ``points`` [P, 3] float64 in world units, ``colors`` [P, 3] uint8 sRGB."""
 
-    points: NDArray[np.float64]
-    colors: NDArray[np.uint8]
+    points: Array
+    colors: ByteArray
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 3 or self.points.dtype != np.float64:

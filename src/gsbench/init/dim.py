@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeVar
 
 from annotated_types import Interval
-from pydantic import NonNegativeFloat, PositiveInt
+from pydantic import NonNegativeFloat, PositiveInt, TypeAdapter
 
 from gsbench.errors import InputError
 from gsbench.files import file_sha256
@@ -39,7 +39,7 @@ SUPERPOINT_LICENCE = "Magic Leap: academic or non-profit noncommercial research 
 
 # the files of extractors and of LightGlue, by name
 EXTRACTOR_WEIGHTS, LIGHTGLUE_WEIGHTS = (
-    {name: WeightsFile(**row | {"names": tuple(row["names"])}) for name, row in rows.items()}
+    TypeAdapter(dict[str, WeightsFile]).validate_python(rows)
     for rows in table_beside(__file__, "weights.yaml").values()
 )
 Extractor = Literal["superpoint", "aliked", "disk"]

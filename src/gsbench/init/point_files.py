@@ -14,7 +14,7 @@ from gsbench.errors import InputError
 from gsbench.files import DAMAGE, require_regular
 from gsbench.gaussians.ply_files import read_ply_data, recognised_format
 from gsbench.parsing import one_line, without_byte_order_mark
-from gsbench.scene.types import Array
+from gsbench.scene.types import Array, ByteArray
 
 log = logging.getLogger(__name__)
 
@@ -45,7 +45,7 @@ REMEDY = (
 )
 
 
-def read_points(path: Path) -> tuple[Array, NDArray[np.uint8] | None]:
+def read_points(path: Path) -> tuple[Array, ByteArray | None]:
     """Read points [P, 3] float64 and colours [P, 3], or None for a file without colours.
 
     The suffix tells the format. A ``.ply`` file, text or binary, has vertices with x, y, z in any
@@ -158,7 +158,7 @@ def _plain(word: str) -> str:
     return name[0] if name in ("rf", "gf", "bf") else name  # as CloudCompare writes
 
 
-def _eight_bits(colors: NDArray[np.generic]) -> NDArray[np.uint8]:
+def _eight_bits(colors: NDArray[np.generic]) -> ByteArray:
     """Colours from 0 to 255: 16-bit values are divided by 257, fractions multiplied by 255."""
     values = colors.astype(np.float64)
     is_whole = values.max() > 1 and (values == values.round()).all()

@@ -15,9 +15,9 @@ import pycolmap
 
 from gsbench.gaussians.paper_values import VOLUME_THRESHOLD
 from gsbench.init.base import MODEL_FOLDER, REPORT_FILE, Gauge, InitReport
-from gsbench.init.colmap.models import posed_images, training_extent
+from gsbench.init.colmap.models import training_extent
 from gsbench.runs.trial_record import Oddity
-from gsbench.scene.colmap import save_model
+from gsbench.scene.colmap import posed_images, save_model
 from gsbench.scene.rules import Finding, inspect
 from gsbench.scene.types import Capture
 

@@ -185,9 +185,8 @@ def _best_attempt(
     except UnplacedError:
         if not lacks_pairs:
             raise
-    if made and (not lacks_pairs or made[2]["poses"] == "shared"):
-        return made
-    if made and placed >= REGISTERED_SHARE * total:
+    is_enough = not lacks_pairs or placed >= REGISTERED_SHARE * total
+    if made and (is_enough or made[2]["poses"] == "shared"):
         return made
     logger.warning(
         "%s: %d of %d images placed from the pairs of init.pairs=auto: the others are matched, too",

@@ -28,14 +28,13 @@ from gsbench.scene.names import match
 from gsbench.scene.options import Backdrop
 from gsbench.scene.record import Photograph
 from gsbench.scene.rules import given
-from gsbench.scene.types import Camera, CameraModel, Capture
+from gsbench.scene.types import ByteArray, Camera, CameraModel, Capture, Mask
 from gsbench.scene.undistortion import as_colmap, grid, rays_through
 from gsbench.words import listed, some_of
 
 DEPTH = "depth"
 MILLIMETRE = 0.001  # of a world in metres: the step of most sensors
 Pixels = NDArray[Any]  # [H, W] or [H, W, C]
-Mask = NDArray[np.bool_]  # [H, W], True where a pixel counts
 SUFFIX = ".png"
 WHITE = np.uint8(255)
 IMAGES, MASKS = "images", "masks"  # in the folder of `prepare_photograph`
@@ -132,7 +131,7 @@ def prepared_mask(folder: Path, name: str) -> Path:
     return folder / MASKS / f"{name}{SUFFIX}"
 
 
-def fill_ignored(image: NDArray[np.uint8], mask: Mask) -> NDArray[np.uint8]:
+def fill_ignored(image: ByteArray, mask: Mask) -> ByteArray:
     """``image`` [H, W, 3] with its ignored pixels interpolated from counted pixels nearby.
 
     Uses the pull and push of Gortler et al. 1996, "The Lumigraph", section 3.4.1: the counted
@@ -162,11 +161,10 @@ def _pull_push(image: NDArray[np.float32], mask: Mask) -> NDArray[np.float32]:
 
 def _double(image: NDArray[np.float32], axis: int) -> NDArray[np.float32]:
     """``image`` [H, W, 3] with twice as many pixels along ``axis``, interpolated linearly."""
-    rows = np.moveaxis(image, axis, 0)
-    padded = np.concatenate([rows[:1], rows, rows[-1:]])
-    pairs = [0.75 * rows + 0.25 * beside for beside in (padded[:-2], padded[2:])]
-    doubled = np.stack(pairs, axis=1, dtype=np.float32).reshape(-1, *rows.shape[1:])
-    return np.moveaxis(doubled, 0, axis)
+    places = np.arange(2 * image.shape[axis])
+    beside = places // 2 + 2 * (places % 2) - 1  # on the side of the finer pixel
+    own, other = (image.take(chosen, axis, mode="clip") for chosen in (places // 2, beside))
+    return 0.75 * own + 0.25 * other
 
 
 def resize_mask(mask: Mask, width: int, height: int) -> Mask:
@@ -256,7 +254,7 @@ def pixels_of_view(picture: Pixels, lens: CameraModel, view: Camera, source: Pat
         return resized(picture, view.width, view.height)
     middles = [np.arange(side, dtype=np.float64) + 0.5 for side in (view.width, view.height)]
     pixels = grid(*middles)  # [H W, 2]
-    rays = rays_through(pixels, view.fx, view.fy, view.cx, view.cy)
+    rays = rays_through(pixels, *view.params)
     seen: Any = as_colmap(lens).img_from_cam(rays)  # [H W, 2] px
     places = seen / (lens.width, lens.height)  # in 0..1
     inside = ((places >= 0) & (places < 1)).all(axis=1)  # False for a ray without a place

@@ -6,19 +6,23 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
 from gsbench.errors import InputError
 from gsbench.normalization import Normalization
 from gsbench.scene.colmap_read import read_model as read_model
 from gsbench.scene.images import check_size, image_size
 from gsbench.scene.names import match_anywhere
-from gsbench.scene.types import Array, Camera, CameraModel, Capture, to_pinhole
+from gsbench.scene.types import Array, ByteArray, Camera, CameraModel, Capture, to_pinhole
 from gsbench.scene.undistortion import as_colmap, as_values
 from gsbench.scene.undistortion import plain_camera as plain_camera
 
-Cloud = tuple[Array, NDArray[np.uint8]]  # positions [P, 3] in world units, colours [P, 3]
+Cloud = tuple[Array, ByteArray]  # positions [P, 3] in world units, colours [P, 3]
 MIN_TRACK = 2  # images that must see a 3D point, as in COLMAP
+
+
+def posed_images(model: pycolmap.Reconstruction) -> dict[str, pycolmap.Image]:
+    """The images that have a pose, by name, in the order of their ids."""
+    return {image.name: image for _, image in sorted(model.images.items()) if image.has_pose}
 
 
 def posed_by_name(
@@ -27,18 +31,16 @@ def posed_by_name(
     """Camera, rotation [3, 3] and translation [3] of the images that have a pose, by name."""
     cameras = {number: as_values(camera) for number, camera in model.cameras.items()}
     found = {}
-    for image in model.images.values():
-        if image.has_pose:
-            pose = image.cam_from_world()
-            rotation, translation = pose.rotation.matrix(), np.array(pose.translation)
-            found[image.name] = cameras[image.camera_id], rotation, translation
+    for name, image in posed_images(model).items():
+        pose = image.cam_from_world()
+        found[name] = cameras[image.camera_id], pose.rotation.matrix(), np.array(pose.translation)
     return found
 
 
 def camera_centers(model: pycolmap.Reconstruction) -> Array:
     """The centres [V, 3] of the images that have a pose, in the order of their ids."""
-    posed = [image for _, image in sorted(model.images.items()) if image.has_pose]
-    return np.array([image.projection_center() for image in posed], dtype=np.float64).reshape(-1, 3)
+    centers = [image.projection_center() for image in posed_images(model).values()]
+    return np.array(centers, dtype=np.float64).reshape(-1, 3)
 
 
 def normalize_capture(capture: Capture, folder: Path) -> None:
@@ -85,18 +87,17 @@ def read_reference(capture: Capture) -> pycolmap.Reconstruction:
             "init.poses=own"
         )
     model = read_model(capture.model)
-    posed = sorted(image.name for image in model.images.values() if image.has_pose)
-    names = match_anywhere(posed, capture.image_names)
+    posed = posed_images(model)
+    names = match_anywhere(sorted(posed), capture.image_names)
     fitted = pycolmap.Reconstruction()
     # The files of one camera may have several sizes, for example if some were shrunk. Then each
     # size gets a camera, and the first one keeps the id.
     next_camera_id = max(model.cameras, default=0) + 1
     camera_ids: dict[tuple[int, tuple[int, int]], int] = {}
-    kept: set[int] = set()
-    for image_id, image in sorted(model.images.items()):
-        if not image.has_pose or image.name not in names:
+    for model_name, image in posed.items():
+        if model_name not in names:
             continue
-        name, camera = names[image.name], model.cameras[image.camera_id]
+        name, camera = names[model_name], model.cameras[image.camera_id]
         file_camera = camera_of_file(camera, capture.images / name)
         size = file_camera.width, file_camera.height
         key = image.camera_id, size
@@ -110,11 +111,10 @@ def read_reference(capture: Capture) -> pycolmap.Reconstruction:
         scale = np.array(size) / (camera.width, camera.height)
         points = np.array([point.xy for point in image.points2D], dtype=np.float64).reshape(-1, 2)
         resized = pycolmap.Image(
-            name=name, keypoints=points * scale, camera_id=camera_ids[key], image_id=image_id
+            name=name, keypoints=points * scale, camera_id=camera_ids[key], image_id=image.image_id
         )
         fitted.add_image_with_trivial_frame(resized, image.cam_from_world())
-        kept.add(image_id)
-    _copy_points(model, fitted, kept)
+    _copy_points(model, fitted)
     return fitted
 
 
@@ -171,8 +171,7 @@ def write_model(folder: Path, cameras: Mapping[str, Camera], cloud: Cloud | None
     """
     frames = {}
     for name, camera in cameras.items():
-        params = (camera.fx, camera.fy, camera.cx, camera.cy)
-        pinhole = CameraModel("PINHOLE", camera.width, camera.height, params)
+        pinhole = CameraModel("PINHOLE", camera.width, camera.height, camera.params)
         frames[name] = pinhole, camera.rotation, camera.translation
     write_frames(folder, frames, cloud)
 
@@ -201,9 +200,9 @@ def write_frames(
     save_model(model, folder)
 
 
-def _copy_points(
-    model: pycolmap.Reconstruction, target: pycolmap.Reconstruction, image_ids: set[int]
-) -> None:
+def _copy_points(model: pycolmap.Reconstruction, target: pycolmap.Reconstruction) -> None:
+    """Copy the points, with the observations of the images that ``target`` has."""
+    image_ids = set(target.images)
     # A model without any track, such as one that `write_model` wrote, keeps all its points.
     observed = any(point.track.elements for point in model.points3D.values())
     for point_id, point in sorted(model.points3D.items()):

@@ -106,15 +106,13 @@ def find_model(root: Path, sparse: str | None) -> tuple[Path, list[str]]:
         numbered = [folder for folder in parent.glob("*") if folder.name.isdecimal()]
         ordered = [*sorted(numbered, key=lambda path: int(path.name)), parent]
         found = [folder for folder in ordered if _is_model(folder)]
-        if len(found) == 1:
-            return found[0], []  # not counted: a damaged one gets a better message later
         if found:
-            counts = {folder: count_images(folder) for folder in found}
-            largest = max(found, key=counts.__getitem__)
-            del counts[largest]
+            # a single one is not counted: if it is damaged, it gets a better message later
+            largest = max(found, key=count_images) if len(found) > 1 else found[0]
             return largest, [
-                f"{path.relative_to(root)}: {counted(count, 'image')}"
-                for path, count in counts.items()
+                f"{path.relative_to(root)}: {counted(count_images(path), 'image')}"
+                for path in found
+                if path != largest
             ]
     for folder in (root / name for name in SPARSE_FOLDERS):
         if any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):

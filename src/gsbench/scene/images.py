@@ -15,13 +15,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from gsbench.errors import InputError
 from gsbench.files import GIT_LFS, LFS_REMEDY, MAX_NAME_BYTES, require_regular
 from gsbench.scene.names import FILES, IMAGE_SUFFIXES
 from gsbench.scene.options import Backdrop, Resample
+from gsbench.scene.types import ByteArray
 from gsbench.words import counted, is_one_line, some_of
 
 log = logging.getLogger(__name__)
@@ -126,7 +126,7 @@ def image_size(path: Path) -> tuple[int, int]:
         return image.size
 
 
-def read_image(path: Path, backdrop: Backdrop = "black") -> NDArray[np.uint8]:
+def read_image(path: Path, backdrop: Backdrop = "black") -> ByteArray:
     """The image as [H, W, 3] uint8 RGB.
 
     Grey and palette images become RGB, 16-bit values keep their high byte, and transparent pixels
@@ -149,8 +149,8 @@ def read_image(path: Path, backdrop: Backdrop = "black") -> NDArray[np.uint8]:
 
 
 def resize_image(
-    image: NDArray[np.uint8], width: int, height: int, resample: Resample = "lanczos"
-) -> NDArray[np.uint8]:
+    image: ByteArray, width: int, height: int, resample: Resample = "lanczos"
+) -> ByteArray:
     """The image [H, W, 3] at another size.
 
     ``lanczos`` is Pillow's windowed sinc with three lobes, widened by the scale against aliasing.
@@ -211,7 +211,7 @@ def open_image(path: Path, decode: bool = False) -> Image.Image:
         raise InputError(f"{path}: {reason}: replace or remove it") from error
 
 
-def write_png(image: NDArray[np.uint8], path: Path, exif: bytes = b"") -> None:
+def write_png(image: ByteArray, path: Path, exif: bytes = b"") -> None:
     """Write an image [H, W, 3] or [H, W] as PNG."""
     # At zlib level 1, writing is about five times as fast as at the default level.
     Image.fromarray(image).save(path, format="PNG", compress_level=1, exif=exif)

@@ -215,17 +215,15 @@ def _model_cameras(
 ) -> dict[str, tuple[CameraModel, list[list[float]]]]:
     """The COLMAP camera at the file's size and the 3x4 pose of every posed image of the capture."""
     # not needed if the views are cached
-    from gsbench.scene.colmap import camera_of_file, plain_camera, read_model
+    from gsbench.scene.colmap import camera_of_file, plain_camera, posed_images, read_model
 
     model = read_model(model_dir)
     wanted = set(capture.image_names)
     cameras = {}
-    for image in model.images.values():
-        if not image.has_pose or image.name not in wanted:
-            continue
-        camera = model.cameras[image.camera_id]
-        fitted = camera_of_file(camera, capture.images / image.name)
-        cameras[image.name] = plain_camera(fitted), image.cam_from_world().matrix().tolist()
+    for name, image in posed_images(model).items():
+        if name in wanted:
+            fitted = camera_of_file(model.cameras[image.camera_id], capture.images / name)
+            cameras[name] = plain_camera(fitted), image.cam_from_world().matrix().tolist()
     if len(cameras) < MIN_IMAGES:
         raise InputError(
             f"scene {capture.name}: {len(cameras)} of {len(wanted)} images have a pose in "

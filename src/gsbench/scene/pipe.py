@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from gsbench.errors import InputError
-from gsbench.files import require_regular
+from gsbench.files import file_sha256, require_regular
 from gsbench.normalization import IDENTITY, find_normalization
 from gsbench.parsing import text_of
 from gsbench.scene.beside import DEPTH, check_masks, find_masks
@@ -150,8 +150,7 @@ def fingerprint(
     for label, file in entries:
         require_regular(file)
         try:
-            with file.open("rb") as stream:
-                content = hashlib.file_digest(stream, "sha256").hexdigest()
+            content = file_sha256(file)
         except OSError as error:
             raise InputError(f"{file}: cannot be read ({error.strerror})") from error
         digest.update(f"{label}\0{content}\n".encode())

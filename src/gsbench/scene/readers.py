@@ -108,8 +108,7 @@ def read_photos(root: Path, options: SceneConfig) -> RawCapture:
     else:
         folder = root / "images" if (root / "images").is_dir() else root
     names = photographs_among(folder, _images_outside_masks(root, folder, options.masks))
-    formats = ", ".join(sorted(suffix[1:] for suffix in IMAGE_SUFFIXES))
-    require_enough(len(names), folder, f"({formats})")
+    require_enough(len(names), folder, f"({', '.join(sorted(FORMATS))})")
     return RawCapture(folder, tuple(Photograph(name, folder / name) for name in names))
 
 

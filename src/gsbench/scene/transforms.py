@@ -21,7 +21,7 @@ from pydantic_core import from_json
 
 from gsbench.errors import InputError
 from gsbench.files import GIT_LFS, LFS_REMEDY
-from gsbench.parsing import DamagedError, parse_typed, read_bytes, resolved, table_beside, text_of
+from gsbench.parsing import DamagedError, parse_typed, read_bytes, resolved, text_of
 from gsbench.scene.colmap_files import require_subfolder
 from gsbench.scene.images import list_images
 from gsbench.scene.names import IMAGE_SUFFIXES, match
@@ -29,6 +29,7 @@ from gsbench.scene.options import Backdrop, require_enough
 from gsbench.scene.record import Photograph, PointsFile, RawCapture, Role
 from gsbench.scene.rules import Finding
 from gsbench.scene.transforms_cameras import (
+    KEYS,
     AppliedTransform,
     FrameRecord,
     TransformsRecord,
@@ -206,9 +207,6 @@ def _named_split(
     roles: dict[str, Role] = dict.fromkeys(images, "train" if train is None else "unused")
     roles |= dict.fromkeys(chosen["train"], "train")
     return roles | dict.fromkeys(chosen["held-out"], "test")
-
-
-KEYS = table_beside(__file__, "transforms_keys.yaml")
 
 
 def check_keys(path: Path, document: Any, backdrop: Backdrop) -> None:

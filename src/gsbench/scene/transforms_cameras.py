@@ -12,7 +12,7 @@ import numpy as np
 from annotated_types import Len
 
 from gsbench.errors import InputError
-from gsbench.parsing import Number, Record, Text
+from gsbench.parsing import Number, Record, Text, table_beside
 from gsbench.scene.images import image_size
 from gsbench.scene.rules import Finding, given
 from gsbench.scene.types import ROTATION_TOLERANCE, Array, CameraModel, nearest_rotation
@@ -22,17 +22,10 @@ Optional = Number | None
 Matrix = Annotated[list[Row], Len(3, 4)]  # a fourth row must be `LAST_ROW`
 LAST_ROW = [0.0, 0.0, 0.0, 1.0]
 OPENGL = np.diag([1.0, -1.0, -1.0])  # from OpenCV's camera axes to OpenGL's, and back
-PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 FISHEYE = "OPENCV_FISHEYE"
 RATIONAL = "FULL_OPENCV"  # OpenCV's: a polynomial of k1, k2, k3 divided by one of k4, k5, k6
-# the coefficients of each camera model, in COLMAP's order
-MODELS = {
-    **dict.fromkeys(PERSPECTIVE, ("k1", "k2", "p1", "p2")),
-    RATIONAL: ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
-    FISHEYE: ("k1", "k2", "k3", "k4"),
-}
-FOCAL_KEYS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov")
-OTHER_KEYS = ("w", "h", "cx", "cy", "camera_model", "is_fisheye")
+KEYS = table_beside(__file__, "transforms_keys.yaml")
+MODELS = KEYS["coefficients"]
 # A principal point may be the centre of a copy of another size if it is off by one factor along
 # both sides, up to a tenth.
 SAME_SCALE = 0.1
@@ -134,7 +127,7 @@ def intrinsics_of(record: TransformsRecord, frame: FrameRecord) -> dict[str, Any
     Focal lengths come from one of both, and so do coefficients: never a mix.
     """
     found: dict[str, Any] = {}
-    for keys in (FOCAL_KEYS, MODELS[RATIONAL], *((key,) for key in OTHER_KEYS)):
+    for keys in KEYS["used_together"]:
         source = frame if any(getattr(frame, key) is not None for key in keys) else record
         found |= {key: getattr(source, key) for key in keys}
     return found
@@ -212,7 +205,7 @@ def _distortion(where: str, intrinsics: Mapping[str, Any]) -> tuple[str, tuple[f
     model = intrinsics["camera_model"] or (FISHEYE if intrinsics["is_fisheye"] else "OPENCV")
     if model not in MODELS:
         raise InputError(f"{where}: camera_model {model} is not known here ({', '.join(MODELS)})")
-    if model in PERSPECTIVE:
+    if MODELS[model] == MODELS["OPENCV"]:
         # k4 is a coefficient of r^8 in nerfstudio and Metashape, but a divisor in OpenCV; only
         # RATIONAL says which.
         needs_k3 = given["k3"] and not any(given[name] for name in ("k4", "k5", "k6"))

@@ -10,7 +10,6 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
 from gsbench.files import file_sha256
@@ -18,7 +17,7 @@ from gsbench.runs.trial_record import TwinViews
 from gsbench.scene.beside import resize_mask
 from gsbench.scene.names import grouped, stem_of
 from gsbench.scene.rules import given
-from gsbench.scene.types import Scene, View
+from gsbench.scene.types import Array, Mask, Scene, View
 
 # Near twins are compared as grey pictures of 24 x 24 cells, whatever their sizes and shapes,
 # because a copy may be shrunk, rounded or cut. In 16 captures, a second shot that is moved by half
@@ -104,7 +103,7 @@ def without_copies(scene: Scene) -> Scene:
     return replace(scene, train=train, twins=TwinViews(left_out=equal, near=near))
 
 
-SmallPicture = tuple[NDArray[np.float64], NDArray[np.bool_]]  # grey values and counted cells
+SmallPicture = tuple[Array, Mask]  # grey values and counted cells
 
 
 def small_picture(view: View) -> SmallPicture:
@@ -136,5 +135,6 @@ def same_pixels(one: View, other: View) -> bool:
         return False
     both = np.ones(one.image.shape[:2], bool)
     for mask in (one.mask, other.mask):
-        both = both if mask is None else both & mask
+        if mask is not None:
+            both &= mask
     return bool(both.any()) and np.array_equal(one.image[both], other.image[both])

@@ -20,6 +20,8 @@ from gsbench.normalization import IDENTITY, Normalization
 from gsbench.runs.trial_record import Oddity, TwinViews
 
 Array = NDArray[np.float64]
+ByteArray = NDArray[np.uint8]
+Mask = NDArray[np.bool_]  # [H, W], True where a pixel counts
 
 # 3DGS: cameras_extent = 1.1 x the largest distance of a training camera to their mean
 EXTENT_MARGIN = 1.1
@@ -42,18 +44,18 @@ class Camera:
     fy: float
     cx: float
     cy: float
-    rotation: NDArray[np.float64]
-    translation: NDArray[np.float64]
+    rotation: Array
+    translation: Array
 
     def __post_init__(self) -> None:
         if self.width < 1 or self.height < 1:
             raise ValueError(
                 f"camera: width and height must be at least 1 px, got {self.width}x{self.height}"
             )
-        in_px = self.fx, self.fy, self.cx, self.cy
-        if not np.isfinite(in_px).all() or min(self.fx, self.fy) <= 0:
+        if not np.isfinite(self.params).all() or min(self.fx, self.fy) <= 0:
             raise ValueError(
-                f"camera: fx, fy, cx and cy must be finite, and fx and fy positive, got {in_px}"
+                "camera: fx, fy, cx and cy must be finite, and fx and fy positive, got "
+                f"{self.params}"
             )
         rotation = np.asarray(self.rotation, dtype=np.float64)
         translation = np.asarray(self.translation, dtype=np.float64)
@@ -66,7 +68,12 @@ class Camera:
         object.__setattr__(self, "translation", translation)
 
     @property
-    def center(self) -> NDArray[np.float64]:
+    def params(self) -> tuple[float, ...]:
+        """The intrinsics in px, in the order of COLMAP's PINHOLE."""
+        return self.fx, self.fy, self.cx, self.cy
+
+    @property
+    def center(self) -> Array:
         """The camera centre in world units, [3]."""
         return -self.rotation.T @ self.translation
 
@@ -166,8 +173,8 @@ class View:
 
     name: str
     camera: Camera
-    image: NDArray[np.uint8]
-    mask: NDArray[np.bool_] | None = None
+    image: ByteArray
+    mask: Mask | None = None
     beside: Mapping[str, NDArray[Any]] = field(default_factory=dict)
 
     @property
@@ -205,7 +212,7 @@ def nearest_rotation(matrix: Array, what: str) -> Array:
     return nearest
 
 
-def extent_of_centers(centers: NDArray[np.float64]) -> float:
+def extent_of_centers(centers: Array) -> float:
     """1.1 x the largest distance of a centre [V, 3] from their mean, world units (3DGS)."""
     return float(EXTENT_MARGIN * np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
 

@@ -11,11 +11,10 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gsbench.errors import InputError
 from gsbench.scene.rules import Finding
-from gsbench.scene.types import Array, Camera, CameraModel, to_pinhole
+from gsbench.scene.types import Array, ByteArray, Camera, CameraModel, to_pinhole
 from gsbench.system.isolate import CrashError, run_isolated
 from gsbench.words import some_of
 
@@ -113,7 +112,7 @@ def flat_camera(camera: CameraModel) -> Camera:
     return to_pinhole(plain_camera(_pinhole_of(camera)) if camera.distorted else camera)
 
 
-def undistort(image: NDArray[np.uint8], camera: CameraModel) -> tuple[NDArray[np.uint8], Camera]:
+def undistort(image: ByteArray, camera: CameraModel) -> tuple[ByteArray, Camera]:
     """Undistort one image [H, W, 3] of any perspective COLMAP camera model; its size changes.
 
     Raises `InputError` for a camera without a pinhole image (a full panorama) or with impossible
@@ -167,7 +166,7 @@ def folded_share(camera: pycolmap.Camera, pinhole: pycolmap.Camera) -> float:
     ends = rays_through(pixels, *_pinhole_parameters(pinhole))[:, :2]  # [P, 2]
     rays = ends[:, None] * (np.arange(1, FOLD_STEPS + 1) / FOLD_STEPS)[:, None]  # [P, S, 2]
 
-    def project(offset: tuple[float, float]) -> NDArray[np.float64]:
+    def project(offset: tuple[float, float]) -> Array:
         moved = (rays + offset).reshape(-1, 2)
         pixels = camera.img_from_cam(np.column_stack([moved, np.ones(len(moved))]))
         return np.asarray(pixels, dtype=np.float64).reshape(rays.shape)

@@ -12,12 +12,11 @@ import pycolmap
 from numpy.typing import NDArray
 
 from gsbench.init.base import FIELD_OF_VIEW_DEG
-from gsbench.init.colmap.models import posed_images
 from gsbench.init.colmap.pairs import select_pairs
 from gsbench.init.options import ColmapOptions
-from gsbench.scene.colmap import rescaled_camera
+from gsbench.scene.colmap import posed_images, rescaled_camera
 from gsbench.scene.images import image_size, lens_of, open_image, read_image, write_png
-from gsbench.scene.types import Capture
+from gsbench.scene.types import ByteArray, Capture
 
 DEFAULT_FOCAL_LENGTH = 1.2  # of the longest side, as in COLMAP
 COLMAP_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
@@ -225,7 +224,7 @@ def image_ids(path: Path) -> dict[str, int]:
         return {image.name: image.image_id for image in database.read_all_images()}
 
 
-def strongest_descriptors(path: Path, name: str, count: int) -> NDArray[np.uint8]:
+def strongest_descriptors(path: Path, name: str, count: int) -> ByteArray:
     """The descriptors [K, 128] of an image's ``count`` features of the largest scales, in order."""
     image_id = image_ids(path)[name]
     with pycolmap.Database.open(path) as database:

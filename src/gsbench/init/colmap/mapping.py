@@ -24,9 +24,9 @@ from gsbench.init.base import REGISTERED_SHARE, UnplacedError
 from gsbench.init.colmap import database as colmap_database
 from gsbench.init.colmap import matches
 from gsbench.init.colmap.database import DatabaseTask
-from gsbench.init.colmap.models import posed_images
 from gsbench.init.options import ColmapOptions
 from gsbench.logs import Progress
+from gsbench.scene.colmap import posed_images
 from gsbench.scene.rules import MIN_IMAGES
 
 SMALL_ANGLE_DEG = 2.0  # triangulation angle of the initial pair; COLMAP's default is 16

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from gsbench.errors import InputError
 from gsbench.init.base import PoseErrors, TrainingPoints
-from gsbench.scene.colmap import MIN_TRACK
+from gsbench.scene.colmap import MIN_TRACK, posed_images
 from gsbench.scene.types import Array, Capture, extent_of_centers
 
 TRIALS = 500  # random triples of cameras
@@ -29,11 +29,6 @@ COLLINEAR_RATIO = 1e-2
 
 # centres [N, 3] and rotations [N, 3, 3] (world to camera) of a model's cameras, and the reference's
 CommonPoses = tuple[Array, Array, Array, Array]
-
-
-def posed_images(model: pycolmap.Reconstruction) -> dict[str, pycolmap.Image]:
-    """The images that have a pose, by name."""
-    return {image.name: image for image in model.images.values() if image.has_pose}
 
 
 def training_centers(model: pycolmap.Reconstruction, capture: Capture) -> Array:

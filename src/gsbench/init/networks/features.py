@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from gsbench.files import DAMAGE, atomic, file_sha256
 from gsbench.runs.configuration import sha256_of
-from gsbench.scene.types import Capture
+from gsbench.scene.types import Capture, Mask
 
 Size = NDArray[np.int64] | tuple[int, int]
 
@@ -49,7 +49,7 @@ class Features:
         scale = np.array(self.file_size, dtype=np.float64) / self.network_size
         return ((self.keypoints.astype(np.float64) + 0.5) * scale).astype(np.float32)
 
-    def within(self, mask: NDArray[np.bool_]) -> Features:
+    def within(self, mask: Mask) -> Features:
         """The features on pixels that count in ``mask`` [H, W], which has the file's size."""
         height, width = mask.shape
         columns, rows = np.floor(self.colmap_keypoints).astype(np.int64).T  # [K] each

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbench.parsing import table_beside
+from gsbench.scene.types import Array
 
 BOX, SPHERE, TUBE = 0, 1, 2
 X, Y, Z = 0, 1, 2
@@ -27,18 +28,18 @@ class Layout(NamedTuple):
     """
 
     kind: NDArray[np.int64]  # [S]
-    center: NDArray[np.float64]  # [S, 3] m
-    rotation: NDArray[np.float64]  # [S, 3, 3]
-    size: NDArray[np.float64]  # [S, 3] m
+    center: Array  # [S, 3] m
+    rotation: Array  # [S, 3, 3]
+    size: Array  # [S, 3] m
     material: NDArray[np.int64]  # [S]
-    tint: NDArray[np.float64]  # [S, 3] linear RGB
+    tint: Array  # [S, 3] linear RGB
     group_start: NDArray[np.int64]  # [G + 1] first primitive of each group
-    group_low: NDArray[np.float64]  # [G, 3] m
-    group_high: NDArray[np.float64]  # [G, 3] m
+    group_low: Array  # [G, 3] m
+    group_high: Array  # [G, 3] m
 
 
 # kind, position, size, paint and rotation of a primitive, relative to its part
-Solid = tuple[int, tuple[float, ...], tuple[float, ...], str, NDArray[np.float64]]
+Solid = tuple[int, tuple[float, ...], tuple[float, ...], str, Array]
 
 
 def build_layout(seed: int) -> Layout:
@@ -75,13 +76,11 @@ def build_layout(seed: int) -> Layout:
     return Layout(*columns, *map(np.array, (starts, *boxes)))
 
 
-def _rotation(degrees: float, axis: int) -> NDArray[np.float64]:
+def _rotation(degrees: float, axis: int) -> Array:
     """The rotation [3, 3] about one axis (0, 1, 2 for x, y, z)."""
-    angle, i, j = radians(degrees), (axis + 1) % 3, (axis + 2) % 3
-    matrix = np.eye(3)
-    matrix[i, i] = matrix[j, j] = cos(angle)
-    matrix[i, j], matrix[j, i] = -sin(angle), sin(angle)
-    return matrix
+    across, along = cos(radians(degrees)), sin(radians(degrees))
+    about_z = np.array([[across, -along, 0.0], [along, across, 0.0], [0.0, 0.0, 1.0]])
+    return np.roll(about_z, axis + 1, axis=(0, 1))
 
 
 def box(x, y, z, width, depth, height, paint, degrees=0.0, axis=X) -> Iterator[Solid]:

@@ -9,13 +9,12 @@ from math import cos, pi, radians, sin, tan
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
 from gsbench.logs import Progress, no_progress
 from gsbench.scene.courtyard.kernels import render
 from gsbench.scene.courtyard.layout import Layout, build_layout
-from gsbench.scene.types import Camera
+from gsbench.scene.types import ByteArray, Camera
 from gsbench.system.resources import in_threads
 
 VERSION = 1  # raise it when the images change
@@ -79,9 +78,9 @@ def ring_camera(angle: float, width: int, height: int) -> Camera:
     return Camera(width, height, focal, focal, width / 2, height / 2, rotation, -rotation @ center)
 
 
-def render_view(layout: Layout, camera: Camera, seed: int) -> NDArray[np.uint8]:
+def render_view(layout: Layout, camera: Camera, seed: int) -> ByteArray:
     """Render one photograph, [H, W, 3] uint8 sRGB; a matt surface has one colour in all views."""
     image = np.empty((camera.height, camera.width, 3), dtype=np.uint8)
     pose = np.ascontiguousarray(camera.rotation), np.ascontiguousarray(camera.center)
-    render(layout, *pose, (camera.fx, camera.fy, camera.cx, camera.cy), image, seed)
+    render(layout, *pose, camera.params, image, seed)
     return image
