@@ -16,7 +16,9 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
+import pandas as pd
 import pycolmap
+from matplotlib.axes import Axes
 from numpy.typing import NDArray
 from PIL import Image
 from scipy.ndimage import gaussian_filter
@@ -70,6 +72,44 @@ def verdicts() -> str:
     return "\n".join(line for line in lines if line.startswith(badges))
 
 
+def show(axis: Axes, title: str, picture: NDArray[np.float64]) -> None:
+    """Draw a picture [H, W, 3], or a map of differences [H, W], below its title."""
+    bound = 0.06 if picture.ndim == 2 else None
+    axis.imshow(
+        picture,
+        cmap="RdBu",
+        vmin=-bound if bound else None,
+        vmax=bound,
+        interpolation="lanczos",
+    )
+    axis.set_title(title, fontsize=11)
+    axis.axis("off")
+
+
+def write_table(axis: Axes, frame: pd.DataFrame) -> None:
+    """Write the means and deviations of the arms, and the verdicts below them."""
+    axis.axis("off")
+    columns = [name for name in COLUMNS if name in frame]
+    cells = []
+    for arm in ARMS:
+        rows = frame[frame["densify"] == arm]
+        values = [
+            f"{FORMATS[n].format(rows[n].mean())} ± {FORMATS[n].format(rows[n].std())}"
+            for n in columns
+        ]
+        cells.append([arm, *values])
+    labels = ["", *(COLUMNS[name] for name in columns)]
+    table = axis.table(cells, colLabels=labels, loc="upper center", cellLoc="center")
+    table.auto_set_font_size(False)
+    table.set_fontsize(11)
+    table.scale(0.8, 1.25)
+    for cell in table.get_celld().values():
+        cell.set_edgecolor("#cccccc")
+    axis.text(
+        0.5, -0.02, verdicts(), ha="center", va="bottom", fontsize=11, transform=axis.transAxes
+    )
+
+
 def main(runs: Path) -> None:
     """Write the picture from the experiment ``demo`` of a runs folder."""
     experiment = load_experiment(runs, "demo")
@@ -97,41 +137,12 @@ def main(runs: Path) -> None:
         "photograph": truth,
         "initial cloud": cloud,
         f"baseline: {BASELINE}": renders[BASELINE],
+        f"idea: {IDEA}": renders[IDEA],
+        "blue: idea nearer; red: baseline": gain,
     }
-    panels |= {f"idea: {IDEA}": renders[IDEA], "blue: idea nearer; red: baseline": gain}
     for place, (title, picture) in enumerate(panels.items()):
-        axis = figure.add_subplot(grid[0, place])
-        bound = 0.06 if picture.ndim == 2 else None
-        axis.imshow(
-            picture,
-            cmap="RdBu",
-            vmin=-bound if bound else None,
-            vmax=bound,
-            interpolation="lanczos",
-        )
-        axis.set_title(title, fontsize=11)
-        axis.axis("off")
-    below = figure.add_subplot(grid[1, :])
-    below.axis("off")
-    columns = [name for name in COLUMNS if name in frame]
-    cells = []
-    for arm in ARMS:
-        rows = frame[frame["densify"] == arm]
-        values = [
-            f"{FORMATS[n].format(rows[n].mean())} ± {FORMATS[n].format(rows[n].std())}"
-            for n in columns
-        ]
-        cells.append([arm, *values])
-    labels = ["", *(COLUMNS[name] for name in columns)]
-    table = below.table(cells, colLabels=labels, loc="upper center", cellLoc="center")
-    table.auto_set_font_size(False)
-    table.set_fontsize(11)
-    table.scale(0.8, 1.25)
-    for cell in table.get_celld().values():
-        cell.set_edgecolor("#cccccc")
-    below.text(
-        0.5, -0.02, verdicts(), ha="center", va="bottom", fontsize=11, transform=below.transAxes
-    )
+        show(figure.add_subplot(grid[0, place]), title, picture)
+    write_table(figure.add_subplot(grid[1, :]), frame)
     figure.savefig(TARGET, pil_kwargs={"quality": 88})
     print(f"{TARGET}: {TARGET.stat().st_size // 1000} kB")
 

@@ -226,7 +226,7 @@ def test_a_note_about_a_scene_is_shown_once_in_a_command_and_is_in_every_log(tmp
                 set_up_logging()
                 with log_to(tmp_path / f"{seed}.txt"):
                     logging.getLogger("gsbench.scene.load").warning("scene %s: no pose", "a")
-                    logging.getLogger("gsbench.train.growth").warning("growth stopped")
+                    logging.getLogger("gsbench.train.records").warning("growth stopped")
                     logging.getLogger("gsbench.scene.load").info("a step")
     said = capsys.readouterr().err
     assert (said.count("no pose"), said.count("growth"), said.count("step")) == (2, 6, 6)

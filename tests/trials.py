@@ -6,7 +6,7 @@ The results of an experiment have known effects and known noise.
 import csv
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from hashlib import sha256
 
 import numpy as np
@@ -280,6 +280,11 @@ def write_arms(runs, arms, seeds=(0, 1, 2), scenes=("courtyard",), settings=None
     return paths
 
 
+def with_record(trial, **values):
+    """The trial with these values in its record."""
+    return replace(trial, record=replace(trial.record, **values))
+
+
 def ask_about(
     runs,
     chosen=lambda trial: True,
@@ -300,7 +305,7 @@ def ask_about(
     own = with_variants([trial for trial in trials if chosen(trial)])[:: -1 if turned else 1]
     quantity = asked_quantity(metric, own)
     about = {"sign": quantity.direction, "least": quantity.worthwhile} | asked
-    known = [trial for trial in trials if (seen or (lambda one: one.asked))(trial)]
+    known = [trial for trial in trials if (seen or (lambda one: one.record.questions))(trial)]
     planned = {
         trial.path.relative_to(home).as_posix(): PlannedTrial(words=("x",), digest=trial.digest)
         for trial in own

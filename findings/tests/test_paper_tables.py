@@ -35,7 +35,7 @@ def test_regions_light_up_in_at_most_five_of_a_hundred_reports_of_one_arm():
         for _ in range(100):
             chosen = [trials[index] for index in rng.permutation(8)[: 2 * seeds]]
             found = compare_regions(chosen[:seeds], chosen[seeds:])
-            lit += any(each.any() for each in discoveries(list(found.p.values())))
+            lit += any(each.any() for each in discoveries([view.p for view in found.values()]))
         assert lit <= 5, seeds
 
 

@@ -7,9 +7,9 @@ import shutil
 import pytest
 
 from gsbench.analysis.comparison import compare, joined
-from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.tables import build_table
+from tests.analysis.helpers import loaded, page_of
 from tests.helpers import change_json
 from tests.trials import ask_about, write_arms, write_runs, write_trial
 
@@ -18,7 +18,7 @@ CLEAR = {"effect": {"psnr": 3.0, "ssim": 0.5}}
 
 
 def answers(runs, **how):
-    return compare(load_experiment(runs, "exp"), **how).answers
+    return compare(loaded(runs), **how).answers
 
 
 def badges(runs):
@@ -60,7 +60,7 @@ def test_the_badge_is_that_of_the_question_and_other_metrics_are_not_tested(tmp_
     assert answer.sentence.startswith("sfm-volumetric against sfm-adc: better in PSNR (dB) on")
     assert {one.quantity.key for one in answer.metrics} == {"ssim", "lpips_vgg_raw", "flip"}
     assert {one.state for one in answer.metrics} == {"not tested"}
-    assert compare(load_experiment(tmp_path, "exp")).risk.startswith("1 question, 1 statement;")
+    assert compare(loaded(tmp_path)).risk.startswith("1 question, 1 statement;")
 
 
 def test_what_nobody_asked_has_an_interval_and_no_verdict(tmp_path):
@@ -68,7 +68,7 @@ def test_what_nobody_asked_has_an_interval_and_no_verdict(tmp_path):
     (answer,) = answers(tmp_path)
     assert (answer.badge, answer.verdict.outcome) == ("NOT ASKED", "undecided")
     assert answer.verdict.interval.low > 2
-    assert compare(load_experiment(tmp_path, "exp")).risk == ""
+    assert compare(loaded(tmp_path)).risk == ""
 
 
 def test_arms_that_were_asked_about_are_not_shown_again_the_other_way_round(tmp_path):
@@ -105,7 +105,7 @@ def test_a_scene_of_the_next_day_folds_nothing_away(tmp_path):
     write_runs(tmp_path, scenes=("garden", "room"), **CLEAR)
     for scene in ("garden", "room"):
         ask_about(tmp_path, lambda trial, scene=scene: trial.scene == scene)
-    experiment = load_experiment(tmp_path, "exp")
+    experiment = loaded(tmp_path)
     assert len(experiment.trials) == 12
     (answer,) = answers(tmp_path)
     assert [*answer.verdict.question.seeds] == ["room"]
@@ -123,13 +123,11 @@ def test_the_code_of_an_idea_is_that_of_its_newest_question_from_any_folder(tmp_
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "mine.py").write_text(text)
         monkeypatch.chdir(tmp_path / folder)
-        shown.append(compare(load_experiment(tmp_path, "exp")).to_json())
+        shown.append(compare(loaded(tmp_path)).to_json())
     assert shown[0] == shown[1]
     (answer,) = answers(tmp_path)
     assert (answer.badge, answer.verdict.question.n) == ("WORSE", 2)
-    assert {trial.metrics["psnr"] < 21 for trial in load_experiment(tmp_path, "exp").trials} == {
-        True
-    }
+    assert {trial.metrics["psnr"] < 21 for trial in loaded(tmp_path).trials} == {True}
 
 
 def test_after_an_edit_rows_that_were_not_trained_again_are_folded_as_earlier_code(tmp_path):
@@ -141,7 +139,7 @@ def test_after_an_edit_rows_that_were_not_trained_again_are_folded_as_earlier_co
     ask_about(tmp_path)
     write_mine(tmp_path, "2", 15.0, settings[1])
     ask_about(tmp_path, of("2"))
-    experiment = load_experiment(tmp_path, "exp")
+    experiment = loaded(tmp_path)
     assert len(experiment.older) == 9
     (line,) = experiment.versions
     assert "9 trials of sfm-mine made by earlier versions of mine" in line
@@ -172,7 +170,7 @@ def test_another_experiment_that_asked_about_the_same_trials_is_named(tmp_path, 
 def test_the_page_of_an_idea_waits_for_the_trials_of_its_baseline(tmp_path):
     write_runs(tmp_path, densifiers=("volumetric",))
     ask_about(tmp_path)
-    page = build_report(load_experiment(tmp_path, "exp"))
+    page = page_of(tmp_path)
     assert "no command has planned the others yet, such as sfm-adc" in page
     assert "nan" not in re.findall(r"\w+", page)
     assert "nothing to compare" not in page
@@ -199,7 +197,7 @@ def test_two_experiments_are_told_apart_and_one_setting_stands_for_a_schedule(tm
 def test_a_trial_of_no_question_is_named(tmp_path):
     write_runs(tmp_path, scenes=("garden",), seeds=range(4), **CLEAR)
     ask_about(tmp_path, lambda trial: trial.seed < 3)
-    remarks = [*map(str, compare(load_experiment(tmp_path, "exp")).remarks)]
+    remarks = [*map(str, compare(loaded(tmp_path)).remarks)]
     assert any("whose question did not name them" in line and "seed3" in line for line in remarks)
 
 
@@ -218,7 +216,7 @@ def test_a_broken_link_among_the_commands_is_a_warning(tmp_path):
     ask_about(tmp_path)
     file = tmp_path / "exp/commands.jsonl"
     file.write_text(file.read_text() * 2)
-    experiment = load_experiment(tmp_path, "exp")
+    experiment = loaded(tmp_path)
     assert any("does not follow the one before it" in line for line in experiment.warnings)
     assert badges(tmp_path) == {"sfm-volumetric": "BETTER"}
 

@@ -7,7 +7,7 @@ import pytest
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.tables import build_table
 from gsbench.verbs.results import explain_cell
-from tests.analysis.helpers import loaded
+from tests.analysis.helpers import loaded, table_of
 from tests.trials import write_trial
 
 OLD, NEW = "1" * 64, "2" * 64
@@ -21,10 +21,6 @@ def code(digest=None, **stages):
 
 def of_gsbench(**packages):
     return code() | {"packages": packages}
-
-
-def table_of(runs):
-    return build_table(loaded(runs), metrics=["psnr"])
 
 
 def finished_at(path, seconds):
@@ -89,7 +85,7 @@ def test_older_trials_of_gsbench_are_left_out(tmp_path, old, new, part):
 def test_arms_are_compared_unless_they_share_code_in_two_versions(tmp_path, first, second, best):
     write_trial(tmp_path, 0, "aaaaaaaa", psnr=27.0, **first)
     write_trial(tmp_path, 0, "bbbbbbbb", psnr=28.0, densify="other", **second)
-    table = table_of(tmp_path)
+    table = table_of(tmp_path, "psnr")
     said = "the arms differ in code of mine, so they are not compared"
     assert (said in table.verdicts[0]) == (not best)
 

@@ -10,7 +10,7 @@ from gsbench.analysis.fairness import UNLIKE, _shown, fairness_table
 from gsbench.analysis.notes import Note
 from gsbench.analysis.table_formats import to_latex
 from gsbench.runs.experiments import Arm
-from tests.analysis.helpers import page_of, trials_of
+from tests.analysis.helpers import page_of, rows_of, trials_of
 from tests.analysis.test_attribution import densifier
 from tests.helpers import change_json, write, write_lines
 from tests.trials import search_record, write_arms
@@ -20,10 +20,6 @@ LEFT, RIGHT = Arm("sfm", "adc"), Arm("sfm", "longaxis")
 
 def sheet(runs, second="longaxis", first="adc"):
     return fairness_table(with_variants(trials_of(runs)), Arm("sfm", first), Arm("sfm", second))
-
-
-def shown(table):
-    return {row.labels[0]: tuple(entry.text for entry in row.entries) for row in table.rows}
 
 
 def change(paths, arm, **values):
@@ -39,23 +35,23 @@ def paths(tmp_path):
 
 def test_the_sheet_has_settings_schedules_and_measurements_side_by_side(tmp_path, paths):
     counts = {"train_views": 40, "num_init_points": 9000, "num_gaussians": 31_000}
-    hashes = {"data": "data-courtyard", "cloud": "abcdef"}
+    hashes = {"data": "data-courtyard", "cloud": "abcdef" * 3}
     made = {"versions": {"gsbench": "0.2.0"}, "seconds": {"train": 80.0}, "hashes": hashes}
     change(paths, "longaxis", **counts, **made)
     for path in paths:
         if path.parent.name == "sfm-longaxis":
             write_lines(path / "events.jsonl", [{"step": 100 * k} for k in range(1, 24)])
-    rows = shown(sheet(tmp_path))
-    assert rows["views for training"] == ("42", "40", UNLIKE)
-    assert rows["initial points"] == ("3,000", "9,000", UNLIKE)
-    assert rows["initial cloud (hash)"][1:] == ("abcdef", UNLIKE)
-    assert rows["Gaussians in the end"] == ("20,000 to 20,020, mean 20,010", "31,000", UNLIKE)
-    assert rows["rounds of the densifier"] == ("15", "23", UNLIKE)
+    rows = rows_of(sheet(tmp_path))
+    assert rows["views for training"] == ["42", "40", UNLIKE]
+    assert rows["initial points"] == ["3,000", "9,000", UNLIKE]
+    assert rows["initial cloud (hash)"][1:] == ["abcdefabcdef", UNLIKE]
+    assert rows["Gaussians in the end"] == ["20,000 to 20,020, mean 20,010", "31,000", UNLIKE]
+    assert rows["rounds of the densifier"] == ["15", "23", UNLIKE]
     assert rows["seconds of training"][1] == "80"
-    assert rows["code"] == ("gsbench 0.1.0", "gsbench 0.2.0", UNLIKE)
-    assert rows["budget"] == ("50,000 Gaussians (soft)", "50,000 Gaussians (soft)", "")
-    assert rows["densify.gradient_threshold"] == ("0.0002", "0.0008", UNLIKE)
-    assert rows["densify.split_distance"] == ("–", "0.45", UNLIKE)
+    assert rows["code"] == ["gsbench 0.1.0", "gsbench 0.2.0", UNLIKE]
+    assert rows["budget"] == ["50,000 Gaussians (soft)", "50,000 Gaussians (soft)", ""]
+    assert rows["densify.gradient_threshold"] == ["0.0002", "0.0008", UNLIKE]
+    assert rows["densify.split_distance"] == ["–", "0.45", UNLIKE]
     assert "densify.split_size" not in rows  # alike
 
 
@@ -63,7 +59,7 @@ def test_only_trials_that_are_compared_count(tmp_path, paths):
     """Seed 2 of the baseline has no partner, so its count is not part of the comparison."""
     shutil.rmtree(paths[-1])
     table = sheet(tmp_path)
-    assert shown(table)["Gaussians in the end"][0] == "20,000 to 20,010, mean 20,005"
+    assert rows_of(table)["Gaussians in the end"][0] == "20,000 to 20,010, mean 20,005"
     assert "Compared: 2 pairs of trials of one scene and seed." in table.notes
 
 
@@ -71,7 +67,7 @@ def test_arms_without_a_common_seed_have_a_sheet_of_all_their_trials(tmp_path):
     write_arms(tmp_path, {"adc": densifier("adc")}, seeds=(0, 1))
     write_arms(tmp_path, {"longaxis": densifier("longaxis")}, seeds=(2,))
     table = sheet(tmp_path)
-    assert shown(table)["trials"] == ("2", "1", UNLIKE)
+    assert rows_of(table)["trials"] == ["2", "1", UNLIKE]
     assert "Compared: 0 pairs of trials of one scene and seed." in table.notes
 
 
@@ -92,8 +88,8 @@ def test_a_users_own_arm_has_its_class_and_version(tmp_path):
     sources = {"largest.SplitLargest": "3fa9c1d2aaaaaaaaaaaa"}
     change(found, "largest", code={"sources": sources, "stages": {}})
     table = sheet(tmp_path, "largest")
-    assert shown(table)["densify.share"] == ("–", "0.1", UNLIKE)
-    assert "largest.SplitLargest 3fa9c1d2" in shown(table)["code"][1]
+    assert rows_of(table)["densify.share"] == ["–", "0.1", UNLIKE]
+    assert "largest.SplitLargest 3fa9c1d2" in rows_of(table)["code"][1]
     said = "sfm-largest differs from sfm-adc by rule largest.SplitLargest and schedule."
     assert table.notes[0] == said
 
@@ -104,9 +100,9 @@ def test_trials_without_any_record_still_have_a_sheet(tmp_path, paths):
             (path / name).unlink()
     change(paths, "longaxis", seconds={}, hashes={"data": "data-courtyard"}, versions={})
     table = sheet(tmp_path)
-    assert shown(table)["rounds of the densifier"] == ("not recorded", "not recorded", "")
-    assert shown(table)["seconds of training"][1] == "not recorded"
-    assert shown(table)["code"] == ("gsbench 0.1.0", "not recorded", UNLIKE)
+    assert rows_of(table)["rounds of the densifier"] == ["not recorded", "not recorded", ""]
+    assert rows_of(table)["seconds of training"][1] == "not recorded"
+    assert rows_of(table)["code"] == ["gsbench 0.1.0", "not recorded", UNLIKE]
     assert "settings that are not recorded" in table.notes[0]
 
 

@@ -1,7 +1,6 @@
 """Notes below tables, word for word, for made-up trials with known numbers."""
 
 import itertools
-from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -16,9 +15,10 @@ from gsbench.runs.trial_record import (
     ExternalTrainer,
     Oddity,
 )
+from gsbench.verbs.results import explain_cell
 from tests.analysis.helpers import ADC, VOLUMETRIC, loaded, page_of, table_of
 from tests.helpers import read_json, write
-from tests.trials import write_runs
+from tests.trials import with_record, write_runs, write_trial
 
 EQUAL = "To compare at equal ones: "
 
@@ -26,10 +26,6 @@ EQUAL = "To compare at equal ones: "
 def trials_of(tmp_path, **plan):
     write_runs(tmp_path, **plan)
     return loaded(tmp_path).trials
-
-
-def with_record(trial, **values):
-    return replace(trial, record=replace(trial.record, **values))
 
 
 @pytest.mark.parametrize(
@@ -205,3 +201,47 @@ def test_who_trained_an_arm_and_what_was_measured_is_said(tmp_path):
     own, elsewhere = origin_notes([renders, with_record(third, evaluated_from=FROM_MODEL)])
     assert (own.kind, own["arms"]) == ("program's renders", ("sfm-adc (version 1.2)",))
     assert (elsewhere.kind, elsewhere["arms"]) == ("foreign model", ("sfm-adc",))
+
+
+# ---- several machines and clouds
+
+XEON = {"cpu": "Xeon", "kernels": "skylake-avx512", "torch": "AVX512", "device": "cpu"}
+RYZEN = XEON | {"cpu": "Ryzen", "kernels": "znver3", "torch": "AVX2"}
+A, B = "a" * 64, "b" * 64
+
+
+def notes_of(runs):
+    return list(table_of(runs, "psnr").notes)
+
+
+def hashes(cloud, init="init1"):
+    return {"data": "d", "init": init} | ({} if cloud is None else {"cloud": cloud})
+
+
+def test_trials_of_several_machines_are_averaged_and_the_table_says_so(tmp_path):
+    for seed, machine in enumerate((XEON, RYZEN, XEON, None)):
+        write_trial(tmp_path, seed, psnr=27.0, _machine=machine)
+    (note,) = (note for note in notes_of(tmp_path) if "machine" in note)
+    assert "2 kinds of machine" in note
+    kinds = (
+        "Xeon (skylake-avx512, torch AVX512): 2 trials; Ryzen (znver3, torch AVX2): 1 trial; "
+        "not recorded: 1."
+    )
+    assert kinds in note
+    assert "2 kinds of machine" in page_of(tmp_path)
+    assert "machine   Ryzen (znver3, torch AVX2)" in explain_cell("exp:garden:psnr:adc", tmp_path)
+
+
+def test_one_kind_of_machine_or_none_recorded_gives_no_note(tmp_path):
+    write_trial(tmp_path, psnr=27.0, _machine=XEON)
+    write_trial(tmp_path, 1, psnr=27.0)
+    assert not any("machine" in note for note in notes_of(tmp_path))
+
+
+def test_two_clouds_of_one_initialiser_are_noted(tmp_path):
+    for seed, densify, cloud in ((0, "adc", A), (1, "adc", B), (0, "volumetric", A)):
+        write_trial(tmp_path, seed, psnr=27.0, densify=densify, _hashes=hashes(cloud))
+    assert (
+        "garden: trials of init sfm started from 2 different clouds (aaaaaaaa: adc seed 0; "
+        "volumetric seed 0; bbbbbbbb: adc seed 1)."
+    ) in notes_of(tmp_path)

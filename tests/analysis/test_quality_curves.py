@@ -5,7 +5,7 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from gsbench.analysis.report.quality import log_ratio, saving_words
+from gsbench.analysis.report.curves import log_ratio, saving_words
 from gsbench.analysis.statistics import t_test
 from gsbench.errors import InputError
 from tests.analysis.helpers import page_of

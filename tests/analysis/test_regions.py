@@ -9,7 +9,7 @@ from PIL import Image
 from scipy import special, stats
 
 from gsbench.analysis.comparison import compare
-from gsbench.analysis.images import region_errors, regions_of
+from gsbench.analysis.images import region_errors, regions_of, textured_error
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.report.where import (
     _p_values,
@@ -22,8 +22,10 @@ from gsbench.analysis.report.where import (
 from gsbench.analysis.results import load_experiment
 from gsbench.claims.archive import unpack_archive
 from gsbench.claims.export import write_archive
+from gsbench.runs.layout import FROM_PIXELS, MASKS
 from gsbench.scene.images import read_image
-from tests.helpers import refusal
+from tests.analysis.helpers import trials_of
+from tests.helpers import refusal, write
 from tests.trials import ask_about, write_runs
 
 GRID = {"a": (6, 10), "b": (6, 10), "c": (5, 10)}
@@ -117,12 +119,12 @@ def test_without_a_common_shift_p_is_that_of_the_moderated_t():
 def test_regions_with_an_effect_light_up_and_the_others_do_not():
     rng = np.random.default_rng(5)
     found = compare_regions(trials(rng, 4, effect=4.0), trials(rng, 4))
-    lit = dict(zip(found.p, discoveries(list(found.p.values())), strict=True))
+    lit = dict(zip(found, discoveries([view.p for view in found.values()]), strict=True))
     assert lit["a"][:2].mean() > 0.8
-    assert found.change["a"][:2].mean() == pytest.approx(4.0, abs=0.3)
+    assert found["a"].change[:2].mean() == pytest.approx(4.0, abs=0.3)
     others = np.concatenate([lit["a"][2:].ravel(), lit["b"].ravel(), lit["c"].ravel()])
     assert others.mean() < 0.05
-    assert found.spread["b"].mean() == pytest.approx(0.5, rel=0.3)
+    assert found["b"].spread.mean() == pytest.approx(0.5, rel=0.3)
 
 
 def test_too_few_seeds_and_other_views_are_refused():
@@ -144,7 +146,7 @@ def test_trainings_of_one_arm_light_a_region_in_at_most_one_report_of_twenty(see
     rng, lit, reports = np.random.default_rng(8), 0, 400
     for _ in range(reports):
         found = compare_regions(trials(rng, seeds, **noise), trials(rng, seeds, **noise))
-        lit += any(each.any() for each in discoveries(list(found.p.values())))
+        lit += any(each.any() for each in discoveries([view.p for view in found.values()]))
     assert lit / reports <= 0.07  # 5 % and two standard errors of the simulation
 
 
@@ -199,3 +201,36 @@ def test_an_archive_keeps_the_errors_of_regions_in_place_of_pictures(tmp_path):
     # over the photograph; without one, as many whole regions
     assert [shape_of(own["lit"]) for own in maps] == [photograph.shape[:2], (4 * 32, 5 * 32)]
     assert shape_of(maps[0]["noise"]) == photograph.shape[:2]
+
+
+# ---- the error in textured parts, against its definition pixel by pixel
+
+
+def test_textured_error_is_the_mean_error_in_the_most_textured_fifth(tmp_path):
+    """Texture grows from left to right, as steps do.
+
+    The render is off by a tenth of the column's number.
+    """
+    write_runs(
+        tmp_path, scenes=("garden",), densifiers=("adc",), seeds=(0,), views=1, pictures=True
+    )
+    (trial,) = trials_of(tmp_path)
+    column = np.arange(100)
+    truth = np.repeat((9 + column**2 // 50)[None], 20, axis=0)
+    render = truth - column // 10
+    for folder, pixels in (("ground_truth", truth), ("renders", render)):
+        picture = np.repeat(pixels[..., None], 3, axis=2).astype(np.uint8)
+        Image.fromarray(picture).save(trial.path / f"{folder}/view000.png")
+    assert textured_error(trial) == pytest.approx(8.5, abs=0.2)  # of the last twenty columns
+    counts = np.full((20, 100), 255, np.uint8)
+    counts[:, 50:] = 0
+    (trial.path / MASKS).mkdir()
+    Image.fromarray(counts).save(trial.path / f"{MASKS}/view000.png")
+    # the last ten columns of the left half
+    assert textured_error(trial) == pytest.approx(4.0, abs=0.2)
+    for picture in (trial.path / "renders").iterdir():
+        picture.unlink()
+    with refusal("holds no renders"):
+        textured_error(trial)
+    write(trial.path / FROM_PIXELS, {"error_textured": 3.25})
+    assert textured_error(trial) == 3.25

@@ -13,7 +13,7 @@ from gsbench.analysis.sentences import badge, in_words, reason, risk, sentence
 from gsbench.analysis.verdicts import find_outlying, interval_of, judge
 from gsbench.runs.trial_record import Budget
 from tests.analysis.helpers import ADC, VOLUMETRIC
-from tests.trials import ask_about, write_runs
+from tests.trials import ask_about, with_record, write_runs
 
 BETTER = {"psnr": 3.0}
 
@@ -42,10 +42,7 @@ def lost(trials, place, **state):
 
 def with_adc(trials, **values):
     """The trials, with these values in the records of one arm."""
-    return [
-        replace(one, record=replace(one.record, **values)) if one.densify == "adc" else one
-        for one in trials
-    ]
+    return [with_record(one, **values) if one.densify == "adc" else one for one in trials]
 
 
 # ---- pairs
@@ -104,10 +101,7 @@ def test_relative_differences_are_means_of_logarithms(asked):
 
 def test_one_capture_under_two_names_is_one_scene(asked):
     trials, question = asked()
-    same = [
-        replace(t, record=replace(t.record, hashes=t.record.hashes | {"data": "one"}))
-        for t in trials
-    ]
+    same = [with_record(t, hashes=t.record.hashes | {"data": "one"}) for t in trials]
     assert "garden has the photographs of courtyard" in str(judge(same, question).untestable)
 
 
@@ -156,10 +150,7 @@ def test_an_awaited_baseline_is_named(asked):
 
 def test_results_without_a_question_before_their_training_are_not_tested(asked):
     trials, question = asked(effect=BETTER)
-    late = [
-        replace(t, record=replace(t.record, questions=[])) if t.densify != "adc" else t
-        for t in trials
-    ]
+    late = [with_record(t, questions=[]) if t.densify != "adc" else t for t in trials]
     verdict = judge(late, question)
     assert (badge(verdict), verdict.outcome) == ("NOT ASKED", "undecided")
     assert verdict.interval is not None

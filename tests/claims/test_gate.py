@@ -27,7 +27,7 @@ from gsbench.verbs.gate import (
 )
 from tests.analysis.helpers import loaded
 from tests.helpers import refusal
-from tests.trials import write_as, write_runs, write_trial
+from tests.trials import with_record, write_as, write_runs, write_trial
 
 VALUES = {"eval": {"extra": {}}}
 SCENES = ("courtyard", "garden")
@@ -114,7 +114,7 @@ def test_a_look_waits_for_every_scene_even_if_the_first_is_equal(tmp_path):
 def test_the_code_may_differ_and_the_baseline_may_be_older_than_the_question(tmp_path):
     def made_by(own, state, year):
         made = {"code": Code(packages={"densify": state}), "measured": f"{year}-01-01T00:00:00Z"}
-        return [replace(one, record=replace(one.record, **made)) for one in own]
+        return [with_record(one, **made) for one in own]
 
     old = made_by(trials(tmp_path / "a", 0, 0.01), "one", 2019)
     new = made_by(trials(tmp_path / "b", -1, 0.01), "two", 2021)
@@ -131,9 +131,7 @@ def test_deviations_name_machines_and_libraries(tmp_path):
     assert deviations(own, own) == []
     machine = {"cpu": "Ours", "kernels": "znver4", "torch": "AVX512", "device": "cpu"}
     versions = own[0].record.versions | {"torch": "9.9", "gsbench": "9.9"}
-    other = [
-        replace(one, record=replace(one.record, machine=machine, versions=versions)) for one in own
-    ]
+    other = [with_record(one, machine=machine, versions=versions) for one in own]
     first, second = map(str, deviations(own, other))
     assert (
         "another kind of machine (not recorded) than the new trials (Ours (znver4, torch AVX512))"

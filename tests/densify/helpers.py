@@ -1,6 +1,7 @@
 """Helpers for tests of densifiers: Gaussians in training, made-up renders, checks of a round."""
 
 import numpy as np
+import pytest
 import torch
 from numpy.testing import assert_allclose
 
@@ -11,6 +12,8 @@ from gsbench.raster.base import RenderOutput
 from tests.densify import restatement
 
 EXTENT = 4.0
+# rounds before and after the first opacity reset
+around_a_reset = pytest.mark.parametrize("step", [600, 3100])
 
 
 def generator(seed=0):

@@ -12,6 +12,7 @@ from tests.densify import restatement
 from tests.densify.helpers import (
     EXTENT,
     Round,
+    around_a_reset,
     at,
     gathered,
     generator,
@@ -36,7 +37,7 @@ def absgs_growth(rows, signed, absolute, noise):
     return restatement.split_all(rows, chosen, noise), len(clones), len(chosen)
 
 
-@pytest.mark.parametrize("step", [600, 3100])
+@around_a_reset
 @pytest.mark.parametrize("seed", range(3))
 def test_a_round_of_absgs_matches_the_restatement(seed, step):
     densifier = AbsGS()
@@ -162,7 +163,7 @@ def test_a_render_without_a_footprint_is_refused():
         densifier.observe(1, rendered(torch.zeros(2, 2)))
 
 
-@pytest.mark.parametrize("step", [600, 3100])
+@around_a_reset
 @pytest.mark.parametrize("rate", [0.1, 0.5, 3.0])
 def test_a_round_of_quantile_adc_matches_the_restatement(rate, step):
     """The share with the largest gradients grows as in ADC; Gaussians without a gradient do not.
@@ -249,7 +250,7 @@ def given(densifier, seed, count=60):
     return gradient, matrices
 
 
-@pytest.mark.parametrize("step", [600, 3100])
+@around_a_reset
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("threshold, share", [(-1e-6, 0.5), (None, 1.0)])
 def test_a_round_of_steep_gs_matches_the_restatement(seed, step, threshold, share):

@@ -21,8 +21,8 @@ from gsbench.densify import (
     Volumetric,
 )
 from gsbench.densify.budget import Budgeted
-from gsbench.densify.formulas import faded, quantile, revised_logits
 from gsbench.densify.mcmc import shared_opacity
+from gsbench.densify.scores import faded, quantile, revised_logits
 from gsbench.raster.base import Footprint
 from tests.densify.helpers import generator, rendered, trained
 from tests.gaussians.helpers import random_gaussians

@@ -11,6 +11,7 @@ from tests.densify import restatement
 from tests.densify.helpers import (
     EXTENT,
     Round,
+    around_a_reset,
     assert_same,
     at,
     gathered,
@@ -36,7 +37,7 @@ def halves(rows, mean_gradient):
     )
 
 
-@pytest.mark.parametrize("step", [600, 3100])
+@around_a_reset
 @pytest.mark.parametrize("seed", range(3))
 def test_a_round_of_long_axis_matches_the_restatement(seed, step):
     densifier = LongAxis()

@@ -7,7 +7,16 @@ import torch
 from gsbench.densify import ADC, MCMC, MRNF, DensifyContext, Volumetric
 from gsbench.train.options import TrainConfig
 from tests.densify import restatement
-from tests.densify.helpers import EXTENT, Round, at, generator, noise_of, rendered, trained
+from tests.densify.helpers import (
+    EXTENT,
+    Round,
+    around_a_reset,
+    at,
+    generator,
+    noise_of,
+    rendered,
+    trained,
+)
 from tests.gaussians.helpers import random_gaussians
 
 
@@ -44,7 +53,7 @@ def observe(densifier, trainable, rng, step):
 
 
 @pytest.mark.parametrize("seed", range(6))
-@pytest.mark.parametrize("step", [600, 3100])
+@around_a_reset
 def test_a_round_of_adc_matches_the_restatement(seed, step):
     trainable, gradient = prepared(densifier := ADC(), seed)
     real = Round(densifier, trainable, step, seed)
@@ -75,7 +84,7 @@ def test_a_round_with_revised_opacity_matches_the_restatement(seed):
 
 
 @pytest.mark.parametrize("seed", range(6))
-@pytest.mark.parametrize("step", [600, 3100])
+@around_a_reset
 @pytest.mark.parametrize(
     "order, threshold, isotropic",
     [("after_adc", 0.03, True), ("after_prune", 0.003, True), ("after_adc", 0.03, False)],
@@ -97,7 +106,7 @@ def test_a_volumetric_round_matches_the_restatement(order, threshold, isotropic,
 
 
 @pytest.mark.parametrize("seed", range(6))
-@pytest.mark.parametrize("step", [600, 3100])
+@around_a_reset
 def test_volumes_may_be_split_before_the_gradient_rule(seed, step):
     densifier = Volumetric(volume_threshold=0.03, volume_order="before_adc")
     trainable, gradient = prepared(densifier, seed)

@@ -93,7 +93,11 @@ def find_edges(image):
         Image.fromarray(image.numpy()).convert("L").filter(ImageFilter.FIND_EDGES), np.float64
     )
     edges[[0, -1]], edges[:, [0, -1]] = 0, 0
-    return (edges - edges.min()) / (edges.max() - edges.min())
+    return to_unit(edges)
+
+
+def to_unit(values):
+    return (values - values.min()) / (values.max() - values.min())
 
 
 def over_mean(values):
@@ -183,9 +187,7 @@ def taming_scores(trainable, gradient):
         render = ReferenceRasterizer().render(values, camera, 0, BLACK)
         photograph = room.images[view].numpy() / 255
         error = np.abs(render.image.detach().numpy() - photograph).mean(-1)
-        pixels = 50 * (error - error.min()) / (error.max() - error.min()) + 50 * find_edges(
-            room.images[view]
-        )
+        pixels = 50 * to_unit(error) + 50 * find_edges(room.images[view])
         local = values.means.numpy() @ camera.rotation.T + camera.translation
         x = camera.fx * local[:, 0] / local[:, 2] + camera.cx - 0.5
         y = camera.fy * local[:, 1] / local[:, 2] + camera.cy - 0.5

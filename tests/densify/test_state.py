@@ -16,7 +16,7 @@ from gsbench.densify import (
     Refinement,
     Volumetric,
 )
-from gsbench.densify.formulas import standard_normal
+from gsbench.densify.scores import standard_normal
 from tests.densify.helpers import generator, trained
 from tests.gaussians.helpers import random_gaussians
 

@@ -212,13 +212,13 @@ def test_the_densifiers_of_the_document_resume_to_the_bit(folder, file, name, op
         """Run refinements ``first`` to ``last`` of a made-up training, from ``state`` if given."""
         densifier, rng = cls(start=0, stop=100, **options), torch.Generator()
         context, rates = DensifyContext(2.0), LearningRates()
+        initial = random_gaussians(60, seed=1, dtype=torch.float32)
+        gaussians = TrainableGaussians(initial, rates, 2.0)
         if state is None:
-            initial = random_gaussians(60, seed=1, dtype=torch.float32)
-            gaussians = TrainableGaussians(initial, rates, 2.0)
             densifier.begin(gaussians.values, context)
             rng.manual_seed(5)
         else:
-            gaussians = TrainableGaussians.load(state[0], rates, 2.0)
+            gaussians.load_state_dict(state[0])
             densifier.load_state_dict(state[1], context)
             rng.set_state(state[2])
         for step in range(first, last + 1):

@@ -34,6 +34,12 @@ def random_weights(net, prefix="features."):
     return features, heads
 
 
+def convolved(x, w, index, **options):
+    """ReLU of the convolution at an index of torchvision's layers."""
+    layer = f"features.{index}."
+    return F.relu(F.conv2d(x, w[f"{layer}weight"], w[f"{layer}bias"], **options))
+
+
 def vgg_taps(x, w):
     """VGG16 after relu1_2, relu2_2, relu3_3, relu4_3 and relu5_3, by torchvision's indices."""
     taps = []
@@ -41,9 +47,7 @@ def vgg_taps(x, w):
         if block[0] > 0:
             x = F.max_pool2d(x, 2, 2)
         for index in block:
-            x = F.relu(
-                F.conv2d(x, w[f"features.{index}.weight"], w[f"features.{index}.bias"], padding=1)
-            )
+            x = convolved(x, w, index, padding=1)
         taps.append(x)
     return taps
 
@@ -60,9 +64,7 @@ def alex_taps(x, w):
     ):
         if pool:
             x = F.max_pool2d(x, 3, 2)
-        x = F.relu(
-            F.conv2d(x, w[f"features.{index}.weight"], w[f"features.{index}.bias"], stride, padding)
-        )
+        x = convolved(x, w, index, stride=stride, padding=padding)
         taps.append(x)
     return taps
 

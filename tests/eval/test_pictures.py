@@ -21,10 +21,10 @@ def pairs(tmp_path):
     rng = np.random.default_rng(0)
     made = []
     for view in ("b", "a"):
-        photograph, picture = tmp_path / f"{view}.png", tmp_path / f"{view}_render.png"
-        Image.fromarray(rng.integers(0, 256, (40, 50, 3), dtype=np.uint8)).save(photograph)
-        Image.fromarray(rng.integers(0, 256, (40, 50, 3), dtype=np.uint8)).save(picture)
-        made.append(PicturePair(view, photograph, picture))
+        files = tmp_path / f"{view}.png", tmp_path / f"{view}_render.png"
+        for file in files:
+            Image.fromarray(rng.integers(0, 256, (40, 50, 3), dtype=np.uint8)).save(file)
+        made.append(PicturePair(view, *files))
     return made
 
 

@@ -7,6 +7,7 @@ import torch
 
 from gsbench.densify import ADC, GNS, MCMC, MRNF, FastGS, SteepGS
 from gsbench.gaussians.initial import gaussians_from_cloud
+from gsbench.train.ideas import NO_IDEAS
 from gsbench.train.options import TrainConfig
 from gsbench.train.trainer import Trainer
 
@@ -72,9 +73,9 @@ class Lab:
     def __init__(self, *parts):
         self.scene, self.truth, self.rasterizer, self.folder = parts
 
-    def new(self, densifier, seed=0, snapshot_at=(), **changes):
+    def new(self, densifier, seed=0, snapshot_at=(), ideas=NO_IDEAS, **changes):
         parts = (self.scene, cloud(self.truth), densifier, self.rasterizer)
-        return Trainer(*parts, options(**changes), seed, snapshot_at)
+        return Trainer(*parts, options(**changes), seed, snapshot_at, ideas)
 
     def train(self, densifier, name="", on_status=lambda status: None, **changes):
         (self.folder / name).mkdir(exist_ok=True)

@@ -141,13 +141,12 @@ def test_an_error_in_the_background_is_raised_by_the_next_save(tmp_path, monkeyp
 
 def test_a_state_is_loaded_completely_on_another_device():
     """All tensors of a loaded state are on the device of the model."""
-    rates = LearningRates()
-    gaussians = TrainableGaussians(random_gaussians(5, seed=0, dtype=torch.float32), rates, 1.0)
+    initial, rates = random_gaussians(5, seed=0, dtype=torch.float32), LearningRates()
+    gaussians = TrainableGaussians(initial, rates, 1.0)
     gaussians.values.means.square().sum().backward()
     gaussians.optimizer_step()
-    moved = TrainableGaussians.load(
-        to_host(gaussians.state_dict()), rates, 1.0, torch.device("meta")
-    )
+    moved = TrainableGaussians(initial.map(lambda tensor: tensor.to("meta")), rates, 1.0)
+    moved.load_state_dict(to_host(gaussians.state_dict()))
     assert {tensor.device.type for tensor in moved.values.tensors().values()} == {"meta"}
     moments = moved.adam["means"]
     assert {moments.first.device.type, moments.second.device.type} == {"meta"}

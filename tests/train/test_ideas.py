@@ -1,6 +1,5 @@
 """Loss, terms, schedule and optimiser of the user's: what they read, what they change, errors."""
 
-import json
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
@@ -17,8 +16,7 @@ from gsbench.raster import create_rasterizer
 from gsbench.raster.contract import Case
 from gsbench.raster.depth import median_depth, render_depth
 from gsbench.raster.reference import ReferenceRasterizer
-from gsbench.train.ideas import Ideas
-from gsbench.train.trainer import Trainer
+from gsbench.train.ideas import Ideas, weighted
 from tests.conftest import script
 from tests.train.lab import (
     EVENTS,
@@ -26,7 +24,6 @@ from tests.train.lab import (
     STATEFUL,
     StopError,
     cloud,
-    options,
     same,
     small,
     stop_at,
@@ -35,13 +32,13 @@ from tests.train.lab import (
 ideas = script("ideas", "examples")
 
 
+def own(terms=(), **parts):
+    return Ideas(terms=weighted(terms), **parts)
+
+
 def trained(lab, name="", densifier=None, on_status=lambda status: None, parts=None, **changes):
-    (lab.folder / name).mkdir(exist_ok=True)
-    densifier = densifier or NoDensifier()
-    own = Ideas.of(**(parts or {}))
-    start = cloud(lab.truth)
-    trainer = Trainer(lab.scene, start, densifier, lab.rasterizer, options(**changes), 0, ideas=own)
-    return trainer.run(lab.folder / name, on_status)
+    changes["ideas"] = own(**(parts or {}))
+    return lab.train(densifier or NoDensifier(), name, on_status, **changes)
 
 
 # ---- depth
@@ -160,11 +157,7 @@ def test_a_term_of_weight_zero_changes_no_bit(lab):
 
 
 def test_the_gradient_of_a_term_is_its_weight_times_its_own(lab):
-    own = Ideas.of(terms=[(Mean(), 3.0)])
-    made = [
-        Trainer(lab.scene, cloud(lab.truth), NoDensifier(), lab.rasterizer, options(), 0, ideas=one)
-        for one in (Ideas(), own)
-    ]
+    made = [lab.new(NoDensifier(), ideas=own(terms)) for terms in ((), [(Mean(), 3.0)])]
     for trainer in made:
         trainer.step, trainer.fast = 1, None
         trainer._differentiate(0)
@@ -260,9 +253,9 @@ def test_a_schedule_sets_the_rates_it_names_and_keeps_the_others(lab):
         rates.append(base)
         return {"sh_dc": 0.0}
 
-    own = trained(lab, "own", parts={"schedule": schedule}, iterations=30)
-    assert torch.equal(own.sh_dc, cloud(lab.truth).sh_dc)
-    assert not torch.equal(own.means, cloud(lab.truth).means)
+    model = trained(lab, "own", parts={"schedule": schedule}, iterations=30)
+    assert torch.equal(model.sh_dc, cloud(lab.truth).sh_dc)
+    assert not torch.equal(model.means, cloud(lab.truth).means)
     assert rates[0]["means"] > rates[-1]["means"]
 
 
@@ -314,9 +307,9 @@ def test_rows_of_a_state_are_kept_removed_and_zero_when_new():
 
 
 def test_groups_limit_an_optimiser_to_some_parameters(lab):
-    own = trained(lab, "sign", parts={"optimizer": ideas.SignMomentum()}, iterations=30)
+    sign = trained(lab, "sign", parts={"optimizer": ideas.SignMomentum()}, iterations=30)
     plain = trained(lab, "adam", iterations=30)
-    assert not torch.equal(own.opacity_logits, plain.opacity_logits)
+    assert not torch.equal(sign.opacity_logits, plain.opacity_logits)
     trainer = lab.new(NoDensifier())
     assert set(trainer.gaussians.adam["means"].tensors) == {"first", "second"}
 
@@ -363,23 +356,21 @@ def test_a_resumed_training_with_parts_of_the_users_gives_the_same_bits(lab):
     assert lab.checkpoints("killed") == [50]
     again = trained(lab, "killed", small(), parts=all_parts())
     assert same(whole, again)
-    assert [json.loads(line)["step"] for line in lab.text(METRICS, "killed").splitlines()] == [
-        record["step"] for record in lab.records(METRICS, "whole")
-    ]
+    assert lab.steps(METRICS, "killed") == lab.steps(METRICS, "whole")
 
 
 # ---- pictures beside the photographs
 
 
 def with_beside(lab):
-    """The scene with a depth and normals beside each training view, of its own size."""
+    """The lab with a depth and normals beside each training view, of its own size."""
     views = []
     for number, view in enumerate(lab.scene.train, 1):
         size = view.image.shape[:2]
         depth = np.full(size, number, np.float32)
         normals = np.full((*size, 3), number, np.uint8)
         views.append(replace(view, beside={"depth": depth, "normals": normals}))
-    return replace(lab.scene, train=tuple(views))
+    return lab.with_views(train=tuple(views))
 
 
 @pytest.mark.parametrize("divisor", [1, 2])
@@ -397,9 +388,8 @@ def test_a_term_reads_the_pictures_beside_the_photograph(lab, divisor):
             seen.append(view.photograph.shape)
             return 0 * step.render.image.mean()
 
-    start, settings = cloud(lab.truth), options(iterations=12)
-    scene, parts = with_beside(lab), Ideas.of(terms=[(Beside(), 1.0)])
-    trainer = Trainer(scene, start, NoDensifier(), lab.rasterizer, settings, 0, ideas=parts)
+    ideas = own([(Beside(), 1.0)])
+    trainer = with_beside(lab).new(NoDensifier(), ideas=ideas, iterations=12)
     if divisor > 1:
         trainer.resolution = SimpleNamespace(
             scale=lambda step: divisor if step < 6 else 1, position_step=lambda step: step

@@ -6,13 +6,13 @@ The other pixels have the same weight as without a mask.
 import numpy as np
 import pytest
 import torch
-from skimage.metrics import structural_similarity
 
 from gsbench.eval.images import replace_ignored
 from gsbench.raster import create_rasterizer
 from gsbench.scene.types import Camera, View
 from gsbench.train.loss import PhotometricLoss
 from gsbench.train.views import SceneViews, Targets
+from tests.eval.reference import ssim_map
 
 HEIGHT, WIDTH = 37, 53
 CAMERA = Camera(
@@ -40,20 +40,8 @@ def test_the_loss_with_a_mask_matches_its_definition(picture):
     loss, l1, ssim = PhotometricLoss(0.2, threads=1)(replace_ignored(image, target, mask), target)
     truth, counts = target.numpy() / 255.0, mask.numpy()[..., 0]
     wanted_l1 = np.abs(image.numpy() - truth)[counts].sum() / image.numel()
-    padded = [
-        np.pad(np.where(mask.numpy(), x, truth), ((5, 5), (5, 5), (0, 0)))
-        for x in (image.numpy(), truth)
-    ]
-    _, full = structural_similarity(
-        *padded,
-        gaussian_weights=True,
-        sigma=1.5,
-        use_sample_covariance=False,
-        channel_axis=-1,
-        data_range=1,
-        full=True,
-    )
-    wanted_ssim = full[5:-5, 5:-5].mean()
+    shown = np.where(mask.numpy(), image.numpy(), truth)
+    wanted_ssim = ssim_map(shown, truth, beyond=5).mean()
     assert float(l1) == pytest.approx(wanted_l1, abs=1e-6)
     assert float(ssim) == pytest.approx(wanted_ssim, abs=1e-5)
     assert float(loss) == pytest.approx(0.8 * wanted_l1 + 0.2 * (1 - wanted_ssim), abs=1e-5)

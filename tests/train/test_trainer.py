@@ -181,8 +181,7 @@ def test_the_optimiser_steps_after_or_before_a_refinement(before, lab):
         def refine(self, step, gaussians, rng):
             seen.append(gaussians.values.means.detach().clone())
 
-        def after_step(self, step, gaussians, rng):
-            seen.append(gaussians.values.means.detach().clone())
+        after_step = refine
 
     training = lab.new(Watching(), step_after_refine=before)
     first = training.gaussians.values.means.detach().clone()

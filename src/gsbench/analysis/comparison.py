@@ -6,7 +6,7 @@ beforehand has a mean and an interval.
 """
 
 import itertools
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -255,37 +255,40 @@ def joined(comparisons: Sequence[Comparison]) -> Comparison:
     """
     if len(comparisons) == 1:
         return comparisons[0]
-    trials, answers = list[TrialResult](), list[Answer]()
-    for one in comparisons:
-        place = ("experiment", one.experiment.name)
-
-        def arm(own: Arm, place: tuple[str, str] = place) -> Arm:
-            return replace(own, variant=(place, *own.variant))
-
-        def named(verdict: Verdict, arm: Callable[[Arm], Arm] = arm) -> Verdict:
-            asked = verdict.question
-            sides = arm(asked.baseline), arm(asked.idea)
-            return replace(verdict, question=replace(asked, baseline=sides[0], idea=sides[1]))
-
-        trials += [replace(trial, variant=(place, *trial.variant)) for trial in one.trials]
-        answers += [
-            replace(
-                answer,
-                verdict=named(answer.verdict),
-                others=tuple(map(named, answer.others)),
-                metrics=tuple(map(named, answer.metrics)),
-            )
-            for answer in one.answers
-        ]
     experiments = [one.experiment for one in comparisons]
-
     parts: dict[str, Any] = {
         part: tuple(itertools.chain(*(getattr(one, part) for one in experiments)))
         for part in ("trials", "faults", "older", "versions")
     }
     name = " and ".join(one.name for one in experiments)
     both = replace(experiments[0], name=name, **parts)
-    return Comparison(both, tuple(trials), tuple(answers))
+    trials, answers = zip(*map(_with_experiment, comparisons), strict=True)
+    return Comparison(both, tuple(itertools.chain(*trials)), tuple(itertools.chain(*answers)))
+
+
+def _with_experiment(comparison: Comparison) -> tuple[list[TrialResult], list[Answer]]:
+    """The trials and the answers, with the experiment as a part of their arms' names."""
+    place = ("experiment", comparison.experiment.name)
+
+    def named(verdict: Verdict) -> Verdict:
+        question = verdict.question
+        baseline, idea = (
+            replace(arm, variant=(place, *arm.variant))
+            for arm in (question.baseline, question.idea)
+        )
+        return replace(verdict, question=replace(question, baseline=baseline, idea=idea))
+
+    trials = [replace(trial, variant=(place, *trial.variant)) for trial in comparison.trials]
+    answers = [
+        replace(
+            answer,
+            verdict=named(answer.verdict),
+            others=tuple(map(named, answer.others)),
+            metrics=tuple(map(named, answer.metrics)),
+        )
+        for answer in comparison.answers
+    ]
+    return trials, answers
 
 
 def chosen(comparison: Comparison, trials: Sequence[TrialResult], where: str) -> Comparison:

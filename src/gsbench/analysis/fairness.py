@@ -24,7 +24,7 @@ from gsbench.analysis.notes import Note
 from gsbench.analysis.pairs import pair_trials
 from gsbench.analysis.quantities import COSTS, relative_change
 from gsbench.analysis.results import Arm, TrialResult, group_by, trials_of
-from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
+from gsbench.analysis.table_formats import Table, text_table
 from gsbench.parsing import read_if_sound
 from gsbench.runs.experiments import SearchPoint, TuningRecord
 from gsbench.runs.layout import EVENTS, TUNING
@@ -112,17 +112,22 @@ def fairness_table(trials: Sequence[TrialResult], first: Arm, second: Arm) -> Ta
             for side in zip(*configs, strict=True)
         )
         shown[key] = list(map(", ".join, sides))
-    rows = []
-    for index, (what, values) in enumerate(shown.items()):
-        entries = map(TableEntry, [*values, UNLIKE if values[0] != values[1] else ""])
-        rows.append(Row((what,), tuple(entries), rule_above=index == len(MEASURED) + 1))
+    rows = {
+        what: (one, other, UNLIKE if one != other else "") for what, (one, other) in shown.items()
+    }
     notes = [ingredients_note(ingredients_between(trials, first, second), first, second)]
     notes += between_scenes_notes(*groups)
     notes += [Note.of("compared", pairs=len(pairs))]
     tuning = [f"Tuning. {note}" for note in tuning_notes(trials, (first, second))]
-    columns = tuple(Column("", name, ("", name)) for name in (str(first), str(second), "differs"))
-    title = f"Fairness sheet: {second} against {first}"
-    return Table(title, ("what",), columns, tuple(rows), (*map(str, notes), *tuning), wrapped=True)
+    return text_table(
+        f"Fairness sheet: {second} against {first}",
+        "what",
+        (first, second, "differs"),
+        rows,
+        ruled=len(MEASURED) + 1,
+        notes=(*map(str, notes), *tuning),
+        wrapped=True,
+    )
 
 
 def _shown(value: Any) -> str:

@@ -30,8 +30,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
 COLUMNS = ("method", "scene", "seed")
-DIRECTIONS = {"": 0, "higher": 1, "lower": -1}
-BETTER = {sign: word for word, sign in DIRECTIONS.items()}
+Sign = Literal[-1, 0, 1]
+DIRECTIONS: dict[str, Sign] = {"": 0, "higher": 1, "lower": -1}
+BETTER: dict[int, str] = {sign: word for word, sign in DIRECTIONS.items()}
 
 
 class Declared(Record):
@@ -184,7 +185,7 @@ def _digest(method: str) -> str:
     return method.replace("+", "_")  # what follows a plus stands for code
 
 
-def _trials(frame: pd.DataFrame, metric: str, direction: int, name: str) -> list[TrialResult]:
+def _trials(frame: pd.DataFrame, metric: str, sign: Sign, name: str) -> list[TrialResult]:
     """The rows as trials; raises InputError for missing columns, repeated rows and no numbers."""
     columns = [str(column) for column in frame.columns]
     for column in (*COLUMNS, metric):
@@ -199,7 +200,6 @@ def _trials(frame: pd.DataFrame, metric: str, direction: int, name: str) -> list
     metrics = {key: column for key, column in values.items() if column is not None}
     if metric not in metrics:
         raise InputError(f"the column {metric} has a value that is no number")
-    sign: Literal[-1, 0, 1] = 1 if direction > 0 else -1 if direction else 0
     facts = {
         key: MetricRecord(
             label=COSTS.get(key, (key,))[0],

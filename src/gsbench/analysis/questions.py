@@ -24,10 +24,10 @@ from typing import Any, Literal
 
 from gsbench.analysis.addresses import ArmName
 from gsbench.analysis.statistics import ALPHA, MIN_SCENES, sign_test_needs
-from gsbench.analysis.trial_result import Trained, canonical, seeds_text
+from gsbench.analysis.trial_result import Trained, seeds_text, settings_text
 from gsbench.errors import InputError
 from gsbench.runs.commands import Digest, History, Place, Question, code_in
-from gsbench.runs.configuration import is_ignored, is_of_scene
+from gsbench.runs.configuration import is_of_scene
 from gsbench.runs.experiments import Arm
 from gsbench.words import counted, some_of
 
@@ -117,12 +117,8 @@ def place_of(row: Trained) -> Place:
 
 def recipe_of(row: Trained) -> str:
     """The settings and the code, equal for trials that differ in scene and seed alone."""
-    kept = {
-        key: value
-        for key, value in row.config.items()
-        if value is not None and not is_ignored(key) and not is_of_scene(key)
-    }
-    return f"{row.init}-{row.densify} {code_in(row.digest)} {canonical(kept)}"
+    kept = {key: value for key, value in row.config.items() if not is_of_scene(key)}
+    return f"{row.init}-{row.densify} {code_in(row.digest)} {settings_text(kept)}"
 
 
 @dataclass(frozen=True)

@@ -135,11 +135,8 @@ def in_words(verdict: Verdict) -> str:
     if not (shown := numbers(verdict)):
         # without a pair of trials, the first note says why there is none
         return "; ".join([reason(verdict), *map(str, verdict.pairs.left_out[:1])])
-    return (
-        f"{reason(verdict)}; {verdict.quantity.name} on {scope(verdict)}: {shown}"
-        if (verdict.state != "answered" or verdict.favours_lacking)
-        else f"{reason(verdict)} in {verdict.quantity.name} on {scope(verdict)}: {shown}"
-    )
+    link = "; " if verdict.state != "answered" or verdict.favours_lacking else " in "
+    return f"{reason(verdict)}{link}{verdict.quantity.name} on {scope(verdict)}: {shown}"
 
 
 def _known_sign(verdict: Verdict) -> str:

@@ -6,7 +6,7 @@ import base64
 import hashlib
 import itertools
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -78,6 +78,23 @@ class Table:
         """Neighbouring columns of one group, as (name, number of columns)."""
         groups = itertools.groupby(self.columns, key=lambda column: column.group)
         return [(name, len(list(group))) for name, group in groups]
+
+
+def text_table(
+    title: str,
+    heading: str,
+    columns: Iterable[object],
+    rows: Mapping[str, Iterable[str]],
+    ruled: int | None = None,
+    **more: Any,
+) -> Table:
+    """A table of texts with a label before each row; the row number ``ruled`` is below a rule."""
+    made = [
+        Row((label,), tuple(map(TableEntry, texts)), rule_above=number == ruled)
+        for number, (label, texts) in enumerate(rows.items())
+    ]
+    names = tuple(Column("", str(name), ("", str(name))) for name in columns)
+    return Table(title, (heading,), names, tuple(made), **more)
 
 
 def fill(template: str, package: str = TEMPLATES, **values: Any) -> str:

@@ -99,8 +99,7 @@ def build_table(
     ):
         notes.append(Note.of("no mean"))
     elif has_means:
-        place = list(rows).index("scene")
-        means = _means(groups, place, row_labels, column_labels, quantities, scenes, expected)
+        means = _means(cells, list(rows).index("scene"), scenes, expected)
         best = _best(means, shown_best, varied)
         bold |= best
         shown += _rows(means, best, ruled=True)
@@ -204,42 +203,33 @@ def _best(
 
 
 def _means(
-    groups: Mapping[Labels, Sequence[TrialResult]],
-    scene_index: int,
-    row_labels: Iterable[Labels],
-    column_labels: Sequence[Labels],
-    quantities: Sequence[Quantity],
-    scenes: Sequence[str],
-    expected: int,
+    cells: Mapping[Position, Cell], place: int, scenes: Sequence[str], expected: int
 ) -> dict[Position, Cell]:
     """The means over the scenes on which every arm has a value; {} if there is no such scene.
 
-    ``scene_index`` is the index of the scene in the labels of a row.
+    ``place`` is the index of the scene in the labels of a row.
     """
-    # The labels of rows without the scene: each gives one row of means.
-    mean_rows = dict.fromkeys(
-        labels[:scene_index] + labels[scene_index + 1 :] for labels in row_labels
-    )
 
-    def trials(row: Labels, column: Labels, scene: str) -> Sequence[TrialResult]:
-        return groups.get((*row[:scene_index], scene, *row[scene_index:], *column), [])
+    def without_scene(position: Position) -> Position:
+        row, column, quantity = position
+        return (*row[:place], *row[place + 1 :]), column, quantity
 
-    def have(scene: str, quantity: Quantity) -> bool:
-        return all(
-            any(quantity.read(trial) is not None for trial in trials(row, column, scene))
-            for row, column in itertools.product(mean_rows, column_labels)
-        )
-
-    shared = {one: [scene for scene in scenes if have(scene, one)] for one in quantities}
+    by_scene = {
+        mean: {position[0][place]: cells[position] for position in own}
+        for mean, own in group_by(cells, without_scene).items()
+    }
+    shared: dict[Quantity, Sequence[str]] = {}
+    for (_, _, quantity), own in by_scene.items():
+        with_value = {scene for scene, cell in own.items() if cell.mean is not None}
+        shared[quantity] = [one for one in shared.get(quantity, scenes) if one in with_value]
     most_scenes = max(map(len, shared.values()))
     label = f"mean of {counted(most_scenes, 'scene')}"
-    cells: dict[Position, Cell] = {}
-    for row, quantity, column in itertools.product(mean_rows, quantities, column_labels):
-        own_scenes = shared[quantity]
-        averaged = list(itertools.chain(*(trials(row, column, scene) for scene in own_scenes)))
-        labels = (*row[:scene_index], label, *row[scene_index:])
-        cells[labels, column, quantity] = make_cell(averaged, quantity, own_scenes, expected)
-    return cells if most_scenes else {}
+    means: dict[Position, Cell] = {}
+    for (row, column, quantity), own in by_scene.items():
+        averaged = [trial for scene in shared[quantity] for trial in own[scene].trials]
+        labels = (*row[:place], label, *row[place:])
+        means[labels, column, quantity] = make_cell(averaged, quantity, shared[quantity], expected)
+    return means if most_scenes else {}
 
 
 def _reading_notes(

@@ -191,11 +191,6 @@ class TrialResult:
         return make_digest(arm, config_hash, code.sources, code.packages)
 
     @property
-    def asked(self) -> bool:
-        """Return whether a question covered it before its training began."""
-        return bool(self.record.questions)
-
-    @property
     def code_texts(self) -> list[str]:
         """``code of mine 3fa9c1d2`` for each of the user's modules and of gsbench's stages."""
         shown = [part for part in self.code if part.kind != "package"]

@@ -204,7 +204,9 @@ def _state(
         return "not tested"
     ideas = {second for _, second in question.digests.values()}
     # gates, ledgers and old declarations know by themselves what was asked before
-    if question.rule == "command" and not all(one.asked for one in own if one.digest in ideas):
+    if question.rule == "command" and not all(
+        one.record.questions for one in own if one.digest in ideas
+    ):
         return "not asked beforehand"
     ended = len(own) + sum(one.failed for one in unfinished)
     if ended >= question.trials:

@@ -24,6 +24,7 @@ from typing import Any
 import yaml
 
 from gsbench.analysis.results import Experiment, newest_code, read_experiment, read_views
+from gsbench.analysis.trial_result import GROUPS
 from gsbench.errors import InputError
 from gsbench.parsing import read_typed
 from gsbench.runs.experiments import TuningRecord
@@ -64,7 +65,6 @@ OF_TRIAL = (RESULTS, CONFIG, PER_VIEW, FROM_PIXELS, REGIONS, FAILED)
 MAX_BYTES = 1 << 28  # bytes of one unpacked file
 MAX_TOTAL_BYTES = 1 << 30  # bytes of all unpacked files
 NO_CONFIGURATION = f"it has no {CONFIG}"
-NAMED_GROUPS = ("scene", "init", "densify")  # groups of settings whose names results.json repeats
 
 
 def unpack_archive(file: Path, runs: Path) -> Experiment:
@@ -127,7 +127,7 @@ def _checked(home: Path) -> Experiment:
 
 def _check_configuration(config: Mapping[str, Any], results: Mapping[str, Any]) -> None:
     """Raise InputError if a trial's configuration contradicts its results."""
-    for key in ("seed", *NAMED_GROUPS):
+    for key in ("seed", *GROUPS):  # results.json repeats the names of these groups
         value = config.get(key if key == "seed" else f"{key}.name", results[key])
         if value != results[key]:
             raise InputError(

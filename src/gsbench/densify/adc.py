@@ -11,8 +11,7 @@ from torch import Tensor
 
 from gsbench.densify.base import Refinement, Rule
 from gsbench.densify.budget import Budgeted, admit
-from gsbench.densify.formulas import revised_logits
-from gsbench.densify.scores import draw
+from gsbench.densify.scores import draw, faded, revised_logits
 from gsbench.events import Cause
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import RenderOutput
@@ -33,13 +32,14 @@ class Grown(NamedTuple):
 
     @classmethod
     def halved(
-        cls, values: Gaussians, over: Tensor, log_scales: Tensor, opacity_logits: Tensor
+        cls, values: Gaussians, over: Tensor, log_scales: Tensor, opacity_factor: float
     ) -> "Grown":
-        """Two with these parameters for each Gaussian at the mask ``over`` [N]."""
+        """Two with these scales, and fainter, for each Gaussian at the mask ``over`` [N]."""
+        logits = values.opacity_logits
         return cls(
             torch.where(over, 2, 1),
             torch.where(over.unsqueeze(-1), log_scales, values.log_scales),
-            torch.where(over, opacity_logits, values.opacity_logits),
+            torch.where(over, faded(logits, opacity_factor), logits),
         )
 
 
@@ -92,8 +92,11 @@ class ADC(Budgeted):
         return self.gradient == "absolute"
 
     def observe(self, step: int, render: RenderOutput) -> None:
-        if step >= self.stop:
-            return
+        if step < self.stop:
+            self.gather(render)
+
+    def gather(self, render: RenderOutput) -> None:
+        """Gather the statistics of an iteration within the window."""
         visible, statistics = render.visible, self.statistics
         statistics["gradient_sum"] += torch.where(visible, self.screen_gradient(render), 0.0)
         statistics["visible_count"] += visible

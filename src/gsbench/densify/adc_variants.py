@@ -12,7 +12,7 @@ from torch import Tensor
 from gsbench.densify.adc import ADC, Grown
 from gsbench.densify.base import Refinement, Rule, Statistic
 from gsbench.densify.budget import admit
-from gsbench.densify.formulas import faded, quantile, standard_normal
+from gsbench.densify.scores import faded, quantile, standard_normal
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import RenderOutput
 from gsbench.settings import OpenFraction
@@ -38,13 +38,12 @@ class AbsGS(ADC):
     opacity_ceiling: OpenFraction = 0.8
     ceiling_interval: PositiveInt = 500
 
-    def observe(self, step: int, render: RenderOutput) -> None:
-        super().observe(step, render)
-        if step < self.stop:
-            assert render.screen_gradient_abs is not None  # because of needs_absolute_gradient
-            self.statistics["absolute_sum"] += torch.where(
-                render.visible, render.screen_gradient_abs.norm(dim=-1), 0.0
-            )
+    def gather(self, render: RenderOutput) -> None:
+        super().gather(render)
+        assert render.screen_gradient_abs is not None  # because of needs_absolute_gradient
+        self.statistics["absolute_sum"] += torch.where(
+            render.visible, render.screen_gradient_abs.norm(dim=-1), 0.0
+        )
 
     def mean_absolute_gradient(self) -> Tensor:
         """Absolute mean gradient [N] NDC over the iterations in which a Gaussian was visible."""
@@ -95,10 +94,8 @@ class PixelGS(ADC):
     near_fraction: PositiveFloat | None = 0.37  # of the scene extent; None: f = 1
     needs_footprint = True
 
-    def observe(self, step: int, render: RenderOutput) -> None:
-        super().observe(step, render)
-        if step >= self.stop:
-            return
+    def gather(self, render: RenderOutput) -> None:
+        super().gather(render)
         footprint = render.require_footprint()
         weights = footprint.pixels * self.nearness(footprint.depths)  # [N] px
         self.statistics["weighted_gradient_sum"] += weights * self.screen_gradient(render)
@@ -183,10 +180,9 @@ class SteepGS(ADC):
     eigenvalue_threshold: Annotated[float, Lt(0)] | None = -1e-6  # loss per squared extent
     opacity_factor: Annotated[float, Interval(gt=0, le=1)] = 0.5
 
-    def observe(self, step: int, render: RenderOutput) -> None:
-        super().observe(step, render)
-        if step < self.stop:
-            self.statistics["splitting_sum"] += render.require_extra()
+    def gather(self, render: RenderOutput) -> None:
+        super().gather(render)
+        self.statistics["splitting_sum"] += render.require_extra()
 
     def saddles(self, refinement: Refinement) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """The candidates of ADC whose split lowers the loss, as a mask [N], and where to split.
@@ -216,9 +212,7 @@ class SteepGS(ADC):
         values = refinement.gaussians.values
         over, large = self.candidates(refinement)
         log_scales = values.log_scales - math.log(self.split_shrink) * large.unsqueeze(-1)
-        return Grown.halved(
-            values, over, log_scales, faded(values.opacity_logits, self.opacity_factor)
-        )
+        return Grown.halved(values, over, log_scales, self.opacity_factor)
 
     def grow_by_gradient(self, refinement: Refinement) -> None:
         """Replace each candidate by two halves."""

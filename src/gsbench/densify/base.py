@@ -9,9 +9,8 @@ from typing import Any, ClassVar, NamedTuple
 import torch
 from torch import Tensor
 
-from gsbench.densify.formulas import revised_logits, standard_normal
 from gsbench.densify.lineage import Lineage
-from gsbench.densify.scores import TrainingViews
+from gsbench.densify.scores import TrainingViews, revised_logits, standard_normal
 from gsbench.events import Cause, RefineEvent
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.trainable import TrainableGaussians

@@ -13,8 +13,7 @@ from torch import Tensor
 
 from gsbench.densify.adc import ADC, Grown
 from gsbench.densify.base import DensifyContext, Refinement, Rule
-from gsbench.densify.formulas import faded, quantile
-from gsbench.densify.scores import by_mean, draw, draw_views, edge_scores
+from gsbench.densify.scores import by_mean, draw, draw_views, edge_scores, faded, quantile
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import RenderOutput
 from gsbench.settings import Fraction, OpenFraction
@@ -46,9 +45,7 @@ class LongAxis(ADC):
         values = refinement.gaussians.values
         over, _ = self.candidates(refinement)
         log_scales = shrunk(values.log_scales, *self._factors)
-        return Grown.halved(
-            values, over, log_scales, faded(values.opacity_logits, self.opacity_factor)
-        )
+        return Grown.halved(values, over, log_scales, self.opacity_factor)
 
     def grow_by_gradient(self, refinement: Refinement) -> None:
         """Split the Gaussians whose mean gradient reaches the threshold."""

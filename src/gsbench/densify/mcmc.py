@@ -12,9 +12,15 @@ from torch import Tensor
 
 from gsbench.densify.base import Refinement, Rule
 from gsbench.densify.budget import Budgeted
-from gsbench.densify.formulas import standard_normal
 from gsbench.densify.improved_gs import halves
-from gsbench.densify.scores import blended_sums, by_median, draw, draw_views, edge_scores
+from gsbench.densify.scores import (
+    blended_sums,
+    by_median,
+    draw,
+    draw_views,
+    edge_scores,
+    standard_normal,
+)
 from gsbench.events import Cause
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.trainable import TrainableGaussians

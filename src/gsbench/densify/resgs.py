@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gsbench.densify.adc import ADC
 from gsbench.densify.base import Refinement, Rule
-from gsbench.densify.formulas import faded
+from gsbench.densify.scores import faded
 from gsbench.errors import InputError
 from gsbench.events import Cause
 from gsbench.raster.base import RenderOutput

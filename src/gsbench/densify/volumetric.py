@@ -16,7 +16,7 @@ from torch import Tensor
 from gsbench.densify.adc import ADC, MAX_CHILDREN, Grown
 from gsbench.densify.base import Refinement, Rule
 from gsbench.densify.budget import admit
-from gsbench.densify.formulas import quantile
+from gsbench.densify.scores import quantile
 from gsbench.errors import InputError
 from gsbench.events import Cause
 from gsbench.gaussians.paper_values import VOLUME_THRESHOLD

@@ -194,16 +194,15 @@ class Evaluator:
         self._networks: dict[str, Lpips | MissingWeightsError] = {}  # each looked for once
         self._metrics: dict[str, Measure] = {}
         for facts in METRICS:
-            if facts.setting == MORE and facts.key not in wanted:
-                # not listed as unavailable: that list is in the keys of results, which a new metric
-                # must not change
-                continue
-            try:
-                if facts.key not in wanted:
-                    raise UnavailableError(f"not asked for ({facts.setting})")
-                self._metrics[facts.key] = measure_gsbench(facts.key, self)
-            except UnavailableError as error:
-                self._leave_out(facts.key, error)
+            if facts.key in wanted:
+                try:
+                    self._metrics[facts.key] = measure_gsbench(facts.key, self)
+                except UnavailableError as error:
+                    self._leave_out(facts.key, error)
+            # Further metrics are not listed as unavailable: that list is in the keys of results,
+            # which a new metric must not change.
+            elif facts.setting != MORE:
+                self.unavailable[facts.key] = f"not asked for ({facts.setting})"
         self._metrics |= {name: measure_own(name, metric) for name, metric in extra.items()}
         self._in_regions = [
             key

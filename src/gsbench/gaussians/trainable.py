@@ -302,23 +302,15 @@ class TrainableGaussians:
             },
         }
 
-    @classmethod
-    def load(
-        cls,
-        state: dict[str, Any],
-        rates: LearningRates,
-        spatial_scale: float,
-        device: torch.device | None = None,
-        step_all: StepAll | None = None,
-        optimizer: Optimizer | None = None,
-    ) -> TrainableGaussians:
-        """Make an object from a copy of ``state_dict``, on ``device`` (None: that of the state)."""
-        gaussians = Gaussians(**state["gaussians"]).map(lambda tensor: tensor.to(device))
-        trainable = cls(gaussians, rates, spatial_scale, step_all, optimizer)
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from a copy of ``state_dict``, on the present device."""
+        device = self.device
+        self.values = Gaussians(**state["gaussians"]).map(
+            lambda tensor: tensor.to(device, copy=True).requires_grad_(True)
+        )
         for name, saved in state["adam"].items():
-            tensors = {key: value.clone().to(device) for key, value in saved["tensors"].items()}
-            trainable.adam[name] = ParameterState(saved["rate"], saved["step"], tensors)
-        return trainable
+            tensors = {key: value.to(device, copy=True) for key, value in saved["tensors"].items()}
+            self.adam[name] = ParameterState(saved["rate"], saved["step"], tensors)
 
 
 def torch_adam(

@@ -28,7 +28,7 @@ from gsbench.runs.experiments import AT, metric_and_question
 from gsbench.scene.options import SceneConfig
 from gsbench.scene.record import SceneReader
 from gsbench.system.resources import available_threads, select_device
-from gsbench.train.ideas import Ideas
+from gsbench.train.ideas import Ideas, weighted
 from gsbench.train.options import TrainConfig
 from gsbench.train.proof import Proven, create_proven
 
@@ -185,7 +185,7 @@ def build_ideas(options: TrainConfig, allow_targets: list[str]) -> Ideas:
             raise InputError(f"{place}.weight must be a number, got {weight!r}")
         own = {key: value for key, value in values.items() if key != "weight"}
         terms.append((build(place, {TARGET: None} | own, allow_targets), float(weight)))
-    return Ideas.of(terms=terms, **single)
+    return Ideas(terms=weighted(terms), **single)
 
 
 def build_own_rasterizer(values: dict[str, Any], allow_targets: list[str]) -> Rasterizer | None:

@@ -5,9 +5,6 @@ Tables show unknown values as missing, and say which arms were evaluated from re
 """
 
 import logging
-import os
-import sys
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,6 +31,7 @@ from gsbench.runs.commands import (
     Command,
     History,
     append,
+    command_now,
     make_digest,
     read_history,
     shared_hash,
@@ -213,9 +211,7 @@ def ask_about(
         found, _ = ask(planned, asked, trials, history)
         for question in found:
             log.info("%s: %s", home.name, announce(question))
-        words, cwd = tuple(sys.argv[1:]), os.getcwd()
-        now = Command(words=words, cwd=cwd, time=time.time(), questions=tuple(found))
-        return now if found else None
+        return command_now(questions=tuple(found)) if found else None
 
     append(home, make)
     covering = read_history(home).covering(digest, *this)

@@ -38,27 +38,23 @@ def save_checkpoint(folder: Path, step: int, state: dict[str, Any]) -> None:
 class CheckpointWriter:
     """Writes checkpoints into ``folder``; after `finish`, all of them are completely on disk.
 
-    With ``background``, `save` copies the state to the CPU, and a thread writes and hashes it while
-    training continues; the next `save` waits for the thread. Use it for models on a GPU. For a
-    model on the CPU, the copy would take longer than the write.
+    A thread writes and hashes them. With ``background``, `save` copies the state to the CPU, and
+    training continues meanwhile; the next `save` waits for the thread. Use it for models on a GPU.
+    For a model on the CPU, the copy would take longer than the write, so `save` waits.
     """
 
     def __init__(self, folder: Path, background: bool) -> None:
-        self.folder = folder
-        self._executor = (
-            ThreadPoolExecutor(1, thread_name_prefix="gsbench-checkpoint") if background else None
-        )
+        self.folder, self.background = folder, background
+        self._executor = ThreadPoolExecutor(1, thread_name_prefix="gsbench-checkpoint")
         self._pending: Future[None] | None = None
 
     def save(self, step: int, state: dict[str, Any]) -> None:
         """Save the state of ``step``. Raises the error of the previous save if it failed."""
         self.finish()
-        if self._executor is None:
-            save_checkpoint(self.folder, step, state)
-        else:
-            self._pending = self._executor.submit(
-                save_checkpoint, self.folder, step, to_host(state)
-            )
+        state = to_host(state) if self.background else state
+        self._pending = self._executor.submit(save_checkpoint, self.folder, step, state)
+        if not self.background:
+            self.finish()
 
     def finish(self) -> None:
         """Wait until the last checkpoint is on disk. Raises its error if it failed."""
@@ -71,8 +67,7 @@ class CheckpointWriter:
         try:
             self.finish()
         finally:
-            if self._executor is not None:
-                self._executor.shutdown()
+            self._executor.shutdown()
 
 
 def to_host(state: Any) -> Any:

@@ -100,6 +100,18 @@ class WeightedTerm:
     label: str
 
 
+def weighted(terms: Sequence[tuple[Term, float]]) -> tuple[WeightedTerm, ...]:
+    """The ``terms``, labelled by the names of their classes, which are numbered if they repeat."""
+    counts: Counter[str] = Counter()
+    found = []
+    for term, weight in terms:
+        name = type(term).__name__
+        counts[name] += 1
+        label = name if counts[name] == 1 else f"{name}_{counts[name]}"
+        found.append(WeightedTerm(term, weight, label))
+    return tuple(found)
+
+
 @dataclass(frozen=True)
 class Ideas:
     """The parts that a user's classes replace; by default none."""
@@ -108,34 +120,13 @@ class Ideas:
     terms: tuple[WeightedTerm, ...] = ()
     schedule: Schedule | None = None
     optimizer: Optimizer | None = None
-    # the user's objects by a name of their own, for checkpoints
-    named: Mapping[str, Any] = field(default_factory=dict)
 
-    @classmethod
-    def of(
-        cls,
-        loss: Term | None = None,
-        terms: Sequence[tuple[Term, float]] = (),
-        schedule: Schedule | None = None,
-        optimizer: Optimizer | None = None,
-    ) -> Ideas:
-        """The parts, with a label for each term: the name of its class, numbered if it repeats."""
-        counts: Counter[str] = Counter()
-        weighted = []
-        for term, weight in terms:
-            name = type(term).__name__
-            counts[name] += 1
-            label = name if counts[name] == 1 else f"{name}_{counts[name]}"
-            weighted.append(WeightedTerm(term, weight, label))
-        named = {"loss": loss, "schedule": schedule, "optimizer": optimizer}
-        named |= {f"term {one.label}": one.term for one in weighted}
-        return cls(
-            loss,
-            tuple(weighted),
-            schedule,
-            optimizer,
-            {name: part for name, part in named.items() if part is not None},
-        )
+    @property
+    def named(self) -> dict[str, Any]:
+        """The user's objects by a name of their own, for checkpoints."""
+        named = {name: getattr(self, name) for name in ("loss", "schedule", "optimizer")}
+        named |= {f"term {one.label}": one.term for one in self.terms}
+        return {name: part for name, part in named.items() if part is not None}
 
     @property
     def reads_renders(self) -> bool:

@@ -4,7 +4,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from inspect import signature
@@ -31,13 +31,25 @@ from gsbench.scene.types import Camera, Scene
 from gsbench.system.resources import CLOCK, free_bytes
 from gsbench.system.stopping import deferred, requested
 from gsbench.train.checkpoint import CheckpointWriter, load_checkpoint
-from gsbench.train.growth import GrowthWatch
 from gsbench.train.ideas import NO_IDEAS, Ideas, Step, TrainedView, scheduled, value_of
 from gsbench.train.loss import PhotometricLoss
 from gsbench.train.options import TrainConfig
-from gsbench.train.records import PHOTOMETRIC, LossLog, append, drop_after, volume_histogram
-from gsbench.train.resolution import Resolution, ScaledViews
-from gsbench.train.views import CameraOrder, SceneViews, Targets, generators
+from gsbench.train.records import (
+    PHOTOMETRIC,
+    GrowthWatch,
+    LossLog,
+    append,
+    drop_after,
+    volume_histogram,
+)
+from gsbench.train.views import (
+    CameraOrder,
+    Resolution,
+    ScaledViews,
+    SceneViews,
+    Targets,
+    generators,
+)
 
 log = logging.getLogger(__name__)
 
@@ -165,12 +177,9 @@ class Trainer:
         if self.snapshot_at:
             (folder / snapshot_file(0)).parent.mkdir(exist_ok=True)
         writer = CheckpointWriter(folder, background=self.device.type != "cpu")
-        try:
-            # Signals wait for the end of the iteration: half a step could not be resumed.
-            with deferred(), self._explained(folder):
-                self._loop(folder, writer, on_status)
-        finally:
-            writer.close()
+        # Signals wait for the end of the iteration: half a step could not be resumed.
+        with closing(writer), deferred(), self._explained(folder):
+            self._loop(folder, writer, on_status)
         rounds = (folder / EVENTS).read_bytes().count(b"\n")
         if not isinstance(self.densifier, NoDensifier) and rounds < FEWEST_ROUNDS:
             log.warning("%s", few_rounds(type(self.densifier).__name__, rounds, self.step))
@@ -409,11 +418,14 @@ class Trainer:
         Only gsbench's own densifiers are known to look at it in no other way than these.
         """
         densifier, step = self.densifier, self.step
-        if not type(densifier).__module__.startswith("gsbench."):
-            return False
-        if step == self.options.iterations or step in self.snapshot_at:
-            return False
-        if self.shows_view or densifier.needs_footprint or densifier.needs_extra is not None:
+        if (
+            not type(densifier).__module__.startswith("gsbench.")
+            or step == self.options.iterations
+            or step in self.snapshot_at
+            or self.shows_view
+            or densifier.needs_footprint
+            or densifier.needs_extra is not None
+        ):
             return False
         event = RefineEvent(step=step, before=len(self.gaussians))
         return not densifier.rules(Refinement(step, self.gaussians, self.rngs["densify"], event))
@@ -445,15 +457,7 @@ class Trainer:
             self.step = state["step"]
             self.seconds = state["seconds"]
             self.losses.smoothed = state["smoothed_loss"]
-            old = self.gaussians
-            self.gaussians = TrainableGaussians.load(
-                state["gaussians"],
-                old.rates,
-                old.spatial_scale,
-                self.device,
-                old.step_all,
-                old.optimizer,
-            )
+            self.gaussians.load_state_dict(state["gaussians"])
             self.ideas.load_state_dict(state["ideas"])
             self.densifier.load_state_dict(state["densifier"], self.context)
             for name, rng in self.rngs.items():

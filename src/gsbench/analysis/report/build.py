@@ -23,14 +23,14 @@ from gsbench.analysis.report.charts import forest_plot, line_chart
 from gsbench.analysis.report.curves import (
     event_charts,
     event_table,
+    quality_charts,
     sweep_charts,
     training_charts,
     volume_charts,
 )
-from gsbench.analysis.report.quality import quality_charts
 from gsbench.analysis.report.where import region_maps
 from gsbench.analysis.results import Experiment, TrialResult, group_by, trials_of
-from gsbench.analysis.table_formats import Column, Row, Table, TableEntry, fill
+from gsbench.analysis.table_formats import Table, fill, text_table
 from gsbench.analysis.tables import build_table
 from gsbench.analysis.verdicts import Verdict
 from gsbench.eval.facts import find_metric
@@ -208,12 +208,10 @@ def provenance(trials: Sequence[TrialResult]) -> Table:
             "versions": ", ".join(versions),
         }
     names = dict.fromkeys(itertools.chain(*facts_by_trial.values()))
-    columns = tuple(Column("", name, ("provenance", name)) for name in names)
-    rows = []
-    for label, facts in facts_by_trial.items():
-        entries = tuple(TableEntry(facts.get(name, "")) for name in names)
-        rows.append(Row((label,), entries))
-    return Table("Trials", ("trial",), columns, tuple(rows), wrapped=True)
+    rows = {
+        label: [facts.get(name, "") for name in names] for label, facts in facts_by_trial.items()
+    }
+    return text_table("Trials", "trial", names, rows, wrapped=True)
 
 
 def search_summary(home: Path) -> tuple[str, str] | None:

@@ -67,23 +67,22 @@ def region_psnr(error: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class SceneRegions:
-    """The regions of a scene's test views: differences, the baseline's noise, and p.
+class ViewRegions:
+    """The regions [R, C] of a test view.
 
-    ``change`` holds for each view the mean difference in dB [R, C] (arm minus baseline, positive is
-    better), ``p`` its two-sided p, and ``spread`` the standard deviation in dB [R, C] over seeds of
-    the baseline alone.
+    ``change`` is the mean difference in dB (arm minus baseline, positive is better), ``p`` its
+    two-sided p, and ``spread`` the standard deviation in dB over seeds of the baseline alone.
     """
 
-    change: Mapping[str, Array]
-    p: Mapping[str, Array]
-    spread: Mapping[str, Array]
+    change: Array
+    p: Array
+    spread: Array
 
 
 def compare_regions(
     arm: Sequence[Mapping[str, Array]], baseline: Sequence[Mapping[str, Array]]
-) -> SceneRegions:
-    """The comparison of one scene, from the region errors by view of each seed's pair.
+) -> dict[str, ViewRegions]:
+    """The comparison of a scene's views, from the region errors by view of each seed's pair.
 
     Raises InputError for fewer than three seeds, and if trials have other views or sizes.
     """
@@ -100,15 +99,15 @@ def compare_regions(
         for trials in (arm, baseline)
     )
     differences = [one - other for one, other in zip(ours, theirs, strict=True)]  # [K, R, C] each
-    rows = [each.reshape(seeds, -1) for each in differences]  # [K, N] each
-    p = _p_values(rows)
-    spread = {view: each.std(axis=0, ddof=1) for view, each in zip(views, theirs, strict=True)}
-    named = list(zip(views, shapes, strict=True))
-    return SceneRegions(
-        {view: each.mean(axis=0) for view, each in zip(views, differences, strict=True)},
-        {view: own.reshape(shape) for (view, shape), own in zip(named, p, strict=True)},
-        spread,
-    )
+    p = _p_values([each.reshape(seeds, -1) for each in differences])  # of [K, N] each
+    return {
+        view: ViewRegions(
+            change=each.mean(axis=0),
+            p=own.reshape(each.shape[1:]),
+            spread=base.std(axis=0, ddof=1),
+        )
+        for view, each, own, base in zip(views, differences, p, theirs, strict=True)
+    }
 
 
 def _p_values(rows: Sequence[Array]) -> list[Array]:
@@ -159,7 +158,7 @@ def region_maps(
 
     A scene has none with fewer than three pairs of seeds, or without pictures or their errors.
     """
-    found: list[tuple[tuple[Arm, Arm], Sequence[TrialPair], SceneRegions]] = []
+    found: list[tuple[tuple[Arm, Arm], Sequence[TrialPair], dict[str, ViewRegions]]] = []
     for arms in dict.fromkeys((one.baseline, one.arm) for one in answers):
         for own in group_by(pair_trials(trials, *arms), lambda pair: pair[0].scene).values():
             if len(own) >= FEWEST_SEEDS:
@@ -168,27 +167,29 @@ def region_maps(
                     found.append((arms, own, compare_regions(*errors)))
                 except InputError:
                     continue
-    family = [p for _, _, scene in found for p in scene.p.values()]
+    family = [view.p for _, _, scene in found for view in scene.values()]
     lit = iter(discoveries(family)) if family else iter(())
     maps: dict[tuple[Arm, Arm], list[dict[str, Any]]] = {}
     for arms, pairs, scene in found:
-        of_views = {view: next(lit) for view in scene.p}
+        of_views = {view: next(lit) for view in scene}
         maps.setdefault(arms, []).append(_map(pairs, scene, of_views))
     return maps
 
 
-def _map(own: Sequence[TrialPair], scene: SceneRegions, lit: dict[str, Flags]) -> dict[str, Any]:
+def _map(
+    own: Sequence[TrialPair], scene: Mapping[str, ViewRegions], lit: dict[str, Flags]
+) -> dict[str, Any]:
     """The test view of a scene with most lit regions, and the counts of all its views.
 
     Pictures are data URIs, in the photograph's size. Lit regions are drawn over the photograph if
     it is there.
     """
-    better = {view: flags & (scene.change[view] > 0) for view, flags in lit.items()}
+    better = {view: flags & (scene[view].change > 0) for view, flags in lit.items()}
     view = max(lit, key=lambda name: int(lit[name].sum()))
     colours = np.full((*lit[view].shape, 3), NOTHING, dtype=np.uint8)
     colours[lit[view]] = WORSE
     colours[better[view]] = BETTER
-    grey = 255 * (1 - np.clip(scene.spread[view] / NOISY, 0, 1))
+    grey = 255 * (1 - np.clip(scene[view].spread / NOISY, 0, 1))
     truth = read_truth(own[0][0], view)
     size = tuple(SIDE * count for count in grey.shape) if truth is None else truth.shape[:2]
     shown = _spread(colours, size)

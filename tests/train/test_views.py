@@ -1,22 +1,28 @@
-"""Training on small pictures: the schedule of sizes, and resuming."""
+"""The training views: small pictures first, and what densifiers get of the views."""
 
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
+from torch.testing import assert_close
 
 from gsbench.analysis.differences import ingredients
-from gsbench.densify import EdgeAware
+from gsbench.densify import EdgeAware, NoDensifier
+from gsbench.densify.scores import blended_sums
+from gsbench.eval.ssim import ssim_map
+from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.runs.code import config_hash
 from gsbench.scene.types import View
-from gsbench.train.resolution import (
+from gsbench.train.loss import photometric_loss
+from gsbench.train.views import (
     Resolution,
     ScaledViews,
     ScaleSchedule,
+    Targets,
     scale_schedule,
 )
-from gsbench.train.views import Targets
 from tests.config.test_schema import composed
 from tests.train.conftest import orbit_camera
 from tests.train.lab import CPU, EVENTS, METRICS, STATEFUL, StopError, options, same, small, stop_at
@@ -114,17 +120,21 @@ def weights(size, smaller):
     return triangle / triangle.sum(1, keepdims=True)
 
 
+def reduced(view, scale):
+    """The camera and the picture of a view with sides divided by ``scale``."""
+    cameras, targets = ScaledViews([view], Targets([view], CPU), CPU, None).at(scale)
+    return cameras[0], targets.get(0)
+
+
 @pytest.mark.parametrize("scale, height, width", [(2, 16, 20), (3, 10, 13), (8, 4, 5)])
 def test_a_small_picture_is_filtered_and_its_camera_is_resized(scale, height, width):
     camera = orbit_camera(0.3)
     (image,) = soft_pictures(1, camera.height, camera.width, 5)
-    view = View("a.png", camera, image)
-    cameras, targets = ScaledViews([view], Targets([view], CPU), CPU, None).at(scale)
-    small = cameras[0]
+    small, picture = reduced(View("a.png", camera, image), scale)
     assert (small.width, small.height) == (width, height)
     rows, columns = weights(camera.height, height), weights(camera.width, width)
     expected = np.einsum("ih,hwc,jw->ijc", rows, image / 1.0, columns)
-    assert np.abs(targets.get(0).numpy() - expected).max() <= 0.5 + 1e-4
+    assert np.abs(picture.numpy() - expected).max() <= 0.5 + 1e-4
     x, y, z = camera.rotation @ np.array([0.1, -0.2, 0.3]) + camera.translation
     across = (camera.fx * x / z + camera.cx) / camera.width
     down = (camera.fy * y / z + camera.cy) / camera.height
@@ -134,9 +144,9 @@ def test_a_small_picture_is_filtered_and_its_camera_is_resized(scale, height, wi
 
 def test_a_picture_keeps_at_least_one_pixel():
     view = View("a.png", orbit_camera(0.0, 5, 3), np.full((3, 5, 3), 7, np.uint8))
-    cameras, targets = ScaledViews([view], Targets([view], CPU), CPU, None).at(8)
-    assert (cameras[0].width, cameras[0].height) == (1, 1)
-    assert targets.get(0).tolist() == [[[7, 7, 7]]]
+    camera, picture = reduced(view, 8)
+    assert (camera.width, camera.height) == (1, 1)
+    assert picture.tolist() == [[[7, 7, 7]]]
 
 
 def scheduled(scene):
@@ -217,3 +227,39 @@ def test_the_schedule_is_an_ingredient_and_part_of_the_hash():
 )
 def test_full_size_begins_at_the_last_point_with_a_scale_of_two_or_more(scales, full):
     assert ScaleSchedule((0, 100, 200, 300), scales).full_from == full
+
+
+def test_views_are_rendered_and_measured_as_in_training(lab):
+    lab.rasterizer, views_of_scene = ReferenceRasterizer(), lab.scene.train
+    trainer = lab.new(NoDensifier(), background=[0.2, 0.4, 0.6])
+    views, gaussians = trainer.context.training_views, trainer.gaussians.values
+    gaussians.sh_rest.data += 0.1
+    assert len(views) == len(views_of_scene)
+    for index, view in enumerate(views_of_scene[:2]):
+        assert torch.equal(views.image(index), torch.from_numpy(view.image))
+        for step, degree in ((39, 0), (40, 1), (120, 3), (400, 3)):  # a degree every 40 iterations
+            image = views.render(index, gaussians, step).image
+            own = trainer.rasterizer.render(
+                gaussians, view.camera, degree, torch.tensor([0.2, 0.4, 0.6])
+            ).image
+            assert torch.equal(image, own)
+        expected, _, _ = photometric_loss(own.detach(), torch.from_numpy(view.image))
+        assert views.loss(index, own) == expected
+        assert not views.loss(index, own).requires_grad
+        photograph = torch.from_numpy(view.image) / 255
+        dissimilar = views.dissimilarity(index, own.detach())
+        assert_close(dissimilar, (1 - ssim_map(own.detach(), photograph).mean(0)).clamp_min(0))
+        assert dissimilar.shape == view.image.shape[:2]
+        assert float(views.dissimilarity(index, photograph).abs().max()) < 1e-6
+
+
+def test_rendering_a_view_for_scores_leaves_no_gradient(lab):
+    lab.rasterizer = ReferenceRasterizer()
+    trainer = lab.new(NoDensifier())
+    views, gaussians = trainer.context.training_views, trainer.gaussians.values
+    with torch.no_grad():
+        sums, render = blended_sums(views, 0, gaussians, 100, torch.ones(*views.image(0).shape))
+    assert torch.equal(sums[:, 0], sums[:, 2])
+    # the sum of all blending weights
+    assert_close(sums[:, 0].sum(), render.alpha.sum())
+    assert all(tensor.grad is None for tensor in gaussians.tensors().values())
