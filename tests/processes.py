@@ -2,6 +2,7 @@
 
 import signal
 import subprocess
+import time
 from contextlib import suppress
 
 import psutil
@@ -29,6 +30,14 @@ def is_running(pid):
         return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
     except psutil.NoSuchProcess:
         return False
+
+
+def wait_until(condition, seconds=300, pause=0.01):
+    """Wait until ``condition()`` holds; the limit is for programs that hang."""
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(pause)
 
 
 def bytes_written(folder, pattern):

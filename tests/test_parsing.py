@@ -33,7 +33,7 @@ from gsbench.parsing import (
     resolved,
     without_byte_order_mark,
 )
-from gsbench.runs.trial_files import iterate_rows
+from gsbench.runs.trial_record import iterate_rows
 from tests.helpers import refusal, table, write
 
 

@@ -35,7 +35,7 @@ from gsbench.analysis.report.curves import (
 )
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.statistics import Interval
-from gsbench.runs.trial_files import Histogram
+from gsbench.runs.trial_record import Histogram
 from tests.analysis.helpers import ADC, VOLUMETRIC, loaded, page_of, rows_of, trials_of
 from tests.helpers import refusal, write
 from tests.markup import Page

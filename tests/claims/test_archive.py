@@ -22,7 +22,7 @@ from gsbench.claims.archive import unpack_archive
 from gsbench.claims.export import write_archive
 from gsbench.errors import InputError
 from tests.analysis.helpers import ADC, VOLUMETRIC, loaded
-from tests.helpers import read_json, refusal, write
+from tests.helpers import change_json, refusal, write
 from tests.trials import ask_about, search_record, write_runs
 
 # as many trials as Table 1 has
@@ -133,13 +133,12 @@ def test_an_archive_has_no_pixels_no_paths_and_no_passwords(tmp_path):
         "b": "https://alice:secret@a.org/c",
     }
     write(path / "config.yaml", config)
-    results = read_json(path / "results.json")
     looked = (
         "weights not found: a.pth (looked in /home/alice/weights, /home/alice/.cache/torch; "
         "switched off): get them"
     )
-    results["unavailable"] = {"lpips_alex": looked, "where": "/home/alice/weights/a.pth"}
-    write(path / "results.json", results)
+    unavailable = {"lpips_alex": looked, "where": "/home/alice/weights/a.pth"}
+    change_json(path / "results.json", unavailable=unavailable)
     write_archive(loaded(runs), tmp_path / "exp.zip")
     content = members(tmp_path / "exp.zip")
     assert not any(name.endswith((".png", ".ply")) for name in content)
@@ -157,20 +156,16 @@ def cut(file):
     file.write_bytes(file.read_bytes()[:-600])
 
 
-def edit(name, old, new, resigned=False):
+def edit(name, old, new):
     def change(content):
         assert old in content[name]
         content[name] = content[name].replace(old, new)
 
-    return lambda file: rewrite(file, change, resigned)
+    return lambda file: rewrite(file, change)
 
 
 def drop(name):
     return lambda file: rewrite(file, lambda content: content.pop(name) and None)
-
-
-def resigned(name, old, new):
-    return edit(name, old, new, resigned=True)
 
 
 def added(place, content):

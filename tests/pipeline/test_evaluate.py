@@ -1,7 +1,6 @@
 """What an evaluation depends on, and what it measures."""
 
 import csv
-from contextlib import nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -90,16 +89,6 @@ def test_speed_is_measured_at_the_given_size(monkeypatch):
     found = measure_speed(Watched(), case.gaussians(), scene, black, [64, 20])
     assert sizes == [(64, 20)] * 6  # the first render is not timed
     assert found == {"a": 2.5}
-
-
-@pytest.fixture
-def told(monkeypatch):
-    """The progress that an evaluation reports."""
-    told = []
-    monkeypatch.setattr(
-        evaluate_module, "progress", lambda title: nullcontext(lambda *counts: told.append(counts))
-    )
-    return told
 
 
 def test_an_evaluation_measures_the_pixels_of_its_png_files(tmp_path, truth, tiny_scene, told):

@@ -19,7 +19,7 @@ from gsbench.renders.imported import Destination, Measured, check_destination, f
 from gsbench.renders.measure import _lines
 from gsbench.renders.sources import ReferenceImages, find_reference_images
 from gsbench.scene.names import Matching
-from tests.helpers import read_json, refusal, write
+from tests.helpers import change_json, read_json, refusal, write
 from tests.trials import write_runs
 
 QUICK = ["eval.lpips=[]", "eval.flip=false"]
@@ -117,8 +117,7 @@ def test_renders_are_entered_beside_the_trial_of_their_photographs(trial, runs, 
 def test_a_named_metric_writes_the_question_about_all_seeds_of_the_baseline(trial, runs, said):
     second = trial.with_name(trial.name.replace("seed0", "seed1"))
     shutil.copytree(trial, second)
-    record = read_json(second / "results.json")
-    write(second / "results.json", record | {"seed": 1})
+    change_json(second / "results.json", seed=1)
     words = ["evaluate", trial / "renders", "--truth", "exp:garden:adc:0", "--as", "exp:theirs"]
     for seed in (0, 1):
         said(*words, "eval.primary=psnr", "--seed", seed)
@@ -206,8 +205,7 @@ def test_the_initialiser_of_an_arm_is_that_of_the_experiments_own_trials(tmp_pat
     with refusal(r"has random, sfm on garden: say which, .* exp:random-mine"):
         find_destination("exp:mine", None, 0, garden, tmp_path)
     for folder in (tmp_path / "exp" / "garden").glob("sfm-*/*"):
-        results = read_json(folder / "results.json")
-        write(folder / "results.json", results | {"evaluated_from": "renders"})
+        change_json(folder / "results.json", evaluated_from="renders")
     assert find_destination("exp:mine", None, 0, garden, tmp_path).init == "random"
 
 

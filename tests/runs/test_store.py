@@ -17,6 +17,7 @@ from gsbench.runs.keys import Stage, Step
 from gsbench.runs.layout import MANIFEST
 from gsbench.runs.store import Store, read_manifest
 from tests.helpers import refusal, write
+from tests.processes import wait_until
 from tests.runs.toy import TOY, expected_text, toy_inputs
 
 LETTERS = Stage("letters", 1)
@@ -290,9 +291,7 @@ def test_processes_that_want_the_same_result_build_it_once_and_say_what_they_wai
 def test_a_killed_process_frees_its_lock(store):
     first = toy(store, 1, "--slow")
     key = TOY.key(toy_inputs(0))
-    deadline = time.monotonic() + 20
-    while not store.partial(TOY, key).exists() and time.monotonic() < deadline:
-        time.sleep(0.01)
+    wait_until(store.partial(TOY, key).exists)
     second = toy(store, 1)
     time.sleep(0.3)
     first.send_signal(signal.SIGKILL)

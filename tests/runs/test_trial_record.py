@@ -6,8 +6,16 @@ from pathlib import Path
 import pytest
 
 from gsbench.parsing import DamagedError, parse_typed
-from gsbench.runs.trial_files import Failure, Histogram, read_rows, whole_lines
-from gsbench.runs.trial_record import MetricRecord, UnfinishedError, record_from, split_text
+from gsbench.runs.trial_record import (
+    Failure,
+    Histogram,
+    MetricRecord,
+    UnfinishedError,
+    read_rows,
+    record_from,
+    split_text,
+    whole_lines,
+)
 from tests.helpers import table
 from tests.trials import results_of, trial_values
 

@@ -4,7 +4,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 import urllib.request
 from contextlib import ExitStack, contextmanager, suppress
 from shlex import split
@@ -18,7 +17,7 @@ from gsbench.tracking import connect, ensure_experiment
 from gsbench.tracking.mlflow_sink import SETTINGS
 from tests.end_to_end.conftest import SMALL
 from tests.helpers import read_json
-from tests.processes import completed, heed_interrupts
+from tests.processes import completed, heed_interrupts, wait_until
 from tests.tracking.helpers import (
     begin_trial,
     child_environment,
@@ -143,13 +142,6 @@ def mirrors_of(program):
 
     wait_until(look)
     return found
-
-
-def wait_until(condition):
-    deadline = time.monotonic() + SECONDS
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.1)
 
 
 @pytest.fixture(params=["http", "postgresql"])

@@ -15,12 +15,12 @@ from gsbench.tracking import Mirror, beside, connect
 from gsbench.tracking.beside import permissions, send_beside
 from gsbench.tracking.sync import MirrorError
 from tests.helpers import read_json, write
+from tests.processes import wait_until
 from tests.tracking.helpers import (
     STATE,
     begun_trial,
     child_environment,
     following,
-    found_runs,
     options,
     run_of,
     write_trial,
@@ -193,13 +193,6 @@ def told(folders, pause=60.0, patience=1e6):
     return write(folders[0].parents[4] / "told.json", content)
 
 
-def wait_until(condition):
-    deadline = time.monotonic() + 60
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-
-
 def test_a_trial_is_sent_from_its_beginning_to_its_end_and_at_once_when_it_ends(sent, tmp_path):
     trials = [tracked(tmp_path, seed) for seed in range(3)]
 
@@ -290,10 +283,7 @@ def test_a_trial_is_shown_from_its_beginning_to_its_end(runs):
     folder, values = begun_trial(runs, seed=4)
     with following(options(), folder):
         (folder / "metrics.jsonl").write_text('{"step": 1, "loss": 0.5}\n')
-        deadline = time.monotonic() + 240
-        while not (folder / STATE).exists():
-            assert time.monotonic() < deadline
-            time.sleep(0.1)
+        wait_until((folder / STATE).exists)
         write_trial(folder, values)
     assert run_of(connect(None, runs), 4).info.status == "FINISHED"
 
@@ -340,15 +330,3 @@ def test_a_process_whose_sweep_was_killed_ends_soon_though_its_tracker_hangs(tmp
             child.wait(10)
         child.stdin.close()
         assert child.wait(120) == 1
-
-
-@pytest.mark.slow
-def test_a_trial_whose_lock_another_holds_is_left_alone(runs):
-    folder, values = begun_trial(runs, seed=6)
-    with hold(folder / ".mlflow.lock", "mirroring"), following(options(), folder):
-        write_trial(folder, values)
-    assert not [
-        run
-        for run in found_runs(connect(None, runs), "tracked")
-        if run.data.tags.get("seed") == "6"
-    ]

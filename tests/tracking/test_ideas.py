@@ -17,7 +17,7 @@ from gsbench.tracking.ideas import addresses, description
 from gsbench.tracking.sync import sync
 from gsbench.verbs import servers
 from tests.helpers import change_json
-from tests.processes import bytes_written
+from tests.processes import bytes_written, wait_until
 from tests.tracking.helpers import (
     begin_trial,
     child_environment,
@@ -178,10 +178,7 @@ def test_a_browser_shows_a_row_for_each_idea(tmp_path, monkeypatch):
     monkeypatch.setattr(servers, "stop_on_signals", lambda: threading.Lock())
     thread.start()
     try:
-        deadline = time.monotonic() + 120
-        while not servers._serves(server, "swept", page):
-            assert time.monotonic() < deadline
-            time.sleep(0.5)
+        wait_until(lambda: servers._serves(server, "swept", page), pause=0.5)
         with Browser(page, tmp_path / "profile", (1500, 1000)) as browser:
 
             def text(picture):

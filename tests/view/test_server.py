@@ -18,6 +18,7 @@ from gsbench.view import server
 from gsbench.view.server import Session, Viewer, check_port
 from gsbench.view.trials import find_trial, load_viewed
 from tests.helpers import refusal
+from tests.processes import wait_until
 from tests.view.browser import Browser
 
 
@@ -34,13 +35,6 @@ def viewer(trials):
     viewer = Viewer(trials, 0)
     yield viewer
     viewer.stop()
-
-
-def wait_until(condition):
-    deadline = time.monotonic() + 20
-    while not condition():
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.005)
 
 
 def test_page_answers_until_it_is_stopped(trials):

@@ -31,8 +31,8 @@ from gsbench.parsing import DamagedError
 from gsbench.runs.configuration import Values, sha256_of
 from gsbench.runs.experiments import experiment_home
 from gsbench.runs.layout import CURVES, RESULTS, TRIAL_GLOB
-from gsbench.runs.trial_files import read_rows
 from gsbench.runs.trial_folder import TrialFolder
+from gsbench.runs.trial_record import read_rows
 from gsbench.scene.images import image_size
 from gsbench.scene.names import IMAGE_SUFFIXES
 from gsbench.scene.options import downscaled_size

@@ -13,7 +13,6 @@ from gsbench.runs import keys, layout
 from gsbench.runs.code import config_hash, user_modules
 from gsbench.runs.configuration import arm_hash, flatten, sha256_of
 from gsbench.runs.store import StoredResult, read_manifest
-from gsbench.runs.trial_files import read_rows
 from gsbench.runs.trial_record import (
     FROM_MODEL,
     FROM_RENDERS,
@@ -26,6 +25,7 @@ from gsbench.runs.trial_record import (
     Training,
     TrialRecord,
     TwinViews,
+    read_rows,
     split_text,
 )
 from gsbench.scene.rules import settle
@@ -33,6 +33,7 @@ from gsbench.scene.types import Capture, Scene
 from gsbench.system.install import version_of
 from gsbench.train.proof import Proven
 
+MEASURED = keys.INIT, keys.TRAIN, keys.EVALUATE  # stages whose time and key are recorded
 # packages on whose versions a result depends
 PACKAGES = ("torch", "numpy", "numba", "pycolmap", "kornia", "gsplat", "piq")
 # fields that results.json copies from the training and from the evaluation without changes
@@ -65,8 +66,7 @@ def results_of(
     entries by stage. ``code`` maps the parts of gsbench's source that the steps used to their
     states. ``asked`` are the ids of the questions that covered the trial before its training.
     """
-    stages = keys.INIT, keys.TRAIN, keys.EVALUATE
-    init, trained, evaluated = (entries[stage.name] for stage in stages)
+    init, trained, evaluated = (entries[stage.name] for stage in MEASURED)
     training = read_typed(trained.path / layout.TRAINING, Training)
     evaluation = read_typed(evaluated.path / layout.METRICS, Evaluation)
     manifest = read_manifest(evaluated.path)
@@ -76,12 +76,6 @@ def results_of(
     # A stage of the store may have been made with a rule accepted that is not accepted here.
     refused = [odd for odd in oddities if odd.refused]
     settle(refused, f"scene {capture.name}", capture.accept)
-    is_ready_made = training.trained_by is None and not training.iterations
-    seconds = {"init": init.seconds, "train": training.seconds, "evaluate": evaluated.seconds}
-    if is_ready_made:
-        del seconds["train"]
-    if training.compile_seconds is not None:
-        seconds["compile"] = training.compile_seconds
     only_renders = training.evaluated_from == FROM_RENDERS
     views = [*scene.train, *scene.test]
     copied = {name: getattr(training, name) for name in OF_TRAINING}
@@ -95,7 +89,7 @@ def results_of(
         raster_proof=raster.proof,
         raster_passed_over=[*raster.passed_over],
         protocol=manifest.inputs["protocol"],
-        unavailable=evaluation.unavailable | _unknown_costs(training, is_ready_made),
+        unavailable=evaluation.unavailable | _unknown_costs(training),
         measured=manifest.created,  # of an evaluation found in the store: when it was put there
         questions=asked,
         metric_facts=evaluation.facts,
@@ -104,7 +98,7 @@ def results_of(
         twins=TwinViews(
             left_out={**capture.left_out, **scene.twins.left_out}, near=dict(scene.twins.near)
         ),
-        seconds=seconds,
+        seconds=_seconds(init, training, evaluated),
         budget=Budget(
             max_gaussians=values["densify"].get("max_gaussians"),
             cap=values["densify"].get("cap"),
@@ -123,7 +117,7 @@ def results_of(
             "arm": arm_hash(values),
             "data": capture.fingerprint,
             "cloud": cloud_hash(init.path),
-            **{stage.name: entries[stage.name].key for stage in stages},
+            **{stage.name: entries[stage.name].key for stage in MEASURED},
         },
         code=Code(
             sources=user_modules(values),
@@ -132,19 +126,29 @@ def results_of(
             **training.checkout,
         ),
         versions=versions(),
-        evaluated_from=FROM_MODEL if is_ready_made else training.evaluated_from,
+        evaluated_from=FROM_MODEL if training.was_given else training.evaluated_from,
         **copied,
     )
 
 
-def _unknown_costs(training: Training, is_ready_made: bool) -> dict[str, str]:
+def _seconds(init: StoredResult, training: Training, evaluated: StoredResult) -> dict[str, float]:
+    """The seconds of each stage; without a training, none for it."""
+    seconds = {"init": init.seconds, "train": training.seconds, "evaluate": evaluated.seconds}
+    if training.was_given:
+        del seconds["train"]
+    if training.compile_seconds is not None:
+        seconds["compile"] = training.compile_seconds
+    return seconds
+
+
+def _unknown_costs(training: Training) -> dict[str, str]:
     """The costs that were not measured, each with the reason, if gsbench did not train."""
     unknown = {}
     if training.evaluated_from == FROM_RENDERS:
         unknown["gaussians"] = RENDERS_ALONE
     if training.peak_memory_mb is None:
         unknown["peak_memory_mb"] = "another program's memory of a GPU is not measured"
-    if is_ready_made:
+    if training.was_given:
         reason = f"{MADE_ELSEWHERE}: not trained here"
         unknown |= {"train_time": reason, "total_time": reason}
     return unknown

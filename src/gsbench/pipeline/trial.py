@@ -47,9 +47,10 @@ from gsbench.pipeline.steps.train import train_step
 from gsbench.runs import keys, layout
 from gsbench.runs.commands import digest_of, read_history
 from gsbench.runs.store import Store, StoredResult
-from gsbench.runs.trial_files import AskedBefore, Failure
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import (
+    AskedBefore,
+    Failure,
     TrialRecord,
 )
 from gsbench.scene.colmap_files import model_files

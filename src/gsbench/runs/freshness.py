@@ -9,21 +9,57 @@ only their code, and says with what (`code_changes`).
 import hashlib
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 from gsbench.files import file_sha256
-from gsbench.parsing import DamagedError, read_bytes
+from gsbench.parsing import Amount, DamagedError, Raw, Record, fault_of, read_bytes
 from gsbench.runs import layout
 from gsbench.runs.code import config_hash, state_of
 from gsbench.runs.configuration import Values, sha256_of
 from gsbench.runs.keys import STAGES
 from gsbench.runs.store import read_manifest
-from gsbench.runs.trial_files import MadeOf, Stamp
 from gsbench.runs.trial_record import Code, TrialRecord
 from gsbench.system.install import version_of
 from gsbench.words import as_line
+
+Stamp = tuple[int, ...]  # size in bytes, times of change in ns
+
+
+class MadeOf(Record):
+    """The inputs of a trial's results: configuration, versions, and files with their stamps.
+
+    ``settings`` is the configuration, ``config`` its hash, ``results`` the hash of the rest of
+    ``results.json``. ``sources`` are the user's files, ``folders`` their folders with times of
+    change. ``entries`` are the stages' results in the store. ``published`` are files in the
+    trial's folder; ``digests`` has the sha256 of those that tables and reports read, and of
+    small ones. ``finished`` is the Unix time at which the trial first had these results; 0 if
+    unknown.
+    """
+
+    results: str
+    config: str
+    stages: dict[str, int]
+    pycolmap: str | None
+    sources: dict[Raw, Stamp]
+    folders: dict[Raw, int | None]
+    entries: dict[str, Raw]
+    published: dict[Raw, Stamp]
+    digests: dict[Raw, str]
+    settings: dict[str, Any]
+    finished: Amount = 0.0
+
+    def __post_init__(self) -> None:
+        if fault := fault_of(self.settings):
+            raise ValueError(f"in settings {fault}")
+
+
+class ResultsFile(Record):
+    """The part of ``results.json`` that says what the results were made of."""
+
+    made_of: MadeOf | None = field(default=None, repr=False)
+
 
 SENTENCES = {
     "unfinished": "{name} is not there, or not complete",

@@ -40,21 +40,23 @@ from gsbench.runs.commands import make_digest, remember_result, shared_hash
 from gsbench.runs.configuration import Values, sha256_of
 from gsbench.runs.freshness import (
     Change,
+    MadeOf,
+    ResultsFile,
     changed_files,
     changes,
     damaged_entries,
     origin_of,
 )
-from gsbench.runs.trial_files import (
+from gsbench.runs.trial_record import (
     Building,
     Configuration,
     Failure,
-    MadeOf,
-    ResultsFile,
     Row,
+    TrialRecord,
+    UnfinishedError,
     read_rows,
+    record_from,
 )
-from gsbench.runs.trial_record import TrialRecord, UnfinishedError, record_from
 from gsbench.system.locks import is_held
 from gsbench.words import as_line, command
 

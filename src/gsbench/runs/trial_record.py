@@ -1,16 +1,17 @@
-"""The types of a trial's results, for writing and for reading.
+"""The types of a trial's files, for writing and for reading.
 
-The files are ``results.json`` and the records of stages in the store (``training.json``,
-``metrics.json``).
+These are ``results.json``, the records of stages in the store (``training.json``,
+``metrics.json``), the small files of a trial's folder, and the JSON lines of a training.
 """
 
+import logging
 import reprlib
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import field
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, TypeVar
 
-from pydantic import AliasChoices, Field, ValidationError
+from pydantic import AfterValidator, AliasChoices, Field, ValidationError
 
 from gsbench.normalization import IDENTITY, Normalization
 from gsbench.parsing import (
@@ -20,12 +21,22 @@ from gsbench.parsing import (
     DamagedError,
     Facts,
     Number,
+    Raw,
     Record,
     Text,
+    Whole,
     adapter,
     describe_misfit,
     fault_of,
+    one_line,
+    parse_typed,
+    read_bytes,
 )
+from gsbench.settings import FolderName
+from gsbench.words import as_line
+
+log = logging.getLogger(__name__)
+T = TypeVar("T")
 
 # ``evaluated_from`` of trials that gsbench did not train: it rendered another program's model, or
 # has only renders.
@@ -287,6 +298,11 @@ class Training(Record):
     evaluated_from: Literal["model", "renders"] | None = None
     trained_by: ExternalTrainer | None = None
 
+    @property
+    def was_given(self) -> bool:
+        """Return whether the model of another program was given, so that nothing was trained."""
+        return self.trained_by is None and not self.iterations
+
 
 class Evaluation(Record):
     """The metrics of a trial; fields as in `TrialRecord`."""
@@ -309,3 +325,141 @@ def split_text(config: Mapping[str, Any]) -> str:
     elif config.get("scene.match_views"):
         text += ", matched" if text.startswith("sector") else f", matched with {sectors}"
     return f"{text}, validation" if config.get("scene.validation") else text
+
+
+# ---- the small files of a trial's folder
+
+
+class NamedGroup(Record):
+    """A group of the configuration that must have a name."""
+
+    name: FolderName
+
+
+class TrackingSettings(Record):
+    """The settings of the group ``tracking`` that later mirroring of a trial needs."""
+
+    uri: str | None
+    flush_seconds: Amount
+    patience_seconds: Amount
+    images: Count
+
+
+class Configuration(Record):
+    """The keys that every usable ``config.yaml`` has; `gsbench.config.schema` checks the others."""
+
+    name: FolderName
+    seed: Count
+    runs: str
+    scene: NamedGroup
+    init: NamedGroup
+    densify: NamedGroup
+    tracking: TrackingSettings
+
+
+class Failure(Record):
+    """``failed.json``: the error's type, its text, its traceback, and the Unix time."""
+
+    error: str = ""
+    message: Raw = ""  # of several lines; `reason` is the first
+    traceback: Raw = field(default="", repr=False)
+    time: Amount = 0.0
+    seed: Count = 0
+    bad_input: bool = False  # the user's files or settings are the cause
+
+    @property
+    def reason(self) -> str:
+        """The first line of the message."""
+        lines = (self.message or self.error).strip().splitlines()
+        return one_line(as_line(lines[0])) if lines else "no reason was given"
+
+
+class Building(Record):
+    """``building.json``: the present stage of an unfinished trial, and where it is built."""
+
+    stage: str = ""
+    folder: Raw = ""
+
+
+class AskedBefore(Record):
+    """The ids of the questions that covered a trial when the ``training`` (a key) began."""
+
+    training: str
+    questions: list[str]
+
+
+# ---- the JSON lines of a training
+
+STEP = "step"  # the key of the iteration in every row
+Exponent = Annotated[float, Field(ge=-300, le=300)]  # ten to this power is a finite number above 0
+
+
+def _with_step(row: dict[str, bool | int | float]) -> dict[str, bool | int | float]:
+    step = row.get(STEP)
+    if not isinstance(step, int) or isinstance(step, bool) or step < 0:
+        raise ValueError(f"{STEP} is not an iteration")
+    return row
+
+
+Value = bool | Whole | Number
+# a row of ``metrics.jsonl`` or ``events.jsonl``
+Row = Annotated[dict[str, Value], AfterValidator(_with_step)]
+
+
+class RowWithStep(Record):
+    """A row of any of these files; only its iteration is checked."""
+
+    step: Count
+
+
+class Histogram(RowWithStep):
+    """A row of ``volume_histograms.jsonl``: counts between edges, which are log10 of volumes."""
+
+    log10_edges: list[Exponent]
+    counts: list[Amount]
+
+    def __post_init__(self) -> None:
+        if len(self.log10_edges) != len(self.counts) + 1:
+            raise ValueError("the edges are not one more than the counts")
+
+
+def read_rows(path: Path, kind: Any = Row, read: Callable[[Path], bytes] = read_bytes) -> list[Any]:
+    """The rows of a file, each of type ``kind``; [] if there is no such file.
+
+    ``read`` reads the content. With a warning, a file that cannot be read is left out, and so are
+    all rows from a damaged one on.
+    """
+    try:
+        content = read(path)
+    except FileNotFoundError:
+        return []
+    except DamagedError as error:
+        log.warning("left out: %s", error)
+        return []
+    return [row for _, row in iterate_rows(content, kind, path)]
+
+
+def whole_lines(path: Path) -> list[tuple[str, int]]:
+    """The lines of a file such as ``metrics.jsonl`` up to the first damaged one, by iteration."""
+    try:
+        content = read_bytes(path)
+    except FileNotFoundError:
+        return []
+    return [(line, row.step) for line, row in iterate_rows(content, RowWithStep, path)]
+
+
+def iterate_rows(content: bytes, kind: type[T], path: Path) -> Iterator[tuple[str, T]]:
+    """Parse the JSON lines of the file ``path``; yields each line with its object of ``kind``.
+
+    A damaged line and the lines after it are left out. There is a warning, except for an incomplete
+    last line, which a killed process leaves.
+    """
+    lines = content.splitlines(keepends=True)
+    for number, line in enumerate(lines, 1):
+        try:
+            row = parse_typed(line, kind, path)
+        except DamagedError as error:
+            if line.endswith(b"\n") or number < len(lines):
+                log.warning("left out: %s from line %d on, which %s", path, number, error.reason)
+            return
+        yield line.decode("utf-8").rstrip("\r\n"), row

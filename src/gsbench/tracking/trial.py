@@ -14,9 +14,8 @@ from gsbench.runs import layout
 from gsbench.runs.commands import read_history
 from gsbench.runs.configuration import flatten, sha256_of
 from gsbench.runs.keys import TRAIN
-from gsbench.runs.trial_files import read_rows
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.runs.trial_record import TrialRecord
+from gsbench.runs.trial_record import TrialRecord, read_rows
 from gsbench.scene.images import read_image
 from gsbench.words import command, markdown_code, markdown_text
 

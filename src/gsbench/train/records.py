@@ -15,7 +15,7 @@ from gsbench.densify.volumetric import log_volume
 from gsbench.events import RefineEvent
 from gsbench.files import write_text
 from gsbench.raster.staged import Readback
-from gsbench.runs.trial_files import whole_lines
+from gsbench.runs.trial_record import whole_lines
 
 log = logging.getLogger(__name__)
 

@@ -3,7 +3,6 @@
 import json
 import shlex
 import sys
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
@@ -22,7 +21,6 @@ from gsbench.init import Random
 from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER
 from gsbench.normalization import Normalization
 from gsbench.pipeline.steps import external as external_steps
-from gsbench.pipeline.steps import scene as scene_steps
 from gsbench.pipeline.steps import train as train_steps
 from gsbench.pipeline.steps.external import external_step
 from gsbench.pipeline.steps.scene import init_step
@@ -204,12 +202,8 @@ def test_a_program_gets_the_environment_without_variables_of_gsbench(tmp_path, m
     )
 
 
-def test_a_training_writes_its_model_lineage_and_summary(views, tmp_path, monkeypatch):
-    told = []
+def test_a_training_writes_its_model_lineage_and_summary(views, tmp_path, monkeypatch, told):
     reset = []
-    monkeypatch.setattr(
-        train_steps, "progress", lambda title: nullcontext(lambda *counts: told.append(counts))
-    )
     monkeypatch.setattr(train_steps, "reset_peak_memory", reset.append)
     logged = []
     monkeypatch.setattr(train_steps, "_log_normalization", lambda *given: logged.append(given))
@@ -322,12 +316,8 @@ class Noting:
 
 @pytest.mark.parametrize("has_reference", [False, True])
 def test_an_initialiser_gets_the_reference_cameras_and_they_are_in_its_key(
-    tmp_path, has_reference, monkeypatch
+    tmp_path, has_reference, told
 ):
-    told = []
-    monkeypatch.setattr(
-        scene_steps, "progress", lambda title: nullcontext(lambda *counts: told.append(counts))
-    )
     Image.new("RGB", (4, 4)).save(tmp_path / "a.png")
     store, capture = (
         Store(tmp_path / "store"),

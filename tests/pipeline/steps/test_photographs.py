@@ -1,6 +1,5 @@
 """The photographs of a trial: the steps that make them, replace pixels and keep the test views."""
 
-from contextlib import nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -77,11 +76,7 @@ def test_a_capture_is_moved_to_the_coordinates_of_the_training_by_a_step(photogr
     assert moved == [(far, photographs / MODEL_FOLDER)]
 
 
-def test_masked_and_transparent_pixels_are_replaced(photographs, tmp_path, monkeypatch):
-    told = []
-    monkeypatch.setattr(
-        scene_steps, "progress", lambda title: nullcontext(lambda _, *counts: told.append(counts))
-    )
+def test_masked_and_transparent_pixels_are_replaced(photographs, tmp_path, told):
     bare, masks = (
         read_photos(str(photographs)),
         read_photos(str(photographs), masks="masks"),
@@ -95,7 +90,7 @@ def test_masked_and_transparent_pixels_are_replaced(photographs, tmp_path, monke
     for name, step in zip(("white", "both", "masks"), steps, strict=True):
         step.build(tmp_path / name)
     # the progress ends at all four photographs
-    assert told == [(done, 4) for done in (1, 2, 3, 4)] * 3
+    assert told == [("pixels replaced", done, 4) for done in (1, 2, 3, 4)] * 3
     read = {
         name: np.asarray(Image.open(tmp_path / f"{name}/images/b.png").convert("RGB"))
         for name in ("white", "both")

@@ -23,7 +23,7 @@ from gsbench.analysis.verdicts import Verdict
 from gsbench.errors import InputError
 from gsbench.events import RefineEvent
 from gsbench.runs import layout
-from gsbench.runs.trial_files import Histogram
+from gsbench.runs.trial_record import Histogram
 from gsbench.words import signed
 
 EVENT_CAUSES = (*RefineEvent.GROWN, "relocated", *RefineEvent.PRUNED)

@@ -6,9 +6,10 @@ import csv
 import math
 import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -83,7 +84,7 @@ def evaluate_step(views: Views, trained: Step, parts: Parts) -> Step:
     }
     if parts.program is not None and not parts.program.leaves_model:
         inputs["renders"] = trained.key
-        build = _build_from_renders(views, trained, parts)
+        measure = _measure_renders
     else:
         inputs |= {"train": trained.key, "maps": parts.eval.maps}
         further["earlier"] = parts.measured_earlier
@@ -91,92 +92,82 @@ def evaluate_step(views: Views, trained: Step, parts: Parts) -> Step:
         if parts.program is not None:
             inputs["raster"] = rasterizer_inputs(parts.rasterizer, user)
             inputs["background"] = list(parts.train.background)
-        build = _build_from_model(views, trained, parts)
+        measure = _measure_model
     # Metrics that are off are left out, so that a new one changes no key of others.
     inputs |= {name: value for name, value in further.items() if value}
-    return step_of(EVALUATE, inputs, build, user)
+    return step_of(EVALUATE, inputs, partial(measure, views, trained, parts), user)
 
 
-def _build_from_model(views: Views, trained: Step, parts: Parts) -> Callable[[Path], None]:
-    """A build function that renders the model of ``trained`` and measures the renders."""
+def _measure_model(views: Views, trained: Step, parts: Parts, folder: Path) -> None:
+    """Render the model of ``trained`` and its earlier snapshots, and measure the renders."""
     rasterizer, evaluator, device = parts.rasterizer, parts.evaluator, parts.device
+    training, scene = views.store.path(trained), views.scene
+    gaussians = read_ply(training / POINT_CLOUD, device)
+    color = torch.tensor(list(parts.train.background), device=device)  # [3]
+    (folder / RENDERS).mkdir(exist_ok=True)
 
-    def build(folder: Path) -> None:
-        training, scene = views.store.path(trained), views.scene
-        gaussians = read_ply(training / POINT_CLOUD, device)
-        color = torch.tensor(list(parts.train.background), device=device)  # [3]
-        (folder / RENDERS).mkdir(exist_ok=True)
+    regions = regions_of(views, parts)
 
-        regions = regions_of(views, parts)
-
-        def measure(
-            model: Gaussians, phase: str, renders: Path | None
-        ) -> dict[str, dict[str, float]]:
-            per_view, written = {}, []
-            # Compressing a picture takes a core ten times as long as its metrics take a GPU.
-            with ThreadPoolExecutor(available_threads()) as beside:
-                for done, view in enumerate(scene.test, 1):
-                    with torch.no_grad():
-                        rendered = rasterizer.render(model, view.camera, MAX_SH_DEGREE, color).image
-                    image = quantize(rendered).cpu().numpy()  # [H, W, 3] uint8
-                    if renders is not None:
-                        path = renders / png_name(view.name)
-                        written.append(beside.submit(Image.fromarray(image).save, path))
-                    per_view[view.name] = evaluator.evaluate_view(
-                        image, view.image, view.mask, regions.get(view.name, {})
-                    )
-                    report(phase, done, len(scene.test))
-            for saved in written:
-                saved.result()  # raises what the thread raised
-            return per_view
-
-        at: dict[str, Earlier] = {}
-        with progress("evaluate") as report:
-            per_view = measure(gaussians, "views", folder / RENDERS)
-            for step in parts.measured_earlier:
-                snapshot = training / snapshot_file(step)
-                if not snapshot.exists():  # train.max_seconds ended the training before
-                    continue
-                model = read_ply(snapshot, device)
-                means = summarize(measure(model, f"iteration {step}", None), evaluator.unavailable)
-                at[str(step)] = Earlier(metrics=means, num_gaussians=len(model))
-        if parts.eval.maps:
-            causes = torch.from_numpy(read_causes(training / LINEAGE, len(gaussians)))
-            first = scene.test[0]
-            render = read_image(folder / RENDERS / png_name(first.name))
-            picture = draw_ellipsoids(render, gaussians, causes, first.camera, VOLUME_THRESHOLD)
-            (folder / FIGURES).mkdir(exist_ok=True)
-            picture.save(folder / FIGURES / ELLIPSOIDS)
-        if parts.eval.fps is not None:
-            speeds = measure_speed(rasterizer, gaussians, scene, color, parts.eval.fps)
-            for view, speed in speeds.items():
-                per_view[view]["fps"] = speed
-        _write_metrics(folder, evaluator, per_view, scene, at=at)
-
-    return build
-
-
-def _build_from_renders(views: Views, trained: Step, parts: Parts) -> Callable[[Path], None]:
-    """A build function that measures the renders that another program left in ``trained``."""
-    evaluator = parts.evaluator
-
-    def build(folder: Path) -> None:
-        scene, per_view = views.scene, {}
-        regions = regions_of(views, parts)
-        shutil.copytree(views.store.path(trained) / RENDERS, folder / RENDERS)
-        with progress("evaluate") as report:
+    def measure(model: Gaussians, phase: str, renders: Path | None) -> dict[str, dict[str, float]]:
+        per_view, written = {}, []
+        # Compressing a picture takes a core ten times as long as its metrics take a GPU.
+        with ThreadPoolExecutor(available_threads()) as beside:
             for done, view in enumerate(scene.test, 1):
-                image = read_image(folder / RENDERS / png_name(view.name))
+                with torch.no_grad():
+                    rendered = rasterizer.render(model, view.camera, MAX_SH_DEGREE, color).image
+                image = quantize(rendered).cpu().numpy()  # [H, W, 3] uint8
+                if renders is not None:
+                    path = renders / png_name(view.name)
+                    written.append(beside.submit(Image.fromarray(image).save, path))
                 per_view[view.name] = evaluator.evaluate_view(
                     image, view.image, view.mask, regions.get(view.name, {})
                 )
-                report("views", done, len(scene.test))
-        unknown = {}
-        if parts.eval.fps is not None:
-            unknown["fps"] = "only the renders of the other program are known, not its model"
-        _write_metrics(folder, evaluator, per_view, scene, unknown)
+                report(phase, done, len(scene.test))
+        for saved in written:
+            saved.result()  # raises what the thread raised
+        return per_view
 
-    return build
+    at: dict[str, Earlier] = {}
+    with progress("evaluate") as report:
+        per_view = measure(gaussians, "views", folder / RENDERS)
+        for step in parts.measured_earlier:
+            snapshot = training / snapshot_file(step)
+            if not snapshot.exists():  # train.max_seconds ended the training before
+                continue
+            model = read_ply(snapshot, device)
+            means = summarize(measure(model, f"iteration {step}", None), evaluator.unavailable)
+            at[str(step)] = Earlier(metrics=means, num_gaussians=len(model))
+    if parts.eval.maps:
+        causes = torch.from_numpy(read_causes(training / LINEAGE, len(gaussians)))
+        first = scene.test[0]
+        render = read_image(folder / RENDERS / png_name(first.name))
+        picture = draw_ellipsoids(render, gaussians, causes, first.camera, VOLUME_THRESHOLD)
+        (folder / FIGURES).mkdir(exist_ok=True)
+        picture.save(folder / FIGURES / ELLIPSOIDS)
+    if parts.eval.fps is not None:
+        speeds = measure_speed(rasterizer, gaussians, scene, color, parts.eval.fps)
+        for view, speed in speeds.items():
+            per_view[view]["fps"] = speed
+    _write_metrics(folder, evaluator, per_view, scene, at=at)
+
+
+def _measure_renders(views: Views, trained: Step, parts: Parts, folder: Path) -> None:
+    """Measure the renders that another program left in ``trained``."""
+    evaluator = parts.evaluator
+    scene, per_view = views.scene, {}
+    regions = regions_of(views, parts)
+    shutil.copytree(views.store.path(trained) / RENDERS, folder / RENDERS)
+    with progress("evaluate") as report:
+        for done, view in enumerate(scene.test, 1):
+            image = read_image(folder / RENDERS / png_name(view.name))
+            per_view[view.name] = evaluator.evaluate_view(
+                image, view.image, view.mask, regions.get(view.name, {})
+            )
+            report("views", done, len(scene.test))
+    unknown = {}
+    if parts.eval.fps is not None:
+        unknown["fps"] = "only the renders of the other program are known, not its model"
+    _write_metrics(folder, evaluator, per_view, scene, unknown)
 
 
 def measure_speed(

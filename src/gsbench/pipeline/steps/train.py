@@ -49,28 +49,12 @@ def train_step(views: Views, parts: Parts) -> Step:
     densifier, rasterizer, options, seed = parts.trainer, parts.rasterizer, parts.train, parts.seed
     assert isinstance(densifier, Densifier)
     device, snapshot_at, user = parts.device, parts.measured_earlier, parts.user_code
-    effective = {
-        name: value
-        for name, value in dataclasses.asdict(options).items()
-        if is_ingredient(f"train.{name}") and name not in IDEAS
-    }
-    ideas = parts.ideas
-    effective |= {
-        name: options_of("train", part, user, f"train.{name}")
-        for name in ("loss", "schedule", "optimizer")
-        if (part := getattr(ideas, name)) is not None
-    }
-    if ideas.terms:
-        effective["terms"] = [
-            {"weight": one.weight} | options_of("train", one.term, user, f"train.terms.{number}")
-            for number, one in enumerate(ideas.terms)
-        ]
     inputs: dict[str, Any] = {
         "scene": views.inputs,
         "init": views.init.key,
         "densify": options_of("densify", densifier, user),
         "raster": rasterizer_inputs(rasterizer, user),
-        "train": effective,
+        "train": _ingredients(parts),
         "seed": seed,
     }
     if snapshot_at:
@@ -82,7 +66,9 @@ def train_step(views: Views, parts: Parts) -> Step:
         _log_normalization(views.capture, densifier)
         points, colors = initial.means.double().cpu().numpy(), dc_to_bytes(initial.sh_dc)
         start = check_points(points, colors, views, parts)
-        trainer = Trainer(scene, initial, densifier, rasterizer, options, seed, snapshot_at, ideas)
+        trainer = Trainer(
+            scene, initial, densifier, rasterizer, options, seed, snapshot_at, parts.ideas
+        )
         reset_peak_memory(device)
         with progress("train") as report:
 
@@ -104,6 +90,27 @@ def train_step(views: Views, parts: Parts) -> Step:
         write_training(folder, summary, densifier.lineage, views, device, start)
 
     return step_of(TRAIN, inputs, build, user)
+
+
+def _ingredients(parts: Parts) -> dict[str, Any]:
+    """The settings ``train`` that may change the model, and the user's classes that they name."""
+    ideas, user = parts.ideas, parts.user_code
+    found = {
+        name: value
+        for name, value in dataclasses.asdict(parts.train).items()
+        if is_ingredient(f"train.{name}") and name not in IDEAS
+    }
+    found |= {
+        name: options_of("train", part, user, f"train.{name}")
+        for name in ("loss", "schedule", "optimizer")
+        if (part := getattr(ideas, name)) is not None
+    }
+    if ideas.terms:
+        found["terms"] = [
+            {"weight": one.weight} | options_of("train", one.term, user, f"train.terms.{number}")
+            for number, one in enumerate(ideas.terms)
+        ]
+    return found
 
 
 def check_points(
