@@ -1,5 +1,6 @@
 """Fixtures that all tests share."""
 
+import gc
 import importlib.util
 import os
 import subprocess
@@ -25,6 +26,8 @@ settings.register_profile(
 )
 settings.register_profile("explore", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("gsbench")
+
+gc.set_threshold(10_000)  # as the program does
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -54,6 +57,12 @@ def pytest_make_collect_report(collector):
     name = collector.nodeid.replace("/", ".")
     with FileLock(common / f"{name}.lock", poll_interval=0.01):
         return (yield)
+
+
+def pytest_collection_finish():
+    """Keep what imports have made out of garbage collections."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")

@@ -71,11 +71,6 @@ def results_of(
     evaluation = read_typed(evaluated.path / layout.METRICS, Evaluation)
     manifest = read_manifest(evaluated.path)
     init_report = read_json(init.path / REPORT_FILE)
-    of_model = [Oddity(**odd) for odd in init_report.get("oddities", ())]
-    oddities = [*capture.oddities, *scene.oddities, *of_model, *training.oddities]
-    # A stage of the store may have been made with a rule accepted that is not accepted here.
-    refused = [odd for odd in oddities if odd.refused]
-    settle(refused, f"scene {capture.name}", capture.accept)
     only_renders = training.evaluated_from == FROM_RENDERS
     views = [*scene.train, *scene.test]
     copied = {name: getattr(training, name) for name in OF_TRAINING}
@@ -94,7 +89,7 @@ def results_of(
         questions=asked,
         metric_facts=evaluation.facts,
         metrics_at=evaluation.at,
-        oddities=oddities,
+        oddities=_oddities(capture, scene, init_report, training),
         twins=TwinViews(
             left_out={**capture.left_out, **scene.twins.left_out}, near=dict(scene.twins.near)
         ),
@@ -112,13 +107,7 @@ def results_of(
         resolution=max((view.camera.width, view.camera.height) for view in views),
         events=sum_events(read_rows(trained.path / layout.EVENTS)),
         init_report=init_report,
-        hashes={
-            "config": config_hash(values),
-            "arm": arm_hash(values),
-            "data": capture.fingerprint,
-            "cloud": cloud_hash(init.path),
-            **{stage.name: entries[stage.name].key for stage in MEASURED},
-        },
+        hashes=_hashes(values, capture, entries),
         code=Code(
             sources=user_modules(values),
             stages={stage.name: stage.version for stage in keys.STAGES},
@@ -129,6 +118,31 @@ def results_of(
         evaluated_from=FROM_MODEL if training.was_given else training.evaluated_from,
         **copied,
     )
+
+
+def _oddities(
+    capture: Capture, scene: Scene, init_report: Mapping[str, Any], training: Training
+) -> list[Oddity]:
+    """The oddities of all stages; raises InputError for one whose rule is not accepted here."""
+    of_model = [Oddity(**odd) for odd in init_report.get("oddities", ())]
+    found = [*capture.oddities, *scene.oddities, *of_model, *training.oddities]
+    # A stage of the store may have been made with a rule accepted that is not accepted here.
+    refused = [odd for odd in found if odd.refused]
+    settle(refused, f"scene {capture.name}", capture.accept)
+    return found
+
+
+def _hashes(
+    values: dict[str, Any], capture: Capture, entries: Mapping[str, StoredResult]
+) -> dict[str, str]:
+    """The hashes of settings, photographs and initial cloud, and the keys of the stages."""
+    return {
+        "config": config_hash(values),
+        "arm": arm_hash(values),
+        "data": capture.fingerprint,
+        "cloud": cloud_hash(entries[keys.INIT.name].path),
+        **{stage.name: entries[stage.name].key for stage in MEASURED},
+    }
 
 
 def _seconds(init: StoredResult, training: Training, evaluated: StoredResult) -> dict[str, float]:
