@@ -1,0 +1,3 @@
+"""Benchmarks beside `gsbench bench`."""
+
+import gsbench  # noqa: F401  (before torch, whose idle threads would spin)

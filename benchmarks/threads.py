@@ -1,13 +1,15 @@
-"""A simulation of a training step of ``raster=cpu`` on more threads than this machine has.
+"""A training step of ``raster=cpu`` on several threads: measured, and simulated for more of them.
 
     python -m benchmarks.threads [TRIAL WIDTH] ...
 
 A trial is a folder with a trained model; one of its training views is drawn, ``WIDTH`` px wide.
-Without a trial, the scene of `gsbench bench` is drawn. Every shard is timed on one thread, by
-processor time; the fastest of some steps counts. Then the shards of a stage go to the threads in
-their order, each to the first thread that is free. torch's Adam is divided evenly, and all else is
-serial. Effects of threads on each other (memory, caches, scheduling) are left out, so speedups are
-upper bounds.
+Without a trial, the scene of `gsbench bench` is drawn.
+
+On as many threads as this machine has, whole steps are measured by the clock, in turns: run it
+while nothing else runs. For the simulation, every shard is timed on one thread, by processor time;
+the fastest of some steps counts. Then the shards of a stage go to the threads in their order, each
+to the first thread that is free, and all else is serial. Effects of threads on each other (memory,
+caches, scheduling) are left out, so simulated speedups are upper bounds.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ from unittest import mock
 import numpy as np
 import torch
 
-from gsbench.bench.measure import NEVER, SH_DEGREE, constant_scene_options
+from gsbench.bench.measure import NEVER, SH_DEGREE, UNUSED_FOLDER, constant_scene_options
 from gsbench.bench.scenes import make_scene
 from gsbench.densify import ADC
 from gsbench.gaussians.model import Gaussians
@@ -37,11 +39,13 @@ from gsbench.runs.layout import POINT_CLOUD, STORE
 from gsbench.runs.store import Store
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.scene.types import Scene, View
+from gsbench.system.resources import available_cores
 from gsbench.train.trainer import Trainer
 
 THREADS = (2, 4, 8, 16)
 TILE_SHARDS = (8, 16, 32)
 STEPS = 9
+TURNS = 25
 
 
 def trained(folder: Path, width: int) -> tuple[Gaussians, Scene]:
@@ -57,25 +61,31 @@ def trained(folder: Path, width: int) -> tuple[Gaussians, Scene]:
     return read_ply(folder / POINT_CLOUD), Scene("bench", (View("0.png", camera, image),), ())
 
 
-class Timed:
-    """A training on one thread.
+class Training:
+    """A training on ``threads`` threads whose Gaussians do not change."""
 
-    ``stages`` are the stages of the last step in order: the name, and the ms of each shard.
-    """
-
-    def __init__(self, gaussians: Gaussians, scene: Scene) -> None:
+    def __init__(self, gaussians: Gaussians, scene: Scene, threads: int) -> None:
+        self.threads = threads
+        torch.set_num_threads(threads)
         densifier = ADC(
             start=NEVER - 1, stop=NEVER, opacity_reset_interval=NEVER, max_gaussians=None
         )
         self.trainer = Trainer(
-            scene, gaussians, densifier, CpuRasterizer(threads=1), constant_scene_options(), 0
+            scene, gaussians, densifier, CpuRasterizer(threads), constant_scene_options(), 0
         )
         self.trainer.step = SH_DEGREE
-        self.stages: list[tuple[str, list[float]]] = []
 
-    def step(self) -> tuple[list[tuple[str, list[float]]], float, float]:
-        """The stages of a step, ms of torch's Adam, and ms of all else."""
-        self.stages = []
+    def step(self, clock: Callable[[], float] = time.perf_counter) -> float:
+        """Make a step; return its ms by ``clock``."""
+        torch.set_num_threads(self.threads)
+        begin = clock()
+        self.trainer.iterate(UNUSED_FOLDER)
+        self.trainer.losses.wait()
+        return 1e3 * (clock() - begin)
+
+    def stages(self) -> tuple[list[tuple[str, list[float]]], float]:
+        """The stages of a step, with the ms of each shard, and the ms of all else."""
+        stages: list[tuple[str, list[float]]] = []
 
         def timed(
             runner: ShardRunner, shards: int, work: Callable[..., None], *arguments: Any
@@ -85,18 +95,22 @@ class Timed:
                 begin = time.process_time()
                 work(shard, shard + 1, *arguments)
                 times.append(1e3 * (time.process_time() - begin))
-            self.stages.append((work.py_func.__name__, times))  # type: ignore[attr-defined]
+            stages.append((work.py_func.__name__, times))  # type: ignore[attr-defined]
 
         with mock.patch.object(ShardRunner, "run", timed):
-            begin = time.process_time()
-            image = self.trainer.render(0).image
-            self.trainer.loss(image, self.trainer.targets.get(0))[0].backward()
-            before, stages = time.process_time(), len(self.stages)
-            self.trainer.gaussians.optimizer_step()
-            end = time.process_time()
-        adam = 1e3 * (end - before) - sum(sum(times) for _, times in self.stages[stages:])
-        in_shards = sum(sum(times) for _, times in self.stages)
-        return self.stages, adam, 1e3 * (end - begin) - in_shards - adam
+            whole = self.step(time.process_time)
+        return stages, whole - sum(sum(times) for _, times in stages)
+
+
+def measure(title: str, gaussians: Gaussians, scene: Scene) -> None:
+    """Print the measured times of a step by number of threads: medians over turns."""
+    cores = available_cores()
+    trainings = [Training(gaussians, scene, n) for n in (1, *THREADS) if n <= cores]
+    turns = [[training.step() for training in trainings] for _ in range(2 + TURNS)][2:]
+    one, *_ = medians = np.median(turns, axis=0)
+    print(f"\n{title}, {len(gaussians):,} Gaussians, measured")
+    for training, ms in zip(trainings, medians, strict=True):
+        print(f"  {training.threads:2} threads: {ms:5.1f} ms, {one / ms:4.2f}x")
 
 
 def makespan(times: Sequence[float], threads: int) -> float:
@@ -111,22 +125,21 @@ def simulate(title: str, gaussians: Gaussians, scene: Scene) -> None:
     """Print the simulated times of a step, by number of threads and of shards of tiles."""
     for shards in TILE_SHARDS:
         with mock.patch.object(executor, "TILE_SHARDS", shards):
-            training = Timed(gaussians, scene)
-            steps = [training.step() for _ in range(2 + STEPS)][2:]
+            training = Training(gaussians, scene, 1)
+            steps = [training.stages() for _ in range(2 + STEPS)][2:]
         names = [name for name, _ in steps[0][0]]
         fastest = [
-            np.min([stages[k][1] for stages, _, _ in steps], axis=0).tolist()
+            np.min([stages[k][1] for stages, _ in steps], axis=0).tolist()
             for k in range(len(names))
         ]
-        adam, serial = (float(np.median([step[part] for step in steps])) for part in (1, 2))
-        one = sum(map(sum, fastest)) + adam + serial
+        serial = float(np.median([rest for _, rest in steps]))
+        one = sum(map(sum, fastest)) + serial
         if shards == TILE_SHARDS[0]:
             camera = scene.train[0].camera
             print(
                 f"\n{title}, {len(gaussians):,} Gaussians, {camera.width}x{camera.height}: "
-                f"{one:.1f} ms on a thread"
+                f"{one:.1f} ms on a thread, of which serial {serial:.1f}"
             )
-            print(f"  serial {serial:.1f} ms, Adam by torch {adam:.1f} ms")
             for name, times in zip(names, fastest, strict=True):
                 mean = sum(times) / len(times)
                 spans = "  ".join(f"{makespan(times, threads):6.2f}" for threads in THREADS)
@@ -134,15 +147,17 @@ def simulate(title: str, gaussians: Gaussians, scene: Scene) -> None:
                 print(f"  {name:<18} {sum(times):6.2f} ms in {len(times):2}, {skew}: {spans}")
         speedups = []
         for threads in THREADS:
-            ms = sum(makespan(times, threads) for times in fastest) + adam / threads + serial
+            ms = sum(makespan(times, threads) for times in fastest) + serial
             speedups.append(f"{threads}: {one / ms:4.2f}x")
         print(f"  {shards:2} shards of tiles: {one:5.1f} ms on a thread; {'  '.join(speedups)}")
 
 
 if __name__ == "__main__":
-    torch.set_num_threads(1)
     asked = sys.argv[1:]
-    if not asked:
-        simulate("gsbench bench", *make_scene("trained", 500, 375, 100_000))
-    for folder, width in zip(asked[::2], asked[1::2], strict=True):
-        simulate(folder, *trained(Path(folder), int(width)))
+    scenes = [
+        (folder, *trained(Path(folder), int(width)))
+        for folder, width in zip(asked[::2], asked[1::2], strict=True)
+    ]
+    for scene in scenes or [("gsbench bench", *make_scene("trained", 500, 375, 100_000))]:
+        measure(*scene)
+        simulate(*scene)

@@ -250,13 +250,9 @@ def test_the_library_reaches_neither_hydra_nor_mlflow_nor_the_pipeline(name):
 def test_packages_of_quick_commands_load_no_torch(name):
     graph = arrows(inside_functions=False)
     for module in graph:
-        if package(module) == name and not module.startswith(MAY_LOAD_TORCH):
+        if package(module) == name:
             way = way_to(graph, module, {"torch"})
             assert not way, " imports ".join(way)
-
-
-# gsbench.system.device is only about torch
-MAY_LOAD_TORCH = ("gsbench.system.resources", "gsbench.system.device")
 
 
 def test_only_two_packages_import_hydra():

@@ -9,6 +9,7 @@ import yaml
 
 import gsbench
 from tests.conftest import ROOT, script
+from tests.helpers import table
 
 PUBLIC = {"pypi.org", "files.pythonhosted.org"}
 WORKFLOWS = sorted((ROOT / ".github/workflows").glob("*.yml"))
@@ -169,38 +170,7 @@ REPOSITORY = "https://example.org/owner/gsbench/"
 
 @pytest.mark.parametrize(
     "link, folder, repository, wanted",
-    [
-        ("[a](search.md#here)", "docs", None, "[a](search.md#here)"),
-        ("[a](#here)", "docs", None, "[a](#here)"),
-        ("[a](docs/search.md#here)", "", None, "[a](search.md#here)"),
-        ("[a](../CONTRIBUTING.md)", "docs", None, "[a](contributing.md)"),
-        ("[a](../README.md)", "docs", None, "[a](first_steps.md)"),
-        ("[a](../conf/densify/)", "docs", None, "a (`conf/densify`)"),
-        ("[conf/densify](../conf/densify/)", "docs", None, "conf/densify"),
-        (
-            "[a](../conf/densify/)",
-            "docs",
-            REPOSITORY,
-            "[a](https://example.org/owner/gsbench/tree/main/conf/densify)",
-        ),
-        (
-            "[a](LICENSE)",
-            "",
-            REPOSITORY,
-            "[a](https://example.org/owner/gsbench/blob/main/LICENSE)",
-        ),
-        ("[a](https://example.org)", "docs", None, "[a](https://example.org)"),
-        ("![a](demo.jpg)", "docs", None, "![a](demo.jpg)"),
-        # a broken link is kept, so that the build refuses it
-        ("[a](nowhere.md)", "docs", REPOSITORY, "[a](nowhere.md)"),
-        (
-            "[a](../../../../../../etc/passwd)",
-            "docs",
-            REPOSITORY,
-            "[a](../../../../../../etc/passwd)",
-        ),
-        ("```\n[a](../conf/densify/)\n```", "docs", None, "```\n[a](../conf/densify/)\n```"),
-    ],
+    table(__file__, "links"),
 )
 def test_links_are_rewritten_for_the_site(link, folder, repository, wanted):
     assert script("build_site").with_site_links(link, ROOT / folder, repository) == wanted

@@ -14,19 +14,12 @@ from gsbench.words import (
     signed,
     some_of,
 )
+from tests.helpers import table
 
 
 @pytest.mark.parametrize(
     "seconds, text",
-    [
-        (0.4, "0 s"),
-        (89, "89 s"),
-        (90, "2 min"),
-        (89 * 60, "89 min"),
-        (90 * 60, "1.5 h"),
-        (35.9 * 3600, "35.9 h"),
-        (36 * 3600, "1.5 days"),
-    ],
+    table(__file__, "times"),
 )
 def test_times_are_shown_in_a_readable_unit(seconds, text):
     assert readable_time(seconds) == text
@@ -34,16 +27,7 @@ def test_times_are_shown_in_a_readable_unit(seconds, text):
 
 @pytest.mark.parametrize(
     "count, text",
-    [
-        (None, "unknown size"),
-        (0, "0 bytes"),
-        (999, "999 bytes"),
-        (1000, "1 kB"),
-        (999_999, "1e+03 kB"),
-        (1_000_000, "1 MB"),
-        (2_560_000, "2.56 MB"),
-        (10**9, "1 GB"),
-    ],
+    table(__file__, "sizes"),
 )
 def test_sizes_are_shown_in_a_readable_unit(count, text):
     assert readable_bytes(count) == text

@@ -112,6 +112,12 @@ def writable_output(out: Path) -> Iterator[None]:
         ) from error
 
 
+def user_cache(name: str) -> Path:
+    """The folder ``name`` of gsbench's in the user's cache, which may not be there yet."""
+    cache = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    return Path(cache, "gsbench", name)
+
+
 OUTPUTS = ".gsbench-outputs"  # in a folder of the user's: the sha256 of what gsbench wrote there
 
 
@@ -275,12 +281,13 @@ def checked_runs_folder(name: str) -> Path:
     return folder
 
 
-def make_runs_folder(folder: Path) -> None:
+def make_runs_folder(name: str | Path) -> None:
     """Make the runs folder, and check that it can be written to.
 
     Raises OSError if the disk is full or writing is forbidden (see `storage_errors`), else
-    InputError.
+    InputError, as `checked_runs_folder` does.
     """
+    folder = checked_runs_folder(str(name))
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(prefix=".probe-", dir=folder):

@@ -1,5 +1,7 @@
 """Logging to stderr and to a trial's own file, and progress bars."""
 
+from __future__ import annotations
+
 import logging
 import os
 import sys
@@ -7,15 +9,14 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
-from typing import Any, Protocol, TextIO
-
-from rich import progress as bars
-from rich.console import Console
-from rich.markup import escape
+from typing import TYPE_CHECKING, Any, Protocol, TextIO
 
 from gsbench.errors import GsbenchError
 from gsbench.files import open_plain
 from gsbench.words import printable
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 LOGGER = logging.getLogger("gsbench")
 # Loggers of warnings about a scene, which all trials of a sweep would repeat: the terminal shows
@@ -219,11 +220,13 @@ def no_progress(phase: str, done: int, total: int | None, note: str = "") -> Non
 @contextmanager
 def progress(title: str) -> Iterator[Progress]:
     """Show progress of the work called ``title`` while the block runs."""
-    # raw, since a bar needs control characters
-    console = Console(file=getattr(sys.stderr, "raw", sys.stderr))
+    console = _console()
     if not console.is_terminal:
         yield _lines(title)
         return
+    from rich import progress as bars
+    from rich.markup import escape
+
     columns = (
         bars.TextColumn("{task.description}"),
         bars.BarColumn(),
@@ -247,8 +250,14 @@ def progress(title: str) -> Iterator[Progress]:
 
 def bar(title: str) -> AbstractContextManager[Progress]:
     """`progress` on a terminal, with the time left; elsewhere nothing is shown."""
-    stream = getattr(sys.stderr, "raw", sys.stderr)
-    return progress(title) if Console(file=stream).is_terminal else nullcontext(no_progress)
+    return progress(title) if _console().is_terminal else nullcontext(no_progress)
+
+
+def _console() -> Console:
+    from rich.console import Console  # here, for a quick start of every command
+
+    # raw, since a bar needs control characters
+    return Console(file=getattr(sys.stderr, "raw", sys.stderr))
 
 
 def _lines(title: str) -> Progress:

@@ -16,8 +16,12 @@ from gsbench.config.build import build
 from gsbench.config.command_words import typed_permissions
 from gsbench.config.compose import Trial, compose_one
 from gsbench.config.overrides import value_text
-from gsbench.config.permissions import ALLOWED, permission_advice
-from gsbench.config.trust import check_permissions, foreign_address
+from gsbench.config.trust import (
+    ALLOWED,
+    check_permissions,
+    foreign_address,
+    permission_advice,
+)
 from gsbench.errors import InputError
 from gsbench.launch.record import record
 from gsbench.runs.commands import Idea, Ledger, append, command_now

@@ -237,22 +237,14 @@ def test_other_words_are_kept_as_typed(word):
 
 @pytest.mark.parametrize(
     "words, scaled",
-    [
-        (["train=paper", "train.steps_scaler=0.1"], (3000, 50, 1500, 10, 300)),
-        (
-            ["train=quick", "train.steps_scaler=0.5", "train.iterations=400"],
-            (200, 100, 500, 50, 350),
-        ),
-        (["train=paper", "train.steps_scaler=2"], (60_000, 1000, 30_000, 200, 6000)),
-        (["train=quick", "train.steps_scaler=1e-6"], (1, 1, 1, 1, 1)),
-    ],
+    table(__file__, "scaled"),
 )
 def test_all_steps_of_the_schedule_are_scaled(words, scaled):
     values = composed("densify=adc", *words)
     train, densify = values["train"], values["densify"]
     keys = ("iterations", "densify_start", "densify_stop", "densify_interval")
-    assert (*(train[key] for key in keys), train["opacity_reset_interval"]) == scaled
-    assert tuple(densify[key] for key in ("start", "stop", "interval")) == scaled[1:4]
+    assert [*(train[key] for key in keys), train["opacity_reset_interval"]] == scaled
+    assert [densify[key] for key in ("start", "stop", "interval")] == scaled[1:4]
     assert densify["opacity_reset_interval"] == scaled[4]
     # a schedule that is written out makes the same trial
     own = [f"train.{key}={json.dumps(train[key])}" for key in STEPS]

@@ -16,7 +16,7 @@ from gsbench.app.command import compose_trials
 from gsbench.config.build import build
 from gsbench.config.command_words import typed_permissions
 from gsbench.config.compose import compose_one
-from gsbench.config.permissions import ALLOWED, foreign_variables, load_class
+from gsbench.config.trust import ALLOWED, foreign_variables, load_class
 from gsbench.runs.code import module_digest
 from gsbench.system.programs import allow_modules
 from tests.helpers import refusal, table, write
@@ -260,13 +260,7 @@ def test_permission_for_a_module_covers_gsbenchs_classes_in_it():
 
 @pytest.mark.parametrize(
     "settings, said",
-    [
-        ({"_target_": "mine.Popen", "args": "true"}, "is subprocess.Popen"),
-        ({"_target_": "mine.Mine"}, "is not a class of hydra.experimental.callback.Callback"),
-        ({"_target_": "mine.Calls", "in": {"_target_": "mine.Popen"}}, "is subprocess.Popen"),
-        ({"_target_": "mine.Calls", "in": {"_target_": "mine.os.mkdir"}}, "cannot be imported"),
-        ({"size": 3}, "hydra.callbacks.x names no _target_"),
-    ],
+    table(__file__, "callbacks"),
 )
 def test_callbacks_must_be_classes_of_an_allowed_module(settings, said, capsys, monkeypatch):
     run = [*experiment({"hydra.callbacks.x": settings}), "allow_targets=[mine]"]

@@ -3,7 +3,6 @@
 import pytest
 import yaml
 
-from gsbench.config.compose import compose_one
 from gsbench.config.schema import CLASS_DEFAULTS, GROUP_SCHEMAS
 from gsbench.settings import option_fields
 from gsbench.system.install import conf_dir
@@ -22,21 +21,6 @@ def test_the_defaults_of_classes_are_current():
     assert read_json(CLASS_DEFAULTS) == class_defaults.class_defaults()
 
 
-CLASSES = [
-    (group, cls) for group in class_defaults.GROUPS for cls in class_defaults.classes_of(group)
-]
-REQUIRED = {"Ply": ["init.path=a.ply"], "Points": ["init.path=a.ply"]}
-
-
-@pytest.mark.parametrize("group,cls", CLASSES, ids=[cls.__name__ for _, cls in CLASSES])
-def test_a_composed_choice_has_each_option_of_its_class(group, cls):
-    names = [f for f in FILES if f.startswith(f"{group}/") and _target(f) == cls.__name__]
-    words = ["scene=courtyard", names[0].replace("/", "="), *REQUIRED.get(cls.__name__, [])]
-    values = compose_one(words).values[group]
-    options = {option.name: getattr(cls, option.name, None) for option in option_fields(cls)}
-    assert values.keys() - {"name", "_target_"} == options.keys()
-
-
 @pytest.mark.parametrize("path", FILES)
 def test_a_file_states_no_default_again(path):
     """Without a key that a file states, other values are composed, or the same by a reference."""
@@ -51,10 +35,6 @@ def test_a_file_states_no_default_again(path):
 def _read(path):
     content = yaml.safe_load((conf_dir() / f"{path}.yaml").read_text(encoding="utf-8"))
     return content if isinstance(content, dict) else {}
-
-
-def _target(path):
-    return str(_read(path).get("_target_", "")).rpartition(".")[2]
 
 
 def _known(group, base):

@@ -14,7 +14,7 @@ from gsbench.app.command import compose_trials, launch, run_trials
 from gsbench.config.command_words import parse
 from gsbench.config.compose import compose_one
 from gsbench.config.groups import options
-from gsbench.config.permissions import check_target
+from gsbench.config.trust import check_target
 from gsbench.files import DiskFullError
 from gsbench.launch import estimates, jobs
 from gsbench.launch.batch import run_batch

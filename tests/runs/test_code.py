@@ -198,6 +198,20 @@ def test_released_code_adds_nothing_to_keys(package, monkeypatch):
     assert changed(released) == []
 
 
+def test_the_users_cache_keeps_digests_and_may_be_damaged(package, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    before = states_of(["train"])
+    again()
+    with monkeypatch.context() as patch:
+        patch.setattr(code, "syntax_of", lambda *_: pytest.fail("it is parsed again"))
+        assert changed(before) == []
+    (kept,) = (tmp_path / "cache").rglob("*.json")
+    for damaged in ("{", '{"a": 1}'):
+        kept.write_text(damaged)
+        again()
+        assert changed(before) == []
+
+
 def test_an_edit_while_this_process_works_is_noticed(package):
     states_of(["train", "scene"])
     assert changed_since_asked(["train", "scene"]) == []

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from gsbench.system.device import free_bytes, select_device
+from gsbench.system.resources import free_bytes, select_device
 from tests.helpers import refusal, table
 
 

@@ -19,6 +19,7 @@ from gsbench.system.resources import (
     take_slot,
     trials_at_once,
 )
+from tests.helpers import table
 
 
 def test_slots_gpus_and_threads(tmp_path, monkeypatch):
@@ -104,19 +105,7 @@ def test_the_driver_tells_the_gpus_that_a_trial_may_get(monkeypatch):
 
 @pytest.mark.parametrize(
     "cores, gigabytes, most, gpus, expected",
-    [
-        (2, 16, None, 0, 2),
-        (1, 16, None, 0, 1),
-        (6, 16, None, 0, 2),
-        (64, 256, 100_000, 0, 16),
-        (64, 16, 3_000_000, 0, 2),
-        (64, 256, None, 1, 1),
-        (64, 256, None, 3, 3),
-        (12, 256, None, 0, 3),
-        (11, 256, None, 0, 2),
-        (64, 1, None, 0, 1),  # at least one
-        (64, 5, None, 0, 2),  # 2.16 GB each
-    ],
+    table(__file__, "machines"),
 )
 def test_trials_at_once_suit_cores_memory_and_gpus(
     cores, gigabytes, most, gpus, expected, monkeypatch

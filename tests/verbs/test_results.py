@@ -9,7 +9,7 @@ import pytest
 
 from gsbench.runs.code import AS_RELEASED
 from gsbench.verbs.results import _origin, explain, explain_cell, report, tables
-from tests.helpers import refusal
+from tests.helpers import refusal, table
 from tests.trials import write_runs
 
 
@@ -47,17 +47,7 @@ def test_missing_trials_and_metrics_are_reported(tmp_path):
 
 @pytest.mark.parametrize(
     "address, words",
-    [
-        ("exp:garden:psnr", "is not EXPERIMENT:SCENE:METRIC:ARM"),
-        ("nope:garden:psnr:adc", "no experiment 'nope'"),
-        ("exp:kitchen:psnr:adc", "has no scene 'kitchen'; it has garden"),
-        (
-            "exp:garden:psnr:mcmc",
-            "names 0 arms of garden; choose one of dim-adc, dim-volumetric, sfm-adc",
-        ),
-        ("exp:garden:psnr:adc", "names 2 arms"),
-        ("exp:garden:quality:sfm-adc", "unknown metric 'quality'"),
-    ],
+    table(__file__, "addresses"),
 )
 def test_bad_addresses_are_explained(tmp_path, address, words):
     write_runs(tmp_path, scenes=("garden",), inits=("sfm", "dim"))
@@ -98,21 +88,10 @@ FAIR = ["--layout", "fairness"]
 
 @pytest.mark.parametrize(
     "words, files, begins",
-    [
-        (["--out", "new/t.csv"], ["new/t.csv"], "scene,"),
-        (["--out", "T.TeX"], ["T.TeX"], "% "),
-        (["--out", "new"], ["new/exp.md"], "### "),
-        (split("--out new --format csv"), ["new/exp.csv"], "scene,"),
-        (split("--out t.csv --format trials"), ["t.csv"], "experiment,"),
-        (split("--out t.md --format csv"), ["t.md/exp.csv"], "scene,"),
-        (split("--out t.csv --paper 3dgs"), ["t.csv", "t-3dgs.csv"], ""),
-        (split("--out new --format json"), ["new/exp.json"], "{"),
-        (["--out", "f.md", *FAIR], ["f.md"], "### "),
-        (["--out", "new", *FAIR], ["new/exp-fairness-sfm-volumetric-sfm-adc.md"], "### "),
-    ],
+    table(__file__, "files"),
 )
 def test_tables_are_written_where_out_says(made, capsys, words, files, begins):
-    assert tables(["exp", *words], made) == 0
+    assert tables(["exp", *split(words)], made) == 0
     assert capsys.readouterr().out.splitlines() == files
     for name in files:
         assert Path(name).read_text().startswith(begins), name

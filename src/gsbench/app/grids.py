@@ -22,7 +22,7 @@ from gsbench.config.command_words import grid_points, is_interval
 from gsbench.config.compose import Trial
 from gsbench.config.overrides import bare_key, is_sweep, key_of, task_words, value_text
 from gsbench.errors import InputError
-from gsbench.files import checked_runs_folder, make_runs_folder
+from gsbench.files import make_runs_folder
 from gsbench.launch.record import check_looks, planned_rows, record
 from gsbench.runs.layout import RESULTS
 
@@ -91,7 +91,7 @@ def _run_until_decided(trials: Sequence[Trial], run: Run) -> None:
     """
     rows = planned_rows(trials)
     check_looks(trials, rows)
-    make_runs_folder(checked_runs_folder(trials[0].values["runs"]))
+    make_runs_folder(trials[0].values["runs"])
     questions = record(trials)
     if not questions:
         raise InputError(

@@ -23,9 +23,8 @@ from gsbench.app.hydra_main import FOLDER, run_main, words_for_files, words_for_
 from gsbench.app.sweep import BASIC, HYDRA_ERRORS, OWN, Ended, Sweep, better_direction
 from gsbench.app.tuning import mean_of, words_of_point
 from gsbench.config.command_words import grid_points
-from gsbench.config.compose import Trial, check_permitted
+from gsbench.config.compose import Trial, check_permitted, installed_nodes
 from gsbench.config.explain import explained
-from gsbench.config.hydra_setup import installed_nodes
 from gsbench.config.overrides import bare_key, is_sweep, key_of, parse_word, task_words
 from gsbench.config.schema import check, plain
 from gsbench.errors import GsbenchError, InputError

@@ -19,16 +19,10 @@ import hydra.utils
 from omegaconf import DictConfig, OmegaConf
 
 from gsbench.app.sweep import BASIC, OWN, Sweep
-from gsbench.config.hydra_setup import (
-    CONFIG_NAME,
-    VERSION_BASE,
-    hydra_config,
-    installed_nodes,
-)
+from gsbench.config.compose import CONFIG_NAME, VERSION_BASE, hydra_config, installed_nodes
 from gsbench.config.overrides import key_of
-from gsbench.config.permissions import ALLOWED
 from gsbench.config.schema import register_schemas
-from gsbench.config.trust import load_callbacks
+from gsbench.config.trust import ALLOWED, load_callbacks
 from gsbench.errors import InputError
 from gsbench.runs.configuration import targets_in
 from gsbench.system.install import conf_dir

@@ -13,9 +13,8 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from gsbench.config.command_words import check_removal, check_words
-from gsbench.config.compose import Composer, Trial
+from gsbench.config.compose import Composer, Trial, config_loader, hydra_config, hydra_ready
 from gsbench.config.explain import explained
-from gsbench.config.hydra_setup import config_loader, hydra_config, hydra_ready
 from gsbench.config.overrides import is_sweep, parse_word
 from gsbench.errors import InputError
 from gsbench.launch.jobs import Outcome

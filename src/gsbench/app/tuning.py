@@ -31,7 +31,7 @@ from gsbench.config.overrides import bare_key, key_of, parse_word
 from gsbench.config.schema import TUNE, TuneSettings
 from gsbench.errors import GsbenchError, InputError
 from gsbench.eval.facts import known_keys
-from gsbench.files import checked_runs_folder, make_runs_folder, write_json
+from gsbench.files import make_runs_folder, write_json
 from gsbench.runs.configuration import flatten
 from gsbench.runs.experiments import (
     DEFAULT_METRIC,
@@ -186,7 +186,7 @@ def _search(
 def _write(searches: Sequence[ArmSearch]) -> None:
     """Write the records of the searches to their experiments, where the report reads them."""
     for search in searches:
-        make_runs_folder(checked_runs_folder(str(search.home.parent)))
+        make_runs_folder(search.home.parent)
         make_home(search.home)
         write_json(search.home / TUNING, search.record.to_json())
 

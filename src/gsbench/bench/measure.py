@@ -19,9 +19,8 @@ from gsbench.logs import progress
 from gsbench.pipeline.parts import build_own_rasterizer
 from gsbench.raster import create_rasterizer
 from gsbench.raster.executors import find_executor
-from gsbench.system.device import disable_tf32
 from gsbench.system.isolate import run_isolated
-from gsbench.system.resources import peak_memory_mb, reset_peak_memory
+from gsbench.system.resources import disable_tf32, peak_memory_mb, reset_peak_memory
 from gsbench.train.options import TrainConfig
 from gsbench.train.trainer import Trainer
 

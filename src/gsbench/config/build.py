@@ -10,7 +10,7 @@ import sys
 from typing import Any
 
 from gsbench.config.groups import GROUPS, REMOVABLE
-from gsbench.config.permissions import (
+from gsbench.config.trust import (
     check_program,
     check_target,
     is_external,

@@ -10,8 +10,8 @@ from hydra.core.override_parser.types import Override
 
 from gsbench.config.groups import GROUPS, REMOVABLE, options
 from gsbench.config.overrides import bare_key, is_sweep, key_of, parse_word
-from gsbench.config.permissions import reading
 from gsbench.config.search_path import search_path, searched_folders
+from gsbench.config.trust import reading
 from gsbench.errors import InputError
 from gsbench.runs.code import PERMISSIONS
 from gsbench.runs.configuration import READING, WITHOUT_EFFECT, is_hashed, purpose

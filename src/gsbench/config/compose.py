@@ -4,16 +4,20 @@ Words go one way: Hydra composes once for each choice of groups, the values of s
 set in a copy, and the resolved copy is checked: a trial.
 """
 
+import os
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import hydra
+from hydra.core.config_loader import ConfigLoader
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
@@ -21,33 +25,95 @@ from omegaconf.errors import OmegaConfBaseException
 from gsbench.config.command_words import check_single, typed_permissions, typed_readings
 from gsbench.config.explain import explained, not_a_setting
 from gsbench.config.groups import GROUPS
-from gsbench.config.hydra_setup import (
-    CONFIG_NAME,
-    config_loader,
-    hydra_config,
-    hydra_ready,
-    installed_nodes,
-)
 from gsbench.config.overrides import bare_key, is_sweep, key_of, parse_word, task_words
-from gsbench.config.permissions import check_texts
-from gsbench.config.schema import ROOT_SETTINGS, Config, check, plain
+from gsbench.config.schema import ROOT_SETTINGS, Config, check, plain, register_schemas
 from gsbench.config.search_path import (
     check_choice,
     check_search_path,
     permitted_to_files,
     read_by_gsbench,
 )
-from gsbench.config.trust import MADE_NODES, check_composed, check_permissions
+from gsbench.config.trust import MADE_NODES, check_composed, check_permissions, check_texts
 from gsbench.errors import InputError
 from gsbench.runs.code import PERMISSIONS
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.settings import check_values
+from gsbench.system.install import conf_dir
 from gsbench.system.programs import allow_modules
 from gsbench.train.options import BY_AUTOGRAD
 
+CONFIG_NAME = "config"  # conf/config.yaml
+# Hydra 1.3 warns unless it is told which version's defaults hold; Hydra 1.4 has one set and warns
+# if it is told.
+VERSION_BASE: dict[str, Any] = (
+    {"version_base": "1.3"} if hydra.__version__.startswith("1.3.") else {}
+)
 MADE_GROUPS = tuple(f"hydra/{name}" for name in MADE_NODES)
 # stands for the seed while settings are resolved that all seeds share: reading it is an error
 ANY_SEED = "${no_seed}"
+
+
+# ---- Hydra, set up with gsbench's files
+
+
+@cache
+def installed_nodes(choices: tuple[str, ...]) -> Mapping[str, Any]:
+    """Hydra's node for ``choices`` of plug-ins and logs, from installed packages only.
+
+    It includes what gsbench's own ``conf/config.yaml`` sets. Choices that only a user's folder has
+    are left out.
+    """
+    with hydra_ready():
+        known = [
+            word
+            for word in choices
+            if word.partition("=")[2] in config_loader().get_group_options(word.partition("=")[0])
+        ]
+    node = composed_once(tuple(known)).hydra
+    return OmegaConf.to_container(node, resolve=False)  # type: ignore[return-value]
+
+
+@cache
+def composed_once(words: tuple[str, ...]) -> DictConfig:
+    """Hydra's composition of ``words``, with its node; do not change it.
+
+    Only for words that name no folder of the user's: gsbench's own files stay as they are while a
+    process runs.
+    """
+    with hydra_ready():  # composing takes 0.1 s
+        return hydra.compose(CONFIG_NAME, list(words), return_hydra_config=True)
+
+
+@contextmanager
+def hydra_ready() -> Iterator[None]:
+    """Initialise Hydra with gsbench's configuration folder within the block."""
+    register_schemas()
+    if GlobalHydra.instance().is_initialized():  # within `hydra.main`, or in a block of this kind
+        yield
+        return
+    with hydra.initialize_config_dir(str(conf_dir()), job_name="gsbench", **VERSION_BASE):
+        yield
+
+
+def config_loader() -> ConfigLoader:
+    """Hydra's loader of configurations. Call it within `hydra_ready`."""
+    return GlobalHydra.instance().config_loader()
+
+
+@contextmanager
+def hydra_config(config: DictConfig | None) -> Iterator[None]:
+    """Let ``${hydra:…}`` read the node of ``config`` within the block; with None it is an error."""
+    instance = HydraConfig.instance()
+    before, instance.cfg = instance.cfg, None
+    try:
+        if config is not None:
+            instance.set_config(config)
+        yield
+    finally:
+        instance.cfg = before
+
+
+# ---- the trials of a command
 
 
 @dataclass(frozen=True)
@@ -122,6 +188,7 @@ class Composer:
             self.config[PERMISSIONS] = list(self.allowed)
         with open_dict(self.config):
             self.config.hydra = self._choose(values).hydra
+            self.config.hydra.runtime.cwd = os.getcwd()
 
     def settings(self, words: Sequence[str]) -> DictConfig:
         """The configuration of ``words`` without Hydra's node; trials check what it may run."""
@@ -212,7 +279,7 @@ class Composer:
 
     def _choose(self, words: Sequence[str]) -> DictConfig:
         """Hydra's composition of the choices among ``words``, checked; do not change it."""
-        key = tuple(_choices(words).values())  # composing takes 0.1 s
+        key = tuple(_choices(words).values())
         if key not in self._chosen:
             with hydra_ready():
                 self._chosen[key] = self._compose(key, words)
@@ -231,11 +298,12 @@ class Composer:
                 raise InputError(not_a_setting(key, self._choose([]), words))
             check_choice(choice, str(parse_word(choice).value()))
         with explained([*self.hydra_words, *words]):
+            if not self.hydra_words:  # all files are gsbench's own
+                return composed_once(tuple(choices))
             config = self._composed(choices)
-        if self.hydra_words:  # else all files are gsbench's own
-            # for the check, which tells what is in a word from what a file sets
-            config.hydra.overrides.task = list(map(key_of, words))
-            check_permitted(config, self.allowed)
+        # for the check, which tells what is in a word from what a file sets
+        config.hydra.overrides.task = list(map(key_of, words))
+        check_permitted(config, self.allowed)
         return config
 
     def _composed(self, words: Sequence[str]) -> DictConfig:

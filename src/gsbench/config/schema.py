@@ -20,7 +20,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
-from gsbench.config.permissions import is_external
+from gsbench.config.trust import is_external
 from gsbench.errors import InputError
 from gsbench.eval.options import EvalConfig
 from gsbench.raster.executors import RasterConfig

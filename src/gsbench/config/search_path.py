@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from gsbench.config.overrides import key_of, parse_word
-from gsbench.config.permissions import PACKAGE, check_texts, is_allowed, permission_advice
+from gsbench.config.trust import PACKAGE, check_texts, is_allowed, permission_advice
 from gsbench.errors import InputError
 from gsbench.parsing import SafeLoader, read_yaml, resolved
 

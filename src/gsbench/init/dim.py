@@ -186,7 +186,7 @@ class Dim(Reconstruction):
         import torch
 
         from gsbench.init.networks import features, models
-        from gsbench.system.device import select_device
+        from gsbench.system.resources import select_device
 
         torch.set_num_threads(self.num_threads)
         device = select_device(self.device, "init.device")

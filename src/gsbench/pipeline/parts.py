@@ -27,8 +27,7 @@ from gsbench.runs.configuration import GSBENCH, TARGET, targets_in
 from gsbench.runs.experiments import AT, metric_and_question
 from gsbench.scene.options import SceneConfig
 from gsbench.scene.record import SceneReader
-from gsbench.system.device import select_device
-from gsbench.system.resources import available_threads
+from gsbench.system.resources import available_threads, select_device
 from gsbench.train.ideas import Ideas, weighted
 from gsbench.train.options import TrainConfig
 from gsbench.train.proof import Proven, create_proven

@@ -31,9 +31,8 @@ from gsbench.renders.sources import (
 )
 from gsbench.runs.code import PERMISSIONS
 from gsbench.scene.names import Matching, match_by_order, match_pictures
-from gsbench.system.device import select_device
 from gsbench.system.programs import allow_modules
-from gsbench.system.resources import available_threads
+from gsbench.system.resources import available_threads, select_device
 from gsbench.words import counted, some_of
 
 

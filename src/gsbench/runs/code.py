@@ -11,9 +11,11 @@ import ast
 import hashlib
 import importlib.util
 import json
+import platform
 import sys
 import sysconfig
 from collections.abc import Collection, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.machinery import ModuleSpec
@@ -22,14 +24,16 @@ from typing import Any
 
 import yaml
 
-from gsbench.files import file_sha256
-from gsbench.parsing import DamagedError, SafeLoader, read_json
+from gsbench.files import file_sha256, user_cache, write_json
+from gsbench.parsing import DamagedError, SafeLoader, read_if_sound, read_json
 from gsbench.runs.configuration import GSBENCH, Values, determining_settings, sha256_of, targets_in
 
 PACKAGE = Path(__file__).resolve().parents[1]
 RELEASED = "released.json"  # in gsbench's folder: the digests of all packages at the release
 AS_RELEASED = "released"  # the state of a package that equals the release
 DIGEST_CHARACTERS = 16
+SYNTAX_DIGESTS = "syntax-1.json"  # another number if `syntax_of` changes
+MAX_KEPT = 500  # digests in that file
 
 
 def states_of(packages: Iterable[str]) -> dict[str, str]:
@@ -58,10 +62,25 @@ def state_of(package: str) -> str:
     """The state of a package as this process first found it; see `states_of`."""
     released, contents = _released().get(package) or {}, _first_contents(package)
     # the usual case of an installed gsbench, without parsing
-    if released.get("bytes") == _digest(contents):
+    if released.get("bytes") == (digest := _digest(contents)):
         return AS_RELEASED
-    digest = _digest({name: syntax_of(content, name) for name, content in contents.items()})
+    digest = _digest_of_syntax(contents, f"{platform.python_version()} {digest}")
     return AS_RELEASED if digest == released.get("syntax") else digest
+
+
+def _digest_of_syntax(contents: Mapping[str, bytes], key: str) -> str:
+    """The digest of the syntax of files, which the user's cache keeps by a ``key`` of them.
+
+    Parsing all of gsbench takes a second.
+    """
+    file = user_cache("code") / SYNTAX_DIGESTS
+    known = read_if_sound(file, dict[str, str]) or {}
+    if key not in known:
+        known[key] = _digest({name: syntax_of(content, name) for name, content in contents.items()})
+        with suppress(OSError):  # only slower without
+            file.parent.mkdir(parents=True, exist_ok=True)
+            write_json(file, dict(list(known.items())[-MAX_KEPT:]))
+    return known[key]
 
 
 def _contents(package: str) -> dict[str, bytes]:

@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from gsbench.files import user_cache
 from gsbench.system.locks import hold
 from gsbench.system.machine import load_numba, numba_target
 from gsbench.system.resources import CLOCK
@@ -53,9 +54,8 @@ def cache_base() -> Path:
 
     If neither is writable, it is a private temporary folder, and the next process compiles again.
     """
-    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     configured = os.environ.get("NUMBA_CACHE_DIR")
-    for base in [*([Path(configured)] if configured else []), Path(home) / "gsbench" / "numba"]:
+    for base in [*([Path(configured)] if configured else []), user_cache("numba")]:
         try:
             base.mkdir(parents=True, exist_ok=True)
         except OSError:

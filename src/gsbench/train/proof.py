@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from gsbench.errors import InputError
-from gsbench.files import write_json
+from gsbench.files import user_cache, write_json
 from gsbench.gaussians.paper_values import LearningRates
 from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.parsing import read_if_sound
@@ -230,9 +230,8 @@ def stamp_of(raster: str, device: torch.device) -> Path:
     """
     versions = [f"{name} {version}" for name, version in versions_on(device).items()]
     parts = json.dumps([raster, _device_name(device), *versions])
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
     digest = hashlib.sha256(parts.encode()).hexdigest()
-    return cache / "gsbench" / "proofs" / f"{raster}-{digest[:16]}.json"
+    return user_cache("proofs") / f"{raster}-{digest[:16]}.json"
 
 
 def prove_apart(raster: str, device: str) -> RasterProof:

@@ -28,8 +28,7 @@ from gsbench.raster.executors import find_executor, lacks
 from gsbench.runs.layout import CURVES, EVENTS, HISTOGRAMS
 from gsbench.scene.beside import DEPTH, resized
 from gsbench.scene.types import Camera, Scene
-from gsbench.system.device import free_bytes
-from gsbench.system.resources import CLOCK
+from gsbench.system.resources import CLOCK, free_bytes
 from gsbench.system.stopping import deferred, requested
 from gsbench.train.checkpoint import CheckpointWriter, load_checkpoint
 from gsbench.train.ideas import NO_IDEAS, Ideas, Step, TrainedView, scheduled, value_of

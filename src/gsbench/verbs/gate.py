@@ -24,7 +24,7 @@ from gsbench.claims.archive import unpack_archive
 from gsbench.claims.stopping import Needed, SequentialTest, asked_difference, finished_trials
 from gsbench.config.compose import Trial, with_seed
 from gsbench.errors import GsbenchError, InputError, TrainingError
-from gsbench.files import checked_runs_folder, make_runs_folder
+from gsbench.files import make_runs_folder
 from gsbench.runs.commands import Question
 from gsbench.runs.experiments import make_home
 from gsbench.verbs.arguments import options_of
@@ -76,7 +76,7 @@ def _result(options: argparse.Namespace) -> str:
             for scene, trial in by_scene.items()
             for seed in seeds
         }
-        make_runs_folder(checked_runs_folder(str(home.parent)))
+        make_runs_folder(home.parent)
         make_home(home)
         old = [trial for of_scene in baseline.values() for trial in of_scene if trial.seed in seeds]
 

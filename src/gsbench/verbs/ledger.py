@@ -20,7 +20,7 @@ from gsbench.config.compose import Trial
 from gsbench.config.overrides import changed_words, key_of
 from gsbench.errors import GsbenchError, InputError
 from gsbench.eval.options import EvalConfig
-from gsbench.files import checked_runs_folder, make_runs_folder
+from gsbench.files import make_runs_folder
 from gsbench.launch.record import planned_rows
 from gsbench.runs.code import config_hash
 from gsbench.runs.commands import (
@@ -79,7 +79,7 @@ def new(options: Namespace, home: Path) -> int:
             )
         return command_now(ledger=opened, idea=baseline)
 
-    make_runs_folder(checked_runs_folder(str(home.parent)))
+    make_runs_folder(home.parent)
     append(home, make)
     print("\n".join(read_ledger(home).describe()))
     return 0

@@ -17,7 +17,7 @@ from gsbench.runs.trial_record import RasterProof
 from gsbench.scene.rules import MIN_SIZE
 from gsbench.system.install import install_command, version_of
 from gsbench.system.programs import allow_modules
-from gsbench.system.resources import available_threads, installed_gpus
+from gsbench.system.resources import available_threads, installed_gpus, select_device
 from gsbench.verbs.arguments import comma_separated, options_of
 from gsbench.words import counted, readable_bytes
 
@@ -53,7 +53,6 @@ def doctor(argv: Sequence[str], runs: Path) -> int:
 
 
 def _prove(raster: str, device_name: str, as_json: bool) -> int:
-    from gsbench.system.device import select_device
     from gsbench.train.proof import proof_of, stamp_of
 
     device = select_device(device_name, "--device")

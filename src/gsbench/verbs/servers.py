@@ -48,7 +48,7 @@ def view(argv: Sequence[str], runs: Path) -> int:
         raise InputError(f"one or two trials can be viewed, not {len(options.trial)}")
     require_package("viser", "view", "the viewer")
 
-    from gsbench.system.device import select_device
+    from gsbench.system.resources import select_device
     from gsbench.train.proof import create_proven
     from gsbench.view.server import Viewer, check_port
     from gsbench.view.trials import find_trial, load_viewed

@@ -21,7 +21,7 @@ from gsbench.config.command_words import makes_other_trials, parse, typed_permis
 from gsbench.config.compose import Trial, compose_one
 from gsbench.config.overrides import changed_words, key_of
 from gsbench.errors import InputError
-from gsbench.files import checked_runs_folder, make_runs_folder
+from gsbench.files import make_runs_folder
 from gsbench.launch.estimates import SPEED, describe_plan, progress_frame
 from gsbench.launch.record import check_looks, check_questions, planned_rows, record, remove
 from gsbench.launch.states import (
@@ -220,7 +220,7 @@ def declare(argv: Sequence[str], runs: Path) -> int:
     if any(trial.values["launch"]["stop_when_decided"] for trial in trials):
         check_looks(trials, planned_rows(trials))
     check_questions(trials)
-    make_runs_folder(checked_runs_folder(trials[0].values["runs"]))
+    make_runs_folder(trials[0].values["runs"])
     questions = record(trials)  # which says them
     print(
         f"{trials[0].values['name']}: {counted(len(trials), 'trial')} and "

@@ -365,14 +365,9 @@ def composite_backward_tiles(first, past, memory, frame, g_image, g_alpha, rows,
             continue
         _start_backward(left, top, state, frame, g_image, g_alpha, planes, behind, through)
         for entry in range(end - 1, begin - 1, -1):
-            # An entry that touches no block is skipped below, so its record is not needed.
-            ahead = max(entry - 2 * AHEAD, begin)
-            if masks[ahead] != 0:
-                prefetch(records, entries[ahead] * at.RECORD)
-            ahead = max(entry - AHEAD, begin)
-            if masks[ahead] != 0:
-                row = record_ints[entries[ahead] * at.RECORD + at.FIRST_ROW] + shard
-                prefetch(rows, row * at.ROW)
+            prefetch(records, entries[max(entry - 2 * AHEAD, begin)] * at.RECORD)
+            ahead = entries[max(entry - AHEAD, begin)] * at.RECORD
+            prefetch(rows, (record_ints[ahead + at.FIRST_ROW] + shard) * at.ROW)
             todo = np.uint64(masks[entry])
             if todo == 0:
                 continue

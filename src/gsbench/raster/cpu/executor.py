@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -291,8 +292,12 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         return torch.from_numpy(chosen.reshape(camera.height, camera.width))
 
 
+@lru_cache(maxsize=8)
 def _edges(count: int) -> NDArray[np.int64]:
-    """The starts of the shards of ``count`` Gaussians or records, and the end of the last shard."""
+    """The starts of the shards of ``count`` Gaussians or records, and the end of the last shard.
+
+    The array is shared: do not write to it.
+    """
     return np.arange(GAUSSIAN_SHARDS + 1) * count // GAUSSIAN_SHARDS
 
 

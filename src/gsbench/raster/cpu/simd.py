@@ -449,14 +449,13 @@ def lane_sums(context, builder, sig, args):
     while half:
         if len(level) % 2:
             level.append(VECTOR.constant(0.0))
-        # In each group of 2 * half lanes, the first half is from a, the second from b.
-        low = [
-            lane // (2 * half) * 2 * half + lane % half + lane // half % 2 * LANES
-            for lane in range(LANES)
-        ]
-        first, second = lane_indices(low), lane_indices([lane + half for lane in low])
+        # In each group of 2 * half lanes, the first half sums a, the second b. Lanes that stay at
+        # their place are blended, which is cheaper than a second shuffle.
+        own = [lane + LANES if lane & half else lane for lane in range(LANES)]
+        other = [lane - half + LANES if lane & half else lane + half for lane in range(LANES)]
+        stays, moves = lane_indices(own), lane_indices(other)
         level = [
-            builder.fadd(builder.shuffle_vector(a, b, first), builder.shuffle_vector(a, b, second))
+            builder.fadd(builder.shuffle_vector(a, b, stays), builder.shuffle_vector(a, b, moves))
             for a, b in zip(level[::2], level[1::2], strict=True)
         ]
         half //= 2

@@ -106,7 +106,7 @@ class TensorPool:
 
 
 class ShardRunner:
-    """Runs the shards of a stage on ``threads`` threads.
+    """Runs the shards of a stage on ``threads`` threads, of which the caller's is one.
 
     The result of a shard must not depend on the thread. Shards are run in few ranges, because each
     call of a kernel costs up to 40 microseconds, in which no other thread runs Python.
@@ -114,8 +114,8 @@ class ShardRunner:
 
     def __init__(self, threads: int) -> None:
         self.threads = threads
-        self._executor = (
-            ThreadPoolExecutor(threads, thread_name_prefix="gsbench-raster")
+        self._helpers = (
+            ThreadPoolExecutor(threads - 1, thread_name_prefix="gsbench-raster")
             if threads > 1
             else None
         )
@@ -125,16 +125,26 @@ class ShardRunner:
 
         On an error or an interrupt, wait for the calls that have begun.
         """
-        if self._executor is None:
+        if self._helpers is None:
             work(0, shards, *arguments)
             return
         parts = min(shards, RANGES_PER_THREAD * self.threads)
         edges = [shards * part // parts for part in range(parts + 1)]
-        futures = [self._executor.submit(work, *span, *arguments) for span in pairwise(edges)]
+        ranges = iter([*pairwise(edges)])  # each is taken by the first thread that is free
+
+        def run_ranges() -> None:
+            try:
+                for first, past in ranges:
+                    work(first, past, *arguments)
+            finally:
+                for _ in ranges:  # only after an error: no further range begins
+                    pass
+
+        futures = [self._helpers.submit(run_ranges) for _ in range(self.threads - 1)]
         try:
-            for future in futures:
-                future.result()
+            run_ranges()
         finally:
-            for future in futures:
-                future.cancel()
-            wait(futures)  # no thread may still write to memory that returns to a pool
+            begun = [future for future in futures if not future.cancel()]
+            wait(begun)  # no thread may still write to memory that returns to a pool
+        for future in begun:
+            future.result()
