@@ -15,6 +15,8 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pydantic import ConfigDict
+
 from gsbench import downloads
 from gsbench.errors import GsbenchError, InputError
 from gsbench.files import atomic, file_sha256
@@ -45,6 +47,8 @@ class WeightsFile:
     the shapes are checked. ``copies`` are names and checksums of files with the same tensors.
     ``source`` says where a copy, or a file without an address, comes from.
     """
+
+    __pydantic_config__ = ConfigDict(extra="forbid")  # a misspelt key would leave out a check
 
     names: tuple[str, ...]
     url: str | None

@@ -9,7 +9,7 @@ from functools import cache
 from pathlib import Path
 
 import yaml
-from pydantic import TypeAdapter
+from pydantic import ConfigDict, TypeAdapter
 
 from gsbench.errors import InputError
 from gsbench.parsing import table_beside
@@ -26,6 +26,7 @@ class Archive:
 
     url: str
     scenes: Mapping[str, str]  # the folder of each scene in the archive
+    read_in: tuple[str, ...]  # sources of the address, the layout and the size
     size: str = ""  # approximate, in words; "" if unknown
 
     @property
@@ -36,6 +37,8 @@ class Archive:
 @dataclass(frozen=True)
 class PublicDataset:
     """A published set of scenes. Its licence and citation are shown before it is fetched."""
+
+    __pydantic_config__ = ConfigDict(extra="forbid")
 
     name: str
     title: str

@@ -1,4 +1,4 @@
-"""What several densifiers share: draws, opacities, quantiles, and scores by training views."""
+"""Parts of several densifiers: draws, opacities, quantiles, and scores by training views."""
 
 import math
 from collections.abc import Callable, Sequence

@@ -108,9 +108,10 @@ def find_model(root: Path, sparse: str | None) -> tuple[Path, list[str]]:
         found = [folder for folder in ordered if _is_model(folder)]
         if found:
             # a single one is not counted: if it is damaged, it gets a better message later
-            largest = max(found, key=count_images) if len(found) > 1 else found[0]
+            sizes = {path: count_images(path) if len(found) > 1 else 0 for path in found}
+            largest = max(found, key=sizes.__getitem__)
             return largest, [
-                f"{path.relative_to(root)}: {counted(count_images(path), 'image')}"
+                f"{path.relative_to(root)}: {counted(sizes[path], 'image')}"
                 for path in found
                 if path != largest
             ]
