@@ -51,7 +51,8 @@ def pytest_make_collect_report(collector):
 
     The others follow, and read what Python kept: two workers compile a fresh clone once.
     """
-    if "PYTEST_XDIST_WORKER" not in os.environ:
+    # a test's own pytest has the worker's environment, but is none
+    if not hasattr(collector.config, "workerinput"):
         return (yield)
     common = Path(collector.config.getoption("basetemp")).parent  # the folder of all workers
     name = collector.nodeid.replace("/", ".")

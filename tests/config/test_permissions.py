@@ -252,7 +252,7 @@ def test_every_program_and_variable_of_another_trainer_needs_permission(words, m
 
 
 @pytest.mark.parametrize(
-    "target", ["gsbench.external.exchange.External", "gsbench.pipeline.parts.External"]
+    "target", ["gsbench.config.build.External", "gsbench.pipeline.parts.External"]
 )
 def test_the_class_of_other_trainers_is_refused_under_further_names(target):
     """Two names of the class ask for permissions; by any other name nothing is made."""

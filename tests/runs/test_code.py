@@ -3,6 +3,7 @@
 import hashlib
 import importlib
 import importlib.util
+import json
 import os
 import shutil
 import sys
@@ -63,8 +64,9 @@ BESIDE = {
 def package(tmp_path, monkeypatch):
     """A copy of gsbench, other than the one that runs, without the files of a release.
 
-    It is read as by a new process.
+    It is read as by a new process, whose user has an empty cache.
     """
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     copy = shutil.copytree(
         PACKAGE, tmp_path / "gsbench", ignore=shutil.ignore_patterns("__pycache__", "*.json")
     )
@@ -177,13 +179,14 @@ def test_the_digest_of_a_package_is_the_recorded_one(tmp_path, monkeypatch):
     assert found == {"one.py": "8955de80759662ec", "pack": "7d79c895ac4d3f58"}
 
 
-def test_released_code_adds_nothing_to_keys(package, monkeypatch):
+def test_released_code_adds_nothing_to_keys(package, tmp_path, monkeypatch):
     # before the first release
     assert edited(states_of(CODE_OF_STAGE["train"])) == states_of(CODE_OF_STAGE["train"])
     script("released").main()
     again()
     with monkeypatch.context() as patch:
-        patch.setattr(code, "syntax_of", lambda source: pytest.fail("a released package is parsed"))
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path / "empty"))
+        patch.setattr(code, "syntax_of", lambda *_: pytest.fail("a released package is parsed"))
         released = states_of(CODE_OF_STAGE["train"])
     assert set(released.values()) == {AS_RELEASED}
     assert edited(released) == {}
@@ -199,14 +202,14 @@ def test_released_code_adds_nothing_to_keys(package, monkeypatch):
 
 
 def test_the_users_cache_keeps_digests_and_may_be_damaged(package, tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     before = states_of(["train"])
     again()
     with monkeypatch.context() as patch:
         patch.setattr(code, "syntax_of", lambda *_: pytest.fail("it is parsed again"))
         assert changed(before) == []
     (kept,) = (tmp_path / "cache").rglob("*.json")
-    for damaged in ("{", '{"a": 1}'):
+    key = next(iter(json.loads(kept.read_text())))
+    for damaged in ("{", '{"a": 1}', json.dumps({key: AS_RELEASED})):
         kept.write_text(damaged)
         again()
         assert changed(before) == []

@@ -15,7 +15,7 @@ from gsbench.tracking import Mirror, beside, connect
 from gsbench.tracking.beside import permissions, send_beside
 from gsbench.tracking.sync import MirrorError
 from tests.helpers import read_json, write
-from tests.processes import wait_until
+from tests.processes import completed, wait_until
 from tests.tracking.helpers import (
     STATE,
     begun_trial,
@@ -316,6 +316,18 @@ def test_no_process_is_left_by_a_tracker_that_never_answers(tmp_path, caplog):
     assert "tracking: the tracker is slow" in caplog.text
     _, alive = psutil.wait_procs(set(psutil.Process().children()) - others, timeout=60)
     assert not alive
+
+
+def test_a_trial_whose_lock_another_holds_is_left_alone(tmp_path):
+    folder, values = begun_trial(tmp_path)
+    file = told([folder])
+    write_trial(folder, values)
+    words = [sys.executable, "-P", "-m", "gsbench", "sync", f"--beside={file}"]
+    environment = child_environment() | {"GSBENCH_RUNS": str(tmp_path)}
+    with hold(folder / ".mlflow.lock", "mirroring"):
+        completed(words, env=environment, input="", timeout=300)
+    assert not (folder / STATE).exists()
+    assert not file.exists()
 
 
 @pytest.mark.slow

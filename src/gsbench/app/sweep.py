@@ -1,9 +1,11 @@
 """A command line that was read: its words, its configuration, and how its trials ended."""
 
+from __future__ import annotations
+
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
@@ -17,9 +19,11 @@ from gsbench.config.compose import Composer, Trial, config_loader, hydra_config,
 from gsbench.config.explain import explained
 from gsbench.config.overrides import is_sweep, parse_word
 from gsbench.errors import InputError
-from gsbench.launch.jobs import Outcome
 from gsbench.logs import set_up_logging
 from gsbench.pipeline.metric_facts import facts_for
+
+if TYPE_CHECKING:  # loads scipy, which completion does without
+    from gsbench.launch.jobs import Outcome
 
 OWN = "gsbench"  # the name of the launcher and of the sweeper in Hydra
 BASIC = "basic"  # Hydra's own sweeper, which expands lists, and its launcher

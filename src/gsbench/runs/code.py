@@ -20,9 +20,10 @@ from dataclasses import dataclass, field
 from functools import cache
 from importlib.machinery import ModuleSpec
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import yaml
+from pydantic import Field
 
 from gsbench.files import file_sha256, user_cache, write_json
 from gsbench.parsing import DamagedError, SafeLoader, read_if_sound, read_json
@@ -32,8 +33,9 @@ PACKAGE = Path(__file__).resolve().parents[1]
 RELEASED = "released.json"  # in gsbench's folder: the digests of all packages at the release
 AS_RELEASED = "released"  # the state of a package that equals the release
 DIGEST_CHARACTERS = 16
-SYNTAX_DIGESTS = "syntax-1.json"  # another number if `syntax_of` changes
+SYNTAX_DIGESTS = "syntax.json"  # in the user's cache
 MAX_KEPT = 500  # digests in that file
+KeptDigests = dict[str, Annotated[str, Field(pattern=f"^[0-9a-f]{{{DIGEST_CHARACTERS}}}$")]]
 
 
 def states_of(packages: Iterable[str]) -> dict[str, str]:
@@ -64,7 +66,7 @@ def state_of(package: str) -> str:
     # the usual case of an installed gsbench, without parsing
     if released.get("bytes") == (digest := _digest(contents)):
         return AS_RELEASED
-    digest = _digest_of_syntax(contents, f"{platform.python_version()} {digest}")
+    digest = _digest_of_syntax(contents, f"{_parsers()} {digest}")
     return AS_RELEASED if digest == released.get("syntax") else digest
 
 
@@ -74,13 +76,20 @@ def _digest_of_syntax(contents: Mapping[str, bytes], key: str) -> str:
     Parsing all of gsbench takes a second.
     """
     file = user_cache("code") / SYNTAX_DIGESTS
-    known = read_if_sound(file, dict[str, str]) or {}
+    known = read_if_sound(file, KeptDigests) or {}
     if key not in known:
         known[key] = _digest({name: syntax_of(content, name) for name, content in contents.items()})
         with suppress(OSError):  # only slower without
             file.parent.mkdir(parents=True, exist_ok=True)
             write_json(file, dict(list(known.items())[-MAX_KEPT:]))
     return known[key]
+
+
+@cache
+def _parsers() -> str:
+    """The versions of all that computes a digest of syntax: this file, Python and PyYAML."""
+    own = file_sha256(Path(__file__))[:DIGEST_CHARACTERS]
+    return f"{own} {platform.python_version()} {yaml.__version__}"
 
 
 def _contents(package: str) -> dict[str, bytes]:

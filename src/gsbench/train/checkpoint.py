@@ -38,9 +38,9 @@ def save_checkpoint(folder: Path, step: int, state: dict[str, Any]) -> None:
 class CheckpointWriter:
     """Writes checkpoints into ``folder``; after `finish`, all of them are completely on disk.
 
-    A thread writes and hashes them. With ``background``, `save` copies the state to the CPU, and
-    training continues meanwhile; the next `save` waits for the thread. Use it for models on a GPU.
-    For a model on the CPU, the copy would take longer than the write, so `save` waits.
+    With ``background``, `save` copies the state to the CPU, and a thread writes and hashes it while
+    training continues; the next `save` waits for the thread. Use it for models on a GPU. For a
+    model on the CPU, the copy would take longer than the write, so `save` writes at once.
     """
 
     def __init__(self, folder: Path, background: bool) -> None:
@@ -50,11 +50,11 @@ class CheckpointWriter:
 
     def save(self, step: int, state: dict[str, Any]) -> None:
         """Save the state of ``step``. Raises the error of the previous save if it failed."""
-        self.finish()
-        state = to_host(state) if self.background else state
-        self._pending = self._executor.submit(save_checkpoint, self.folder, step, state)
         if not self.background:
-            self.finish()
+            save_checkpoint(self.folder, step, state)
+            return
+        self.finish()
+        self._pending = self._executor.submit(save_checkpoint, self.folder, step, to_host(state))
 
     def finish(self) -> None:
         """Wait until the last checkpoint is on disk. Raises its error if it failed."""
