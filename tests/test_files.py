@@ -273,3 +273,14 @@ def test_only_a_member_that_stays_below_its_folder_is_safe():
     assert is_safe_member("color/a.png")
     for name in ("/a", "../a", "a/../../b", "C:/a", "a\\b", "a\0b", "a\nb", ""):
         assert not is_safe_member(name), name
+
+
+@pytest.mark.parametrize("given", ["relative", "", None])
+def test_the_users_cache_is_never_below_the_current_folder(given, tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    if given is not None:
+        monkeypatch.setenv("XDG_CACHE_HOME", given)
+    assert files.user_cache("code") == tmp_path / ".cache/gsbench/code"
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "own"))
+    assert files.user_cache("code") == tmp_path / "own/gsbench/code"

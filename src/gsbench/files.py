@@ -113,9 +113,14 @@ def writable_output(out: Path) -> Iterator[None]:
 
 
 def user_cache(name: str) -> Path:
-    """The folder ``name`` of gsbench's in the user's cache, which may not be there yet."""
-    cache = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    return Path(cache, "gsbench", name)
+    """The folder ``name`` of gsbench's in the user's cache, which may not be there yet.
+
+    A relative ``XDG_CACHE_HOME`` is ignored, as XDG's specification asks: it would mean a folder of
+    the current one, which may be a stranger's.
+    """
+    given = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    cache = given if given.is_absolute() else Path(os.path.expanduser("~/.cache"))
+    return cache / "gsbench" / name
 
 
 OUTPUTS = ".gsbench-outputs"  # in a folder of the user's: the sha256 of what gsbench wrote there
