@@ -16,6 +16,7 @@ import pytest
 from filelock import FileLock
 from hypothesis import HealthCheck, settings
 
+from gsbench.cli import NEW_OBJECTS
 from tests.helpers import words_of
 from tests.processes import completed
 
@@ -27,7 +28,7 @@ settings.register_profile(
 settings.register_profile("explore", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("gsbench")
 
-gc.set_threshold(10_000)  # as the program does
+gc.set_threshold(NEW_OBJECTS)  # as the program does
 
 ROOT = Path(__file__).resolve().parents[1]
 

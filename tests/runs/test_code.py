@@ -78,7 +78,7 @@ def package(tmp_path, monkeypatch):
 
 def again():
     """Forget what this process has read, as in a new process."""
-    for cached in (code._released, code.state_of, code._first_contents):
+    for cached in (code._released, code.state_of, code._first_contents, code._kept_digests):
         cached.cache_clear()
 
 

@@ -76,13 +76,19 @@ def _digest_of_syntax(contents: Mapping[str, bytes], key: str) -> str:
     Parsing all of gsbench takes a second.
     """
     file = user_cache("code") / SYNTAX_DIGESTS
-    known = read_if_sound(file, KeptDigests) or {}
+    known = _kept_digests(file)
     if key not in known:
         known[key] = _digest({name: syntax_of(content, name) for name, content in contents.items()})
         with suppress(OSError):  # only slower without
             file.parent.mkdir(parents=True, exist_ok=True)
             write_json(file, dict(list(known.items())[-MAX_KEPT:]))
     return known[key]
+
+
+@cache
+def _kept_digests(file: Path) -> dict[str, str]:
+    """The digests in the user's cache as this process first found them, and its own since."""
+    return read_if_sound(file, KeptDigests) or {}
 
 
 @cache
