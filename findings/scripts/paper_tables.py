@@ -1,14 +1,15 @@
 """Train the paper's tables in small over several days and machines, in a clone of one commit.
 
-    python findings/scripts/paper_tables.py train CLONE EXPERIMENT
+    python findings/scripts/paper_tables.py train CLONE EXPERIMENT [SCENE ...]
     python findings/scripts/paper_tables.py save CLONE EXPERIMENT
 
 ``CLONE`` is a checkout of the commit that the page names, with its own environment in ``.venv``.
 ``train`` first unpacks ``findings/archives/EXPERIMENT.zip`` into ``$GSBENCH_RUNS``, if nothing of
-the experiment is there. It then trains one after the other what has no result yet, and can be
-killed and started again at any time. ``save`` writes the archive, with all trials so far, and
-beside it ``EXPERIMENT.csv`` with what archives lack and a machine that is gone cannot tell: CPU
-time, and the share of volumes below V_th.
+the experiment is there. It then trains scene by scene and seed by seed what has no result yet: all
+arms of a scene and seed by one command. It can be killed and started again at any time, and two
+processes can train different scenes. ``save`` writes the archive, with all trials so far, and
+beside it ``EXPERIMENT.csv`` with what archives lack and a machine that is gone cannot tell: the
+share of volumes below V_th, and the CPU time of a seed's trainings.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ import numpy as np
 from gsbench.claims.archive import unpack_archive
 
 FINDINGS = Path(__file__).resolve().parents[1]
-LINE = re.compile(r"^(\w+) +(?P<scene>\S+?)/\S+-(?P<densify>\S+) seed (?P<seed>\d+) \(\w+\)")
+LINE = re.compile(r"^(\w+) +(?P<scene>\S+?)/\S+ seed (?P<seed>\d+) \(\w+\)")
 THRESHOLD = 0.03  # V_th of the paper
 PAGE = FINDINGS / "paper_tables.md"
 STATE, END = "<!-- state {} -->", "<!-- end -->"  # around the table of an experiment
@@ -49,14 +50,19 @@ def words_of(clone: Path, experiment: str) -> list[str]:
     return [f"hydra.searchpath=['file://{clone}/findings']", f"+experiment={experiment}"]
 
 
-def missing(clone: Path, experiment: str) -> list[re.Match[str]]:
-    """The trials without a result, in the order of the experiment's file."""
+def missing(clone: Path, experiment: str, scenes: list[str]) -> list[tuple[str, str]]:
+    """The scenes and seeds that lack a result of some arm, scene by scene."""
     listed = gsbench(clone, *words_of(clone, experiment), "--dry-run").stdout.splitlines()
     lines = [found for line in listed if (found := LINE.match(line))]
-    return [found for found in lines if found[1] != "done"]
+    todo = {(found["scene"], found["seed"]) for found in lines if found[1] != "done"}
+    order = list(dict.fromkeys(found["scene"] for found in lines))
+    return sorted(
+        (one for one in todo if not scenes or one[0] in scenes),
+        key=lambda one: (order.index(one[0]), int(one[1])),
+    )
 
 
-def train(clone: Path, experiment: str) -> None:
+def train(clone: Path, experiment: str, *scenes: str) -> None:
     home = Path(os.environ["GSBENCH_RUNS"]) / experiment
     archive = FINDINGS / "archives" / f"{experiment}.zip"
     if archive.exists() and not home.exists():
@@ -64,17 +70,16 @@ def train(clone: Path, experiment: str) -> None:
         code += "unpack_archive(*map(pathlib.Path, sys.argv[1:]))"
         python = clone / ".venv/bin/python"
         subprocess.run([python, "-c", code, archive, home.parent], check=True)
-    while todo := missing(clone, experiment):
-        first, before = todo[0], resource.getrusage(resource.RUSAGE_CHILDREN)
-        print(f"{len(todo)} trials to go: {first[0]}", flush=True)
-        one = [f"scene.path={os.environ['GSBENCH_DATA']}/{first['scene']}"]
-        one += [f"seed={first['seed']}", f"densify={first['densify']}"]
+    while todo := missing(clone, experiment, list(scenes)):
+        (scene, seed), before = todo[0], resource.getrusage(resource.RUSAGE_CHILDREN)
+        print(f"{len(todo)} seeds to go: {scene}, seed {seed}", flush=True)
+        one = [f"scene.path={os.environ['GSBENCH_DATA']}/{scene}", f"seed={seed}"]
         done = gsbench(clone, *words_of(clone, experiment), *one)
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         spent = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-        trial = f"{first['scene']}-{first['densify']}-{first['seed']}"
         with (home / MEASURED).open("a") as stream:
-            stream.write(f"{trial},{spent:.0f}\n")
+            stream.write(f"{scene}-{seed},{spent:.0f}\n")
+        print(done.stdout[-2000:], flush=True)
         if done.returncode:
             sys.exit(done.returncode)
 

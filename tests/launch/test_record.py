@@ -199,6 +199,16 @@ def test_a_question_may_be_about_some_scenes_alone(tmp_path):
     assert [*found.seeds] == ["courtyard"]
 
 
+def test_a_part_of_a_declared_sweep_leaves_out_the_questions_whose_arms_it_lacks(tmp_path):
+    entries = ({"idea": "mine"}, {"idea": "other", "baseline": "mine"})
+    mine, other = named(tmp_path, *entries)
+    assert named(tmp_path, *entries, densifiers=("adc", "mine")) == [mine]
+    assert named(tmp_path, *entries, densifiers=("adc",)) == []
+    assert history(tmp_path).questions == (mine, other)
+    with refusal("third names no arm of this sweep"):  # a new question lacks its arm
+        named(tmp_path, *entries, {"idea": "third"})
+
+
 @pytest.mark.parametrize(
     "entry, said",
     table(__file__, "a_wrong_question_is_refused_in_one_line_before_anything_is_written"),

@@ -140,10 +140,10 @@ class NamedQuestion:
     says: str = ""
     where: str = ""
 
-    def rows(self, word: str, planned: Sequence[Trained]) -> list[Trained]:
-        """The planned trials of the arm called ``word``; raises InputError unless it is one."""
+    def fitting(self, word: str, planned: Sequence[Trained]) -> list[Trained]:
+        """The planned trials that ``word`` can mean."""
         name = ArmName.read(word)
-        found = [
+        return [
             row
             for row in planned
             if name.fits(row)
@@ -152,6 +152,10 @@ class NamedQuestion:
             )
             and row.scene in (self.scenes or [row.scene])
         ]
+
+    def rows(self, word: str, planned: Sequence[Trained]) -> list[Trained]:
+        """The planned trials of the arm called ``word``; raises InputError unless it is one."""
+        found = self.fitting(word, planned)
         arms = list(dict.fromkeys(row.arm for row in found))
         if len(arms) != 1:
             known = some_of([str(arm) for arm in dict.fromkeys(row.arm for row in planned)])
@@ -160,12 +164,16 @@ class NamedQuestion:
         return found
 
 
+# the name of a named question, the question, the sign and the least difference
+Named = tuple[str, NamedQuestion, int, tuple[float | None, bool]]
+
+
 @dataclass(frozen=True)
 class Asked:
     """The settings of a command's questions, beside its trials.
 
     The error rate is that of each idea, or ``shared`` by all. ``named`` are the questions that the
-    experiment's file names, each with sign and least difference, in place of the usual ones.
+    experiment's file names, in place of the usual ones (None).
     """
 
     metric: str
@@ -176,7 +184,7 @@ class Asked:
     looks: tuple[int, ...] = ()
     shared: bool = False
     split: str = ""  # ask about trials with this rule of held-out views alone
-    named: tuple[tuple[NamedQuestion, int, tuple[float | None, bool]], ...] = ()
+    named: tuple[Named, ...] | None = None
 
 
 def ask(
@@ -190,9 +198,9 @@ def ask(
     planned = [
         row for row in planned if not asked.split or row.config.get("scene.split") == asked.split
     ]
-    if asked.named:
+    if asked.named is not None:
         drafts = []
-        for number, (named, sign, (least, relative)) in enumerate(asked.named, 1):
+        for name, named, sign, (least, relative) in asked.named:
             ideas, baselines = (named.rows(word, planned) for word in (named.idea, named.baseline))
             arms = baselines[0].arm, ideas[0].arm
             question = draft(*arms, [*baselines, *ideas], asked, measured)
@@ -203,7 +211,7 @@ def ask(
                     sign=sign,  # type: ignore[arg-type]
                     least=least,
                     relative=relative,
-                    name=f"{named.idea}-{number}",
+                    name=name,
                     says=named.says,
                     where=named.where,
                 )

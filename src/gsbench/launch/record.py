@@ -5,7 +5,7 @@ Loads no torch.
 
 import logging
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from gsbench.analysis.quantities import COSTS, TEXTURED, askable_names
 from gsbench.analysis.questions import (
     FIRST_LOOK,
     Asked,
+    Named,
     NamedQuestion,
     announce,
     ask,
@@ -137,7 +138,8 @@ def asked_of(trials: Sequence[Trial], rows: Sequence[Planned]) -> Asked | None:
     if not facts.direction:
         log.warning("whether more of %s is better is not known: nothing is tested", metric)
         return None
-    named = _named(values, metric, rows)
+    earlier = {question.name for question in read_history(trials[0].files.home).questions}
+    named = _named(values, metric, rows, earlier)
     split = next((key for key, question in QUESTIONS.items() if question == about), "")
     return Asked(
         metric=metric,
@@ -162,11 +164,17 @@ def check_questions(trials: Sequence[Trial]) -> None:
 
 
 def _named(
-    values: Mapping[str, Any], metric: str, rows: Sequence[Planned]
-) -> tuple[tuple[NamedQuestion, int, tuple[float | None, bool]], ...]:
-    """The questions that the experiment's file names; raises InputError for a wrong one."""
+    values: Mapping[str, Any], metric: str, rows: Sequence[Planned], earlier: Collection[str]
+) -> tuple[Named, ...] | None:
+    """The questions that the experiment's file names, if any; raises InputError for a wrong one.
+
+    A command that trains a part of the sweep may lack the arms of a question that an earlier
+    command asked: it leaves that question out.
+    """
+    if not values.get("questions"):
+        return None
     found = []
-    for number, entry in enumerate(values.get("questions") or (), 1):
+    for number, entry in enumerate(values["questions"], 1):
         where = f"questions[{number}]"
         if not isinstance(entry, dict) or "idea" not in entry:
             raise InputError(f"{where} must be a mapping with idea, baseline, metric, …")
@@ -175,7 +183,10 @@ def _named(
         known = (*askable_names(), *(values["eval"].get("extra") or {}))
         if asked not in known:
             raise InputError(f"{where}.metric={asked} is no metric{did_you_mean(asked, known)}")
-        for word in (named.idea, named.baseline):
+        name, sides = f"{named.idea}-{number}", (named.idea, named.baseline)
+        if name in earlier and not all(named.fitting(word, rows) for word in sides):
+            continue
+        for word in sides:
             named.rows(word, rows)  # raises unless it is one arm
         facts = None if asked in (*COSTS, TEXTURED.key) else facts_for(asked, values)
         sign = DIRECTIONS.get(named.direction, facts.direction if facts else -1)
@@ -185,7 +196,7 @@ def _named(
         effect = (None, False) if least is None else read_least(least, f"{where}.least", is_cost)
         if effect[0] is None and named.direction == "same":
             raise InputError(f"{where}.least is needed: a difference below which both are the same")
-        found.append((named, sign, effect))
+        found.append((name, named, sign, effect))
     return tuple(found)
 
 
