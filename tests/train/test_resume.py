@@ -31,7 +31,7 @@ def test_crashes_and_signals_at_random_iterations_do_not_change_the_result(name,
     rng = random.Random(name)
     crashes = stops = 0
     for attempt in range(12):
-        moment = rng.randrange(1, 45)
+        moment = rng.randrange(20, 60)
         crash = attempt % 2 == 0
         seen = []
 
