@@ -20,7 +20,6 @@ def shell(line, folder):
     "line, code",
     [
         ("gsbench densify=adc --dry-run <&- >&- 2>&-", 0),
-        ("gsbench status sw >&-", 2),
         ("gsbench tables E >&- 2>&-", 2),
     ],
 )

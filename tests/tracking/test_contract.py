@@ -264,7 +264,7 @@ def test_what_was_sent_before_a_crash_is_not_shown_twice(shown, mirrored):
     check_one(shown, mirrored)
 
 
-@pytest.mark.parametrize("method, number", [("open", 1), *(("send", k) for k in range(1, 5))])
+@pytest.mark.parametrize("method, number", [("open", 1), ("send", 1), ("send", 4)])
 def test_after_an_error_anywhere_the_next_time_completes_the_run(
     shown, method, number, monkeypatch
 ):

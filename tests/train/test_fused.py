@@ -54,8 +54,8 @@ def test_numbers_without_a_gradient_yet_keep_their_bits(active):
 @pytest.mark.parametrize(
     "kind",
     [
-        *("none", "volumetric", "adc", "mcmc", "fastgs"),
-        *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("mrnf", "gns", "steepgs")),
+        *("none", "volumetric", "mcmc"),
+        *(pytest.param(kind, marks=pytest.mark.slow) for kind in STATEFUL if kind != "mcmc"),
     ],
 )
 def test_a_fused_training_has_the_bits_of_one_by_autograd(kind, lab, monkeypatch):
