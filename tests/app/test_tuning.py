@@ -305,6 +305,7 @@ MISTAKES = [
         "leave one of",
     ),
     (FILE.replace("densify.stop", "scene.max_size"), "", "belongs to what all arms share"),
+    (FILE.replace("densify.stop", "seed"), "", "belongs to what all arms share"),
     (FILE.replace(INTERVAL, "tag(log, interval(0, 1e-1))"), "", "an interval begins above 0"),
     (FILE.replace(INTERVAL, "interval(1e-3"), "", "densify.volume_threshold"),
 ]
