@@ -66,8 +66,8 @@ def test_an_evaluation_without_newer_settings_keeps_its_key(monkeypatch):
     monkeypatch.setattr(keys, "edited", lambda files: {})  # as in a release
     old = {"train": TRAINED.key, "protocol": "paper-1", "unavailable": FOUR_LPIPS, "maps": False}
     assert inputs() == old
-    for more in (["ssim_cc", "psnr_cc"], ["psnr_cc", "ssim_cc"]):
-        assert inputs(more=more) == old | {"more": ["psnr_cc", "ssim_cc"]}
+    for more in (["gmsd", "fsim"], ["fsim", "gmsd"]):
+        assert inputs(more=more)["more"] == ["fsim", "gmsd"]
 
 
 def test_an_evaluation_measures_the_pixels_of_its_png_files(tmp_path, truth, tiny_scene, told):

@@ -44,8 +44,6 @@ class MetricFacts:
         return f"{self.label} ({self.unit})" if self.unit else self.label
 
 
-# the end of the key of a metric that is measured after an affine correction of the colours
-CORRECTED = "_cc"
 METRICS = [MetricFacts(**row) for row in table_beside(__file__, "metrics.yaml")]
 
 
