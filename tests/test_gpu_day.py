@@ -78,7 +78,7 @@ class Absent:
             raise ModuleNotFoundError(f"{name} is not on a borrowed machine", name=name)
 sys.meta_path.insert(0, Absent())
 """
-LISTS = "trained", "skewed", "crowded"  # the scenes in which long lists are split, and are not
+LISTS = "trained", "crowded"  # the scenes in which long lists are split, and are not
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs bash, /proc and Triton")
 
@@ -271,7 +271,7 @@ def test_a_table_of_two_commands(day):
     )
     assert re.search(r"^- bits: yes, \d+ s; 3 passed in 1.2s$", said, re.MULTILINE)
     assert "| triton-3 | triton | 3 | 16x16 | - | - | - | - | 1.25 | - | - | - |" in said
-    assert "| triton-skewed-whole | triton | 3 |" in said
+    assert "| triton-crowded-whole | triton | 3 |" in said
     assert "| adc | recorded | 0 | 15 | 0.06 |" in said
     trained = "| train-volumetric_once | 30000 | 12345 | 1 | 99.5 | - | 31.543 | 0 | - | - | - |"
     assert trained in said
@@ -290,7 +290,7 @@ def test_one_part_of_each_kind_in_the_interpreter(day):
     triton = pytest.importorskip("triton")
     if fault := interpreter_fault(triton.__version__, version("numpy")):
         pytest.skip(fault)
-    parts = split("host bench-triton-3 bench-triton-skewed-whole train-adc bench-cpu memcheck")
+    parts = split("host bench-triton-3 bench-triton-crowded-whole train-adc bench-cpu memcheck")
     code, said = day.run("run", "1600", "proof-triton", *parts, REAL="1")
     assert code == 0, said
     said = day.run("table", str(day.out / "gpu_day.tar.gz"), REAL="1")[1]
