@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from gsbench.init import Sfm
 from gsbench.init.base import Timer
 from gsbench.init.colmap.database import DatabaseTask, create_database, unknown_camera_groups
-from gsbench.init.colmap.matches import distribute_parts, divide_pairs, extract_sift, match_sift
+from gsbench.init.colmap.matches import divide_pairs, extract_sift, match_sift
 from gsbench.init.colmap.pairs import best_pairs
 from gsbench.init.sfm import Job
 from gsbench.logs import no_progress
@@ -25,17 +25,17 @@ pairs_of_some_images = st.integers(2, 40).flatmap(
 
 @given(pairs_of_some_images, st.integers(1, 9), st.integers(1, 5))
 def test_every_pair_is_matched_once(pairs, block, processes):
-    parts = divide_pairs(sorted(pairs), block)
-    shares = distribute_parts(parts, processes)
+    shares = divide_pairs(sorted(pairs), block, processes)
     assert sorted(pair for share in shares for part in share for pair in part) == sorted(pairs)
-    assert all(len(part) <= block * block for part in parts)
+    assert all(len(part) <= block * block for share in shares for part in share)
     assert 1 <= len(shares) <= processes
 
 
 def test_shares_are_about_equal_and_parts_hold_few_images():
-    parts = divide_pairs(list(itertools.combinations(range(1, 101), 2)), 10)
-    assert max(len({image for pair in part for image in pair}) for part in parts) <= 2 * 10
-    sizes = [sum(map(len, share)) for share in distribute_parts(parts, 4)]
+    shares = divide_pairs(list(itertools.combinations(range(1, 101), 2)), 10, 4)
+    parts = [{image for pair in part for image in pair} for share in shares for part in share]
+    assert max(map(len, parts)) <= 2 * 10
+    sizes = [sum(map(len, share)) for share in shares]
     assert max(sizes) - min(sizes) <= 10 * 10
 
 
