@@ -9,8 +9,6 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.quantities import COSTS, TEXTURED, askable_names
 from gsbench.analysis.questions import (
@@ -25,10 +23,10 @@ from gsbench.analysis.questions import (
 )
 from gsbench.analysis.results import group_by, read_experiment
 from gsbench.analysis.trial_result import Planned
+from gsbench.config.build import facts_for
 from gsbench.config.compose import Trial
 from gsbench.errors import InputError
 from gsbench.files import require_no_links
-from gsbench.pipeline.metric_facts import facts_for
 from gsbench.runs.commands import (
     Command,
     History,
@@ -122,7 +120,7 @@ def planned_rows(trials: Sequence[Trial]) -> list[Planned]:
         values = trial.values
         key = trial.folder.parent / trial.folder.name.partition(SEED)[0]
         if key not in configs:  # all seeds share it
-            configs[key] = digest_of(values), flatten(yaml.safe_load(trial.yaml))
+            configs[key] = digest_of(values), flatten(values)
         digest, config = configs[key]
         scene, init, densify = (values[group]["name"] for group in ("scene", "init", "densify"))
         rows.append(Planned(scene, init, densify, key.name, values["seed"], config, digest))

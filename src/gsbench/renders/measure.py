@@ -10,6 +10,7 @@ from typing import Any
 import torch
 
 from gsbench.analysis.results import read_experiment
+from gsbench.config.build import build_metrics
 from gsbench.config.command_words import typed_permissions
 from gsbench.config.compose import compose_one
 from gsbench.errors import InputError
@@ -19,7 +20,7 @@ from gsbench.eval.options import EvalConfig
 from gsbench.eval.pictures import PicturePair, check_pairs, measure
 from gsbench.files import storage_errors
 from gsbench.logs import progress
-from gsbench.pipeline.parts import build_metrics, make_evaluator
+from gsbench.pipeline.parts import make_evaluator
 from gsbench.renders.imported import Measured, check_destination, find_destination, import_trial
 from gsbench.renders.sources import (
     ReferenceImages,
