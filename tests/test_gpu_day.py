@@ -15,6 +15,7 @@ import pytest
 
 from tests.composed import composed
 from tests.conftest import ROOT, script
+from tests.processes import wait_until
 
 SCRIPT = ROOT / "scripts/gpu_day.sh"
 # Stands in for Python: parts fail, hang or are killed as a test wants, and others print what real
@@ -178,9 +179,7 @@ def test_parts_that_fail_hang_or_are_killed_do_not_harm_other_parts(day):
 def test_a_killed_command_leaves_the_results_so_far_and_no_process(day):
     process = day.start("run", "300", faults={"train-adc": ("densify=adc ", "hang")})
     marker = day.state / "results/train-adc.out"
-    until = time.monotonic() + 60
-    while not (marker.exists() and marker.read_text()) and time.monotonic() < until:
-        time.sleep(0.1)
+    wait_until(lambda: marker.exists() and marker.read_text(), 60)
     child = Path("/proc") / marker.read_text().strip()
     assert child.exists()
     process.send_signal(signal.SIGTERM)

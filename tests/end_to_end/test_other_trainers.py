@@ -24,7 +24,7 @@ from gsbench.view.trials import find_trial, load_viewed
 from tests.datasets.server import serve
 from tests.end_to_end.conftest import program
 from tests.helpers import read_json, write
-from tests.processes import is_running
+from tests.processes import is_running, wait_until
 
 pytestmark = pytest.mark.slow
 
@@ -292,10 +292,7 @@ def test_another_program_ends_with_gsbench(hanging, signum):
     assert all(map(is_running, pids))
     os.kill(process.pid, signum)
     process.wait(60)
-    deadline = time.monotonic() + 30
-    while any(map(is_running, pids)) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert not any(map(is_running, pids))
+    wait_until(lambda: not any(map(is_running, pids)), 30)
 
 
 @pytest.mark.parametrize(
