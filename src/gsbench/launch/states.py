@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 import psutil
 from pydantic import Field
 
-from gsbench.analysis.results import Experiment, group_by, newest_code, read_experiment
+from gsbench.analysis.results import group_by, newest_code, read_experiment
 from gsbench.errors import InputError
 from gsbench.files import write_json
 from gsbench.parsing import Record, read_if_sound
@@ -86,12 +86,9 @@ class TrialState:
         return self.planned.words if self.planned else ()
 
 
-def states_of_experiment(home: Path, experiment: Experiment | None = None) -> list[TrialState]:
-    """The states of all trials of the experiment in ``home``, planned or with a folder.
-
-    ``experiment`` has its results (default: they are read).
-    """
-    experiment = experiment or read_experiment(home)
+def states_of_experiment(home: Path) -> list[TrialState]:
+    """The states of all trials of the experiment in ``home``, planned or with a folder."""
+    experiment = read_experiment(home)
     plan = experiment.history.planned
     begun = {
         path
