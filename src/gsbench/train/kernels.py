@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -27,6 +28,7 @@ def tiny_step(rasterizer: Rasterizer) -> Iterator[None]:
     Kernels for outputs that few densifiers request are compiled at their first call.
     """
     from gsbench.raster.cpu import CpuRasterizer
+    from gsbench.raster.cpu.statistics import add_view
     from gsbench.train.adam_cpu import CpuAdam
 
     initial = CASE.gaussians().map(Tensor.float)
@@ -35,6 +37,9 @@ def tiny_step(rasterizer: Rasterizer) -> Iterator[None]:
     loss, target = PhotometricLoss(threads=1), torch.zeros_like(image, dtype=torch.uint8)
     yield
     loss(image, target)[0].backward()
+    yield
+    radii, sums = np.zeros((2, 1), np.int32), np.zeros((3, 1), np.float32)
+    add_view(radii[0], sums[:2].reshape(1, 2), sums[2], radii[1], radii[1])
     yield
     if isinstance(rasterizer, CpuRasterizer):
         own = CpuRasterizer(threads=1)
