@@ -77,7 +77,7 @@ def imports_of(path, inside_functions=True, for_types=False):
     pending = [parsed(path)]
     while pending:
         node = pending.pop()
-        types_only = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+        types_only = isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING"
         if isinstance(node, ast.If) and types_only and not for_types:
             pending += node.orelse
             continue

@@ -176,6 +176,7 @@ def test_parts_that_fail_hang_or_are_killed_do_not_harm_other_parts(day):
     assert set(re.findall(r"(\S+): 0 after", said)) == set(faults)
 
 
+@pytest.mark.slow
 def test_a_killed_command_leaves_the_results_so_far_and_no_process(day):
     process = day.start("run", "300", faults={"train-adc": ("densify=adc ", "hang")})
     marker = day.state / "results/train-adc.out"
@@ -235,6 +236,7 @@ def test_the_commands_of_the_full_day_name_what_exists(tmp_path, monkeypatch):
     assert executor.SPLIT_BLOCKS == 0
 
 
+@pytest.mark.slow
 def test_a_table_of_two_commands(day):
     assert day.run("run", "45", faults={"bits": ("test_same_bits.py", "fail")})[0] == 1
     code, said = day.run("run", "60", "bits")  # a part by its name

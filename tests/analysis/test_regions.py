@@ -136,10 +136,17 @@ def test_too_few_seeds_and_other_views_are_refused():
         compare_regions(trials(rng, 3), other)
 
 
-@pytest.mark.parametrize("seeds", [3, 4])
 @pytest.mark.parametrize(
-    "noise",
-    [{}, {"common": 0.5}, {"of_view": 0.5}, {"smooth": True}, {"common": 0.2, "smooth": True}],
+    "seeds, noise",
+    [
+        (3, {"common": 0.2, "smooth": True}),
+        (4, {"of_view": 0.5}),
+        *(
+            pytest.param(seeds, noise, marks=pytest.mark.slow)
+            for seeds in (3, 4)
+            for noise in ({}, {"common": 0.5}, {"smooth": True})
+        ),
+    ],
     ids=str,
 )
 def test_trainings_of_one_arm_light_a_region_in_at_most_one_report_of_twenty(seeds, noise):

@@ -199,7 +199,7 @@ def test_equal_scenes_have_no_variance_between_them():
         estimate_components([np.array([1.0]), np.array([2.0])])
 
 
-@pytest.mark.parametrize("like_asked", [False, True])
+@pytest.mark.parametrize("like_asked", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_power_is_the_share_of_simulated_sweeps_that_see_the_difference(like_asked):
     rng = np.random.default_rng(1)
     design, effect, sweeps = Design(8, 3), 0.35, 4000

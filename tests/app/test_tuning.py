@@ -297,14 +297,12 @@ MISTAKES = [
     (FILE, f"{TUNE}.seed=one", "must list whole numbers"),
     (FILE, "scene.validation=true", "leave scene.validation out"),
     (FILE, "launch.wait=false", "launch.wait must be true"),
-    (FILE, "hydra/sweeper=basic", "gsbench's own sweeper alone"),
     (
         f"{FILE[: FILE.index('    tune')]}      - "
         f"{{densify: adc, densify.gradient_threshold: 0.1}}\n",
         "",
         "leave one of",
     ),
-    (FILE.replace("densify.stop", "densify.stpo"), "", "did you mean"),
     (FILE.replace("densify.stop", "scene.max_size"), "", "belongs to what all arms share"),
     (FILE.replace("densify.stop", "seed"), "", "belongs to what all arms share"),
     (FILE.replace(INTERVAL, "tag(log, interval(0, 1e-1))"), "", "an interval begins above 0"),

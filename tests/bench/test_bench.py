@@ -178,6 +178,7 @@ def test_a_gpu_is_for_rasterizers_that_need_one_and_for_a_users_own(monkeypatch)
         Stepper("triton", Setting("trained", 40, 30, 50))
 
 
+@pytest.mark.slow
 def test_whole_steps_do_not_change_the_scene(monkeypatch):
     threads = []
     monkeypatch.setattr(torch, "set_num_threads", threads.append)

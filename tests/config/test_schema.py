@@ -20,7 +20,7 @@ from gsbench.config.schema import check, plain, register_schemas
 from gsbench.runs.code import config_hash
 from gsbench.system.install import conf_dir
 from gsbench.train.options import STEPS
-from tests.helpers import refusal, table
+from tests.helpers import refusal, table, write
 
 GROUPS = ("scene", "init", "densify", "raster", "train", "eval", "tracking", "launch")
 
@@ -59,27 +59,35 @@ def checked(base, *words):
 
 
 PLACES = {option: ["init.path=/data/model.ply"] for option in ("ply", "points")}
-
-
 READER = ["scene._target_=mine.Reader", "allow_targets=[mine]"]
+OF_FOLDER = ("photos", "colmap", "transforms", "blender", "reader")
+
+
+def with_option(group, option):
+    """The values of a configuration with this option.
+
+    A composition takes long, so each shows an option of every group but ``train``.
+    """
+    if group == "train":
+        return composed(f"train={option}", *["densify=none"] * (option == "none"))[group]
+    row = options(group).index(option)
+    chosen = {one: options(one)[row % len(options(one))] for one in GROUPS} | {"train": "paper"}
+    more = ["scene.path=/data/capture"] * (chosen["scene"] != "courtyard")
+    more += PLACES.get(chosen["init"], []) + READER * (chosen["scene"] == "reader")
+    return composed(*(f"{one}={name}" for one, name in chosen.items()), *more)[group]
 
 
 @pytest.mark.parametrize(
     "group, option", [(group, option) for group in GROUPS for option in options(group)]
 )
 def test_every_option_composes(group, option):
-    extra = ["scene.path=/data/capture"] if group == "scene" and option != "courtyard" else []
-    extra += PLACES.get(option, []) + (READER if option == "reader" else [])
-    extra += ["densify=none"] if (group, option) == ("train", "none") else []
-    extra += ["train=paper"] if group == "densify" else []
-    values = composed(f"{group}={option}", *extra)
-    of_folder = ("photos", "colmap", "transforms", "blender", "reader")
-    assert values[group]["name"] == ("capture" if option in of_folder else option)
+    name = "capture" if group == "scene" and option in OF_FOLDER else option
+    assert with_option(group, option)["name"] == name
 
 
 @pytest.mark.parametrize("option", options("densify"))
 def test_every_densifier_can_be_built_and_shows_all_its_options(option):
-    values = composed(f"densify={option}", "train=paper")["densify"]
+    values = with_option("densify", option)
     densifier = build("densify", values, [])
     if dataclasses.is_dataclass(densifier):
         names = {field.name for field in dataclasses.fields(densifier) if field.init}
@@ -88,9 +96,8 @@ def test_every_densifier_can_be_built_and_shows_all_its_options(option):
 
 @pytest.mark.parametrize("option", options("init"))
 def test_every_initialiser_shows_all_its_options(option, tmp_path):
-    (tmp_path / "model.ply").write_text("ply\nend_header\n")
-    extra = [f"init.path={tmp_path / 'model.ply'}"] if option in ("ply", "points") else []
-    values = composed(f"init={option}", *extra)["init"]
+    model = write(tmp_path / "model.ply", "ply\nend_header\n")
+    values = with_option("init", option) | ({"path": str(model)} if option in PLACES else {})
     initializer = build("init", values, [])
     names = {field.name for field in dataclasses.fields(initializer) if field.init}
     assert names == set(values) - {"_target_", "name"}
@@ -144,7 +151,7 @@ def test_every_component_of_gsbench_checks_its_own_options():
     """`build` leaves the checks to them. A list of lists is wrong for every kind of option."""
     for group in ("init", "densify"):
         for option in options(group):
-            values = composed(f"{group}={option}", *PLACES.get(option, []))[group]
+            values = with_option(group, option)
             for key in values.keys() - {"_target_", "name"}:
                 with refusal(rf"{group}\.{key}"):
                     build(group, values | {key: [[None]]}, [])
@@ -251,6 +258,6 @@ def test_all_steps_of_the_schedule_are_scaled(words, scaled):
 
 
 @pytest.mark.parametrize("value", split("0 -1 x true"))
-def test_a_scale_that_is_no_number_above_zero_is_refused(value):
+def test_a_scale_that_is_no_number_above_zero_is_refused(base, value):
     with refusal(r"train\.steps_scaler must be"):
-        composed(f"train.steps_scaler={value}")
+        checked(base, f"train.steps_scaler={value}")

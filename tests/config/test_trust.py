@@ -5,22 +5,26 @@ makes a folder.
 """
 
 import importlib.util
+import re
+from copy import deepcopy
 from itertools import product
 from pathlib import Path
 from shlex import split
 
 import pytest
+from omegaconf import OmegaConf
 
 from gsbench import cli
 from gsbench.app.command import compose_trials
 from gsbench.config.build import build
 from gsbench.config.command_words import typed_permissions
-from gsbench.config.compose import compose_one
+from gsbench.config.compose import Trial, check_permitted, compose_one, composed_once
+from gsbench.config.schema import check, plain
 from gsbench.config.trust import ALLOWED, foreign_variables, load_class
 from gsbench.runs.code import module_digest
 from gsbench.system.programs import allow_modules
 from tests.helpers import refusal, table, write
-from tests.strange import BOMB, ask, experiment
+from tests.strange import BOMB, ask, experiment, nested
 from tests.strange import place as place
 
 pytestmark = pytest.mark.usefixtures("place")
@@ -37,11 +41,32 @@ MODES = {
 
 
 SOME = ("a callback", "made of a text", "a module of a package", "logging", "a launcher")
+# those that take more than a look at the configuration, or of which Hydra makes another one
+WHOLE = [case for case, (own, _) in STRANGE.items() if {"defaults", "hydra", "hydra.mode"} & {*own}]
+WHOLE += ["help", "a line break in a name"]
+
+
+@pytest.mark.parametrize("case", [case for case in STRANGE if case not in WHOLE])
+def test_code_in_a_configuration_is_refused(case):
+    """All cases stand in one composition, as a file of an experiment changes it."""
+    settings, said = STRANGE[case]
+    config = deepcopy(composed_once(()))
+    OmegaConf.set_struct(config, False)
+    config.merge_with(nested(settings))
+    with refusal(re.escape(said)):
+        check_permitted(config, [])
+        Trial(check(plain(config)), ())
+    assert not Path("exploded").exists()
 
 
 @pytest.mark.parametrize(
     "case, mode",
-    [*((case, "run") for case in STRANGE), *product(SOME, ["dry run", "question", "info"])],
+    [
+        *product(WHOLE, ["run"]),
+        *product(SOME, ["run", "question"]),
+        (SOME[0], "dry run"),
+        (SOME[0], "info"),
+    ],
 )
 def test_code_that_a_file_names_is_not_run(case, mode, capsys, monkeypatch):
     settings, said = STRANGE[case]
@@ -52,8 +77,7 @@ def test_code_that_a_file_names_is_not_run(case, mode, capsys, monkeypatch):
 JOBS = table(__file__, "jobs")
 
 
-@pytest.mark.parametrize("place_of_words", ["params", "grids"])
-@pytest.mark.parametrize("launcher", ["gsbench", "basic"])
+@pytest.mark.parametrize("launcher, place_of_words", [("gsbench", "params"), ("basic", "grids")])
 @pytest.mark.parametrize("case", JOBS)
 def test_code_that_only_jobs_of_a_sweep_name_is_not_run(
     case, launcher, place_of_words, capsys, monkeypatch

@@ -16,6 +16,7 @@ def test_every_arm_has_a_row():
 
 
 @pytest.mark.parametrize("arm", fidelity.ARMS)
+@pytest.mark.slow
 def test_the_largest_difference_is_no_larger_than_stated(arm):
     """It is not much smaller, either; another processor rounds differently."""
     stated, found = float(fidelity.ARMS[arm].difference), fidelity.measured(arm)

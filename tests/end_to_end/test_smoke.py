@@ -15,6 +15,7 @@ import yaml
 from numpy.testing import assert_array_equal
 from PIL import Image
 
+from gsbench.cli import run
 from gsbench.raster import create_rasterizer
 from gsbench.view.trials import find_trial, load_viewed
 from tests.conftest import ROOT
@@ -94,9 +95,10 @@ def test_the_viewer_draws_a_test_view_as_the_evaluation_did(finished_runs):
                 assert_array_equal(Image.open(trial / folder / view.name), picture)
 
 
-def test_the_same_command_again_computes_nothing(gsbench, runs):
+def test_the_same_command_again_computes_nothing(said, runs, monkeypatch):
+    monkeypatch.setenv("GSBENCH_RUNS", str(runs))
     written = [path.stat().st_mtime_ns for path in sorted(runs.rglob("results.json"))]
-    gsbench(*FINISHED_SWEEP)
+    said(*FINISHED_SWEEP)
     assert [path.stat().st_mtime_ns for path in sorted(runs.rglob("results.json"))] == written
 
 
@@ -109,7 +111,7 @@ def test_tables_and_report(said, runs, monkeypatch):
     assert "data:image/" in page
 
 
-def test_a_killed_trial_continues_to_the_same_bits(gsbench, runs, tmp_path):
+def test_a_killed_trial_continues_to_the_same_bits(gsbench, runs, tmp_path, monkeypatch, capsys):
     (tmp_path / "mortal.py").write_text(MORTAL)
     own = split(
         "densify=adc densify._target_=mortal.Mortal densify.name=mortal allow_targets=[mortal]"
@@ -117,14 +119,17 @@ def test_a_killed_trial_continues_to_the_same_bits(gsbench, runs, tmp_path):
     command = [*SMALL, "name=killed", "tracking=none", *own]
     gsbench(*command, code=-9)
     assert not trials_of(runs, "killed")
-    resumed = gsbench(*command)
-    assert "iteration 120" in resumed.stderr  # the checkpoint from which it continues
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("GSBENCH_RUNS", str(runs))
+    assert run(command) == 0
+    assert "iteration 120" in capsys.readouterr().err  # the checkpoint from which it continues
     (trial,) = trials_of(runs, "killed").values()
     whole = trials_of(runs)["adc-0"]
     for name in ("point_cloud.ply", "per_view.csv", "renders/0000.png"):
         assert (trial / name).read_bytes() == (whole / name).read_bytes()
 
 
+@pytest.mark.slow
 def test_the_densifier_in_the_readme_has_its_effect(gsbench, runs, tmp_path):
     (code,) = re.findall(
         r"```python\n(# mine\.py\n.*?)```", (ROOT / "README.md").read_text(), re.DOTALL
@@ -196,8 +201,9 @@ def test_questions_of_a_file_and_their_archive(gsbench, runs, tmp_path):
     assert not (tmp_path / "elsewhere").exists()
 
 
-def test_a_mirror_in_mlflow(gsbench, runs):
-    gsbench("sync", FINISHED)
+def test_a_mirror_in_mlflow(said, runs, monkeypatch):
+    monkeypatch.setenv("GSBENCH_RUNS", str(runs))
+    said("sync", FINISHED)
     wanted = [
         read_json(trial / "results.json")["metrics"]["psnr"] for trial in trials_of(runs).values()
     ]

@@ -21,6 +21,14 @@ from tests.init.test_report import CENTERS, NAMES, model_of
 ROOT = Path(__file__).resolve().parents[2]
 
 
+@pytest.fixture
+def in_process(monkeypatch):
+    """Compute models in this process; the tests without this fixture start another."""
+    monkeypatch.setattr(
+        "gsbench.init.placed.run_isolated", lambda build, *given, what: build(*given)
+    )
+
+
 def add_points(model_dir, target, count):
     """A copy of the model with points that the first three images see."""
     model = pycolmap.Reconstruction(model_dir)
@@ -47,7 +55,7 @@ def test_dataset_keeps_the_cloud_of_the_model(courtyard, tmp_path):
     assert any("only 20 points" in odd.line for odd in report.oddities)
 
 
-def test_the_dataset_s_points_may_come_from_training_views_alone(courtyard, tmp_path):
+def test_the_dataset_s_points_may_come_from_training_views_alone(courtyard, tmp_path, in_process):
     """The first of the three images that see all points is a test view."""
     add_points(courtyard.model, tmp_path / "model", 20)
     capture, out = replace(courtyard, model=tmp_path / "model"), tmp_path / "out"
@@ -84,7 +92,7 @@ def test_the_example_carved_keeps_points_in_view_of_enough_cameras(courtyard, se
     assert 0 < len(expected) < 300
 
 
-def test_dataset_needs_points_and_a_model(courtyard, bare_photos, tmp_path):
+def test_dataset_needs_points_and_a_model(courtyard, bare_photos, tmp_path, in_process):
     with refusal("has no points: use init=sfm"):
         Dataset().run(courtyard, tmp_path)
     for made in (Dataset(), Random()):
@@ -122,7 +130,9 @@ def test_reading_a_cloud_without_a_model_is_refused(tmp_path):
         read_cloud(tmp_path)
 
 
-def test_a_trained_model_becomes_points_and_is_copied_unchanged(courtyard, tmp_path, caplog):
+def test_a_trained_model_becomes_points_and_is_copied_unchanged(
+    courtyard, tmp_path, caplog, in_process
+):
     gaussians = random_gaussians(20, dtype=torch.float32)
     gaussians.opacity_logits[0] = torch.inf
     write_ply(gaussians, tmp_path / "model.ply")

@@ -95,7 +95,7 @@ def test_lightglue_matches_enough_points(few, untrained_weights, tmp_path, caplo
 # ---- undocumented behaviour of transformers and kornia on which the code relies
 
 
-@pytest.mark.parametrize("width, height", [(128, 96), (1237, 40), (131, 101)])
+@pytest.mark.parametrize("width, height", [(128, 96), (331, 41)])
 def test_superpoint_keypoints_are_the_maxima_of_its_score_map(untrained_weights, width, height):
     settings = superpoint(untrained_weights, max_keypoints=10**6).extraction
     weights = untrained_weights / "superpoint.safetensors"

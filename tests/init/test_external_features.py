@@ -53,6 +53,7 @@ def own_path(bare_photos, tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_sift_through_the_external_path_gives_the_same_model(own_path, bare_photos, tmp_path):
     own, external = own_path, tmp_path / "external.db"
     rewritten(own, external, bare_photos)

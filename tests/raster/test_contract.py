@@ -49,6 +49,9 @@ def rasterizer(request, device):
     return create_rasterizer(name, torch.device(device), threads=2)
 
 
+@pytest.mark.parametrize(
+    "device", [name for name in _available() if name != "reference"], indirect=True
+)
 @pytest.mark.parametrize("case", CASES, ids=str)
 def test_values_and_gradients_match_the_reference(rasterizer, device, case):
     """Tests in ``test_executors.py`` show that `departures` finds each kind of departure."""

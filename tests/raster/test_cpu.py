@@ -380,4 +380,5 @@ def test_statistics_of_a_view_are_those_of_torch_for_visible_gaussians_alone():
     statistics.add_view(*(tensor.numpy() for tensor in (radii, gradient, *found)))
     # torch rounds the second square, too, where the processor has no fused instruction
     assert_allclose(found[0], expected[0], rtol=2.4e-7)
-    assert torch.equal(found[1], expected[1]) and torch.equal(found[2], expected[2])
+    assert torch.equal(found[1], expected[1])
+    assert torch.equal(found[2], expected[2])

@@ -121,17 +121,19 @@ def test_gradients_match_finite_differences(degree):
         if name == "sh_rest" and degree == 0:
             assert tensor.grad is None
             continue
-        numeric = torch.zeros_like(tensor)
+        positions = list(np.ndindex(*tensor.shape))[:: 7 if name == "sh_rest" else 1]
+        numeric = torch.zeros(len(positions), dtype=torch.float64)
         with torch.no_grad():
-            for position in np.ndindex(*tensor.shape):
+            for number, position in enumerate(positions):
                 shifted = []
                 for sign in (1, -1):
                     moved = gaussians.map(torch.clone)
                     getattr(moved, name)[position] += sign * epsilon
                     shifted.append(loss(moved))
-                numeric[position] = (shifted[0] - shifted[1]) / (2 * epsilon)
+                numeric[number] = (shifted[0] - shifted[1]) / (2 * epsilon)
         assert numeric.abs().max() > 0
-        assert_close(tensor.grad, numeric, atol=2e-6, rtol=2e-4, msg=lambda m, n=name: f"{n}: {m}")
+        found = torch.stack([tensor.grad[position] for position in positions])
+        assert_close(found, numeric, atol=2e-6, rtol=2e-4, msg=lambda m, n=name: f"{n}: {m}")
 
 
 def test_screen_gradient_is_the_gradient_of_the_projected_mean_in_ndc():

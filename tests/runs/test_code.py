@@ -179,6 +179,7 @@ def test_the_digest_of_a_package_is_the_recorded_one(tmp_path, monkeypatch):
     assert found == {"one.py": "8955de80759662ec", "pack": "7d79c895ac4d3f58"}
 
 
+@pytest.mark.slow
 def test_released_code_adds_nothing_to_keys(package, tmp_path, monkeypatch):
     # before the first release
     assert edited(states_of(CODE_OF_STAGE["train"])) == states_of(CODE_OF_STAGE["train"])

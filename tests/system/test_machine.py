@@ -117,7 +117,7 @@ def test_kernels_are_for_the_processor_and_its_level(monkeypatch):
 def test_numba_reads_no_settings_of_the_current_folder(tmp_path):
     (tmp_path / ".numba_config.yaml").write_text("disable_jit: 1\nopt: 0\n")
     code = (
-        "import gsbench.raster.cpu\nfrom numba.core import config\nconfig.reload_config()\n"
+        "import gsbench.system.jit\nfrom numba.core import config\nconfig.reload_config()\n"
         "print(config.DISABLE_JIT, int(config.OPT))"
     )
     asked = completed([sys.executable, "-c", code], cwd=tmp_path)

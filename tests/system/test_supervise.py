@@ -56,10 +56,14 @@ def is_gone(mark):
 
 
 @pytest.mark.parametrize(
-    "code", ["import time; time.sleep(600)", SIGNALS, FORKS], ids=["sleeps", "heeds none", "forks"]
-)
-@pytest.mark.parametrize(
-    "end", ["", "raise SystemExit(3)", "os.kill(os.getpid(), 9)", "time.sleep(600)"]
+    "end, code",
+    [
+        ("", SIGNALS),
+        ("raise SystemExit(3)", "import time; time.sleep(600)"),
+        ("os.kill(os.getpid(), 9)", FORKS),
+        ("time.sleep(600)", SIGNALS),
+    ],
+    ids=["ends", "fails", "is killed", "takes too long"],
 )
 def test_a_daemon_of_a_trainer_ends_with_it(tmp_path, end, code):
     program = f"{DAEMON}\ndaemon('mark', {code!r})\n{end}"

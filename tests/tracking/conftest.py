@@ -12,10 +12,19 @@ from gsbench.tracking import connect, ensure_experiment
 from tests.tracking.helpers import free_port
 
 
+@pytest.fixture(scope="session")
+def database(tmp_path_factory):
+    """An empty database, for tests to copy: making one takes MLflow seconds."""
+    folder = tmp_path_factory.mktemp("database")
+    connect(None, folder)
+    return folder / "mlflow.db"
+
+
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory):
-    """A runs folder with a database; making one takes MLflow seconds."""
+def runs(database, tmp_path_factory):
+    """A runs folder with a database."""
     folder = tmp_path_factory.mktemp("runs")
+    shutil.copy(database, folder)
     ensure_experiment(connect(None, folder), "tracked", folder)
     return folder
 

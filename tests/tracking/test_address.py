@@ -1,6 +1,7 @@
 """A tracker that a stranger's file names gets nothing unless the user types its address."""
 
 import os
+import shutil
 import sqlite3
 import struct
 from contextlib import closing
@@ -65,10 +66,11 @@ def test_sync_leaves_out_a_trial_whose_configuration_lacks_a_group(
     assert said.err == ""
 
 
-def test_a_link_among_the_artifacts_is_not_followed(tmp_path):
+def test_a_link_among_the_artifacts_is_not_followed(tmp_path, database):
     runs, private = tmp_path / "runs", tmp_path / "private"
     private.write_text("secret")
     folder, values = ended_trial(runs, name="theirs")
+    shutil.copy(database, runs)
     client = connect(None, runs)
     mirror_trial(options(), folder, values)
     (made,) = found_runs(client, "theirs")
@@ -92,20 +94,20 @@ def journal_naming(other, pages):
     return head.ljust(512, b"\0") + end + magic
 
 
-@pytest.mark.parametrize("command", [["sync", "theirs"], ["ui"]])
-def test_a_journal_of_a_database_deletes_no_file(command, tmp_path, monkeypatch, capfd):
+def test_a_journal_of_a_database_deletes_no_file(tmp_path, database, monkeypatch, capfd):
     runs, private = tmp_path / "runs", write(tmp_path / "private", "secret")
     ended_trial(runs, name="theirs")
-    connect(None, runs)
+    shutil.copy(database, runs)
     database = runs / "mlflow.db"
     journal = journal_naming(private, database.stat().st_size // 4096)
     write(runs / "mlflow.db-journal", journal)
     monkeypatch.setenv("GSBENCH_RUNS", str(runs))
     monkeypatch.delenv(VARIABLE, raising=False)
     monkeypatch.setattr("gsbench.verbs.servers.subprocess.Popen", None)
-    assert run(command) in (1, 2)
-    assert "mlflow.db-journal would delete another file: remove it" in capfd.readouterr().err
-    assert private.exists()
+    for command in (["sync", "theirs"], ["ui"]):
+        assert run(command) in (1, 2)
+        assert "mlflow.db-journal would delete another file: remove it" in capfd.readouterr().err
+        assert private.exists()
     # The journal is what SQLite takes for one.
     with closing(sqlite3.connect(database)) as connection:
         connection.execute("SELECT * FROM experiments")

@@ -51,7 +51,13 @@ def test_numbers_without_a_gradient_yet_keep_their_bits(active):
         assert torch.equal(one, other)
 
 
-@pytest.mark.parametrize("kind", ["none", "volumetric", *STATEFUL])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        *("none", "volumetric", "mcmc"),
+        *(pytest.param(kind, marks=pytest.mark.slow) for kind in STATEFUL if kind != "mcmc"),
+    ],
+)
 def test_a_fused_training_has_the_bits_of_one_by_autograd(kind, lab, monkeypatch):
     more = {"none": NoDensifier, "volumetric": lambda: small(Volumetric, volume_threshold=0.01)}
     make, calls = (more | STATEFUL)[kind], []

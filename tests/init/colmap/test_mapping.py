@@ -92,6 +92,7 @@ def test_a_small_baseline_without_a_focal_length_is_placed_by_another_strategy(t
     assert camera.mean_focal_length() == pytest.approx(FOCAL, rel=0.2)
 
 
+@pytest.mark.slow
 def test_the_global_mapper_places_all_images(tmp_path):
     database, _ = small_baseline(tmp_path)
     result = mapped(database, "global")

@@ -68,7 +68,8 @@ def read_matches(database):
     }
 
 
-@pytest.mark.parametrize("processes", [pytest.param(1, marks=pytest.mark.slow), 3])
+@pytest.mark.parametrize("processes", [1, 3])
+@pytest.mark.slow
 def test_matches_equal_those_of_colmap_on_one_thread(features, tmp_path, processes):
     database, pairs = features
     shutil.copy(database, tmp_path / "colmap.db")
