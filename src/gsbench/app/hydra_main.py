@@ -9,7 +9,7 @@ import os
 import secrets
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, redirect_stderr
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -30,6 +30,7 @@ from gsbench.system.install import conf_dir
 FOLDER = ".hydra"  # below the runs folder
 HYDRAS_FILES = ("run", "sweep", "output_subdir")  # settings of Hydra's own files
 SWEEP_DIR = "hydra.sweep.dir"
+HYDRAS_LINE = "Error executing job with overrides"
 # Within this context, Hydra 1.4 and later instantiates only the named classes (``mine.*``: all of a
 # module).
 WHITELIST: Callable[[Sequence[str]], AbstractContextManager[Any]] = getattr(
@@ -116,7 +117,21 @@ def run_main(
         # else Hydra prints errors and ends the process
         patch.dict(os.environ, HYDRA_FULL_ERROR="1"),
         WHITELIST([*ALLOWED["callbacks"], *names, *(f"{name}.*" for name in names)]),
+        redirect_stderr(_WithoutHydrasLine(sys.stderr)),
         hydra_config(None),
         patch.object(sys, "argv", ["gsbench", *argv]),
     ):
         hydra.main(**VERSION_BASE, config_path=str(conf_dir()), config_name=CONFIG_NAME)(task)()
+
+
+class _WithoutHydrasLine:
+    """Standard error without Hydra's line about a job's error, which gsbench prints itself."""
+
+    def __init__(self, stream: Any) -> None:
+        self._stream = stream
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        return len(text) if text.startswith(HYDRAS_LINE) else int(self._stream.write(text))
