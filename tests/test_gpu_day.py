@@ -66,7 +66,7 @@ elif "gsbench.cli" in words:
                    "seconds": {{"train": 99.5}}}}, file)
 """
 
-LISTS = "trained", "skewed", "crowded"  # the scenes in which long lists are split, and are not
+LISTS = "trained", "crowded"  # the scenes in which long lists are split, and are not
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs bash, /proc and Triton")
 
@@ -251,7 +251,7 @@ def test_a_table_of_two_commands(day):
     )
     assert re.search(r"^- bits: yes, \d+ s; 3 passed in 1.2s$", said, re.MULTILINE)
     assert "| triton-3 | triton | 3 | 16x16 | - | - | - | - | 1.25 | - | - | - |" in said
-    assert "| triton-skewed-whole | triton | 3 |" in said
+    assert "| triton-crowded-whole | triton | 3 |" in said
     assert "| adc | recorded | 0 | 15 | 0.06 |" in said
     trained = "| train-volumetric_once | 30000 | 12345 | 1 | 99.5 | - | 31.543 | 0 | - | - | - |"
     assert trained in said

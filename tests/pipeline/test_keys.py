@@ -29,7 +29,7 @@ BARE = Capture(
     "garden", Path("photos"), ("a.jpg", "b.jpg", "c.jpg"), ("a.jpg",), None, False, "0" * 64
 )
 KEYS = [
-    ("config", "efb880968c80cdd904651c24a9fa44e607e6283f150f6dbad8f47651f0e9d49f"),
+    ("config", "177cdb1aaf377584e0f70d97bd25879384fd4303465d302ada6f34fc71f1ee15"),
     # of the reference cameras
     ("init", "991c126deb4c8459394f2310586bfbb26251e999e306344a946a5826c7fb07d9"),
     ("init", "be87afd1f24decd7478d620990cb56e1cc80f616bd5045809f5a0ed92ef3a68a"),

@@ -107,7 +107,7 @@ def _pair_up(
 
 
 # settings of an evaluation that renders of another program do not use
-WITHOUT_EFFECT = ("eval.at", "eval.maps", "eval.fps", "eval.controls", "eval.regions")
+WITHOUT_EFFECT = ("eval.at", "eval.controls", "eval.regions")
 
 
 def _asked_metric(options: argparse.Namespace) -> str:

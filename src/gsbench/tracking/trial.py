@@ -211,8 +211,6 @@ class TrackedTrial:
         tags |= {f"hash_{key}": value for key, value in results.hashes.items()}
         names = (*FILES, layout.POINT_CLOUD) if with_model else FILES
         files = self.files(names)
-        for path in self.folder.pictures(layout.FIGURES)[:images]:
-            files[f"{layout.FIGURES}/{path.name}"] = path
         pictures = [
             Picture(key, pixels, step, seconds) for key, pixels in self._pictures(images).items()
         ]
