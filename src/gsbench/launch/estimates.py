@@ -191,7 +191,7 @@ def picture_size(scene: Mapping[str, Any]) -> tuple[int, int] | None:
         size = scene["width"], scene["height"]
     if size is None:
         return None
-    return downscaled_size(*size, scene.get("downscale") or 1, scene.get("max_size"))
+    return downscaled_size(*size, scene.get("max_size"))
 
 
 @cache
