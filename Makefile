@@ -83,7 +83,7 @@ lock: $(VENV)/.stamp-run ## bring uv.lock to the versions of constraints.txt
 $(VENV)/.stamp-run: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "gsbench needs Python 3.11 or newer: make PYTHON=python3.12 ...")'
 	@echo making the environment $(VENV)
-	@$(PYTHON) -m venv $(VENV)
+	@$(PYTHON) -m venv --without-pip $(VENV)
 	@$(INSTALL) -e .
 	@touch $@
 

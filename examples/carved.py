@@ -13,7 +13,6 @@ from pydantic import PositiveInt
 from gsbench.errors import InputError
 from gsbench.init import Random
 from gsbench.init.base import PointCloud
-from gsbench.init.placed import points_in_view
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,7 +27,7 @@ class Carved(Random):
         cloud = super().cloud(capture, model)
         cameras = np.zeros(self.count, dtype=np.int64)  # [P] that have each point in view
         for name in capture.train_names:
-            cameras[points_in_view(cloud.points, name, model)[0]] += 1
+            cameras[in_view(cloud.points, name, model)] += 1
         kept = cameras >= self.seen_by
         if not kept.any():
             raise InputError(
@@ -36,3 +35,15 @@ class Carved(Random):
                 "cameras: take a smaller init.size"
             )
         return PointCloud(cloud.points[kept], cloud.colors[kept])
+
+
+def in_view(points, name, model):
+    """The indices of the ``points`` [P, 3] in view of the image ``name``; occlusion is ignored."""
+    image = model.find_image_with_name(name)
+    if image is None or not image.has_pose:
+        return np.empty(0, np.int64)
+    camera = model.cameras[image.camera_id]
+    pixels = np.asarray(camera.img_from_cam(image.cam_from_world() * points))  # NaN behind it
+    with np.errstate(invalid="ignore"):
+        inside = (pixels >= 0) & (pixels < (camera.width, camera.height))
+    return np.nonzero(inside.all(axis=1))[0]

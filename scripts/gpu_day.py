@@ -118,7 +118,7 @@ def plan() -> list[Row]:
         *(Row([bench(f"triton-{n}", "triton", n)], 75 / len(COUNTS), True) for n in COUNTS),
         *(
             Row([bench_of_lists(scene, split=split)], 10, True)
-            for scene in ("trained", "skewed", "crowded")
+            for scene in ("trained", "crowded")
             for split in (True, False)
         ),
         Row([faster_gs("bench-faster_gs", "triton", *COUNTS)], 30, True),

@@ -5,17 +5,22 @@
 The arguments are those of ``pip install``. uv reads none of pip's settings, so those that say where
 packages lie are passed to it. If uv cannot be installed, or fails, pip installs. Neither compiles
 modules to byte code: Python does that for the modules that are used.
+
+The environment needs no pip: uv brings it along, ten times as quick as ``venv`` does.
 """
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
-PIP = [sys.executable, "-m", "pip", "--disable-pip-version-check"]
+OWN_PIP = [sys.executable, "-m", "pip", "--disable-pip-version-check"]
+BASE = getattr(sys, "_base_executable", sys.executable)  # it made this environment
+BASE_PIP = [BASE, *OWN_PIP[1:], "--python", sys.executable]
 CONSTRAINTS = ["-c", str(Path(__file__).resolve().parents[1] / "constraints.txt")]
 # Settings of pip, and the variables with the same meaning for uv.
 PASSED_SETTINGS = {
@@ -28,13 +33,14 @@ PASSED_SETTINGS = {
 
 def main(words: list[str]) -> int:
     """Install the packages that ``words`` name; returns the exit code of the last program."""
-    what = " ".join(words)
-    uv = find_uv()
+    what, pip = " ".join(words), find_pip()
+    uv = find_uv(pip)
     if uv is not None:
         print(f"installing {what} by uv", flush=True)
         # unsafe-best-match: like pip, the best version of all indexes, not only of the first that
         # has the package.
-        environment = {"UV_INDEX_STRATEGY": "unsafe-best-match"} | uv_settings() | dict(os.environ)
+        strategy = {"UV_INDEX_STRATEGY": "unsafe-best-match"}
+        environment = strategy | uv_settings(pip) | dict(os.environ)
         command = [
             uv,
             "pip",
@@ -43,34 +49,49 @@ def main(words: list[str]) -> int:
             "--python",
             sys.executable,
             *CONSTRAINTS,
+            *([] if pip == OWN_PIP else ["pip"]),
             *words,
         ]
         if subprocess.run(command, env=environment, check=False).returncode == 0:
             return 0
     print(f"installing {what} by pip, some minutes", flush=True)
-    install = [*PIP, "install", "--quiet", "--no-compile"]
-    subprocess.run([*install, "pip>=25.1"], check=False)  # 25.1 is the first version with --group
-    return subprocess.run([*install, *CONSTRAINTS, *words], check=False).returncode
+    install = ["install", "--quiet", "--no-compile"]
+    # 25.1 is the first version with --group
+    subprocess.run([*pip, *install, "pip>=25.1"], check=False)
+    return subprocess.run([*OWN_PIP, *install, *CONSTRAINTS, *words], check=False).returncode
 
 
-def find_uv() -> str | None:
+def find_pip() -> list[str]:
+    """The command of a pip that installs here: this environment's, else its base's.
+
+    If neither is there, this environment gets the one that Python brings along.
+    """
+    if importlib.util.find_spec("pip"):
+        return OWN_PIP
+    if subprocess.run([*BASE_PIP, "--version"], capture_output=True, check=False).returncode == 0:
+        return BASE_PIP
+    subprocess.run([sys.executable, "-m", "ensurepip"], stdout=subprocess.DEVNULL, check=False)
+    return OWN_PIP
+
+
+def find_uv(pip: list[str]) -> str | None:
     """The program uv on the PATH or in this environment; None if pip cannot install it here."""
     own = Path(sys.executable).with_name("uv")
     if found := shutil.which("uv") or shutil.which(own):
         return found
     subprocess.run(
-        [*PIP, "install", "--quiet", *CONSTRAINTS, "uv"], stderr=subprocess.DEVNULL, check=False
+        [*pip, "install", "--quiet", *CONSTRAINTS, "uv"], stderr=subprocess.DEVNULL, check=False
     )
     return shutil.which(own)
 
 
-def uv_settings() -> dict[str, str]:
+def uv_settings(pip: list[str]) -> dict[str, str]:
     """The variables for uv with the values of pip's settings.
 
     If pip lists a setting twice, the later one counts.
     """
     listing = subprocess.run(
-        [*PIP, "config", "list"], capture_output=True, text=True, check=False
+        [*pip, "config", "list"], capture_output=True, text=True, check=False
     ).stdout
     variables = {}
     for line in listing.splitlines():

@@ -19,7 +19,7 @@ def test_indexes_of_pips_settings_are_passed_to_uv(install, monkeypatch):
         "run",
         lambda *_, **__: subprocess.CompletedProcess([], 0, stdout=listed),
     )
-    assert install.uv_settings() == {
+    assert install.uv_settings(["pip"]) == {
         "UV_DEFAULT_INDEX": "https://a.org/simple",
         "UV_INDEX": "https://b.org",
     }
@@ -33,8 +33,24 @@ def test_pip_installs_if_uv_is_missing_or_fails(install, monkeypatch, uv, code, 
         ran.append(command)
         return subprocess.CompletedProcess(command, code if command[0] == "uv" else 0, stdout="")
 
-    monkeypatch.setattr(install, "find_uv", lambda: uv)
+    monkeypatch.setattr(install, "find_uv", lambda pip: uv)
     monkeypatch.setattr(install.subprocess, "run", run)
     assert install.main(["-e", "."]) == 0
     assert ran[-1][-2:] == ["-e", "."]
     assert (ran[-1][0] == "uv") == (last == "uv")
+
+
+@pytest.mark.parametrize("base_fails, used", [(0, "BASE_PIP"), (1, "OWN_PIP")])
+def test_an_environment_without_pip_uses_that_of_its_base_else_makes_one(
+    install, monkeypatch, base_fails, used
+):
+    ran = []
+
+    def run(command, **_):
+        ran.append(command)
+        return subprocess.CompletedProcess(command, base_fails)
+
+    monkeypatch.setattr(install.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(install.subprocess, "run", run)
+    assert install.find_pip() == getattr(install, used)
+    assert ("ensurepip" in ran[-1]) == bool(base_fails)

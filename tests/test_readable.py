@@ -85,7 +85,7 @@ def test_the_counts_of_a_refinement_explain_the_number_after_it():
     assert not {"step", "before", "after", "target", "volume_threshold"} & set(counts)
 
 
-def test_causes_have_fixed_numbers_and_colours_apart():
+def test_causes_have_fixed_numbers():
     assert {cause.key: int(cause) for cause in Cause} == {
         "initial": 0,
         "clone": 1,
@@ -94,6 +94,3 @@ def test_causes_have_fixed_numbers_and_colours_apart():
         "relocated": 4,
         "added": 5,
     }
-    assert Cause(3).words == "split by volume"
-    assert len({cause.color for cause in Cause}) == len(Cause)
-    assert Cause.INITIAL.color == (240, 228, 66)  # yellow of Okabe and Ito

@@ -119,7 +119,6 @@ def test_unknown_keys_name_the_nearest():
         (lambda: Sfm(peak_threshold=-1), "init.peak_threshold"),
         (lambda: Sfm(seed=2**31), "init.seed"),
         (lambda: Dim(extractor="sift"), "init.extractor"),
-        (lambda: Dim(extractor="aliked", aliked_model="t16"), "init.aliked_model"),
         (lambda: Random(count=0), "init.count"),
     ],
 )

@@ -112,7 +112,7 @@ def test_errors_of_a_separate_process_are_one_line(place):
         "launch=slurm 'launch.sbatch={constraint: a100}'",
         "launch=slurm launch.sbatch.constraint=a100",
         "train.iterations=1e3 densify.max_gaussians=1e5",
-        "scene.downscale=4 scene.max_size=100",
+        "scene.max_size=1e2",
         "'name=\"größe\"'",
         "~densify.cap",
     ],
@@ -162,7 +162,7 @@ def test_any_value_of_any_setting_is_kept_or_refused_in_one_line(key, value):
 # ---- valid configurations keep their hashes: a changed hash is a trial that is computed again
 
 HASHES = {
-    (): "5d22c1eb5b01c596bf63f3ceb611993fb93c1bcf46321749d4d28c8441057b03",
+    (): "a64faf660ca84eeccad2d13a7d5a6bcc8947a2206594bda1174054b9c349cd95",
     (
         "scene=photos",
         "scene.path=/data/p",
@@ -170,7 +170,7 @@ HASHES = {
         "densify=adc",
         "train=paper",
         "eval=standard",
-    ): "3161888b01db31858824b804afcfb73d9c6eebca194e8276ecf9ecc14dae0fad",
+    ): "64fdc0b018e1e48c0e015ad3fd912cd32e041a2e32e9cf7f61911eeeaf564805",
     (
         "train.opacity=1",
         "train.max_seconds=60",
@@ -179,15 +179,15 @@ HASHES = {
         "eval.lpips=[vgg]",
         "train.volume_histogram=[]",
         "init.peak_threshold=1",
-    ): "055d6dd09c551427b427de86a7da6b93202a6ab8289dc64c7d17bd18f4b134b8",
+    ): "1f84de8e89b47dbce433dee9fde65437881389394a4200b91d65cc42ede78122",
     (
         "densify=mcmc",
         "init=random",
         "densify.max_gaussians=1e5",
-        "scene.downscale=2",
+        "scene.max_size=200",
         "launch=local",
         "tracking=none",
-    ): "9cf12f152de05c002f1bcb5729ff5265d6c8a6ece7083aac0a668483e5a7fd38",
+    ): "637513ecffc735ab96f7cc846695200373377ba6b42b50217110717ebb0b7f93",
     (
         "scene.name=2024",
         "scene.train_list=a.txt",
@@ -195,7 +195,7 @@ HASHES = {
         "threads=3",
         "seed=7",
         "densify.name=0.5",
-    ): "80462abdd59134af2ff9adb5757f51c6321ac79306a26a0e6b666808daa2a783",
+    ): "aa84c2affe617402bce425b4a0054f0c19f3c3fd6ba2223a50d169007783be87",
 }
 
 

@@ -38,6 +38,8 @@ def main() -> None:
     open_streams()
     with printable_output():
         code = run(sys.argv[1:])
+    # Python would look through all of them once more at its end: a second after kernels compiled.
+    gc.freeze()
     sys.exit(code)
 
 

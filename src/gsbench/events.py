@@ -12,28 +12,14 @@ from gsbench.words import FORM
 
 
 class Cause(IntEnum):
-    """Cause of a Gaussian's existence.
+    """Cause of a Gaussian's existence, by its number in ``lineage.npz``."""
 
-    A cause has a number in ``lineage.npz``, words, and a colour (r, g, b) for pictures. The colours
-    are from Okabe and Ito (2008), so that colour-blind people can distinguish them.
-    """
-
-    words: str
-    color: tuple[int, int, int]
-
-    INITIAL = 0, "initial", (240, 228, 66)
-    CLONE = 1, "clone", (86, 180, 233)
-    SPLIT_GRADIENT = 2, "split by gradient", (230, 159, 0)
-    SPLIT_VOLUME = 3, "split by volume", (204, 121, 167)
-    RELOCATED = 4, "relocated", (0, 158, 115)
-    ADDED = 5, "added", (0, 114, 178)
-
-    def __new__(cls, value: int, words: str = "", color: tuple[int, int, int] = (0, 0, 0)) -> Cause:
-        member = int.__new__(cls, value)
-        member._value_ = value
-        member.words = words
-        member.color = color
-        return member
+    INITIAL = 0
+    CLONE = 1
+    SPLIT_GRADIENT = 2
+    SPLIT_VOLUME = 3
+    RELOCATED = 4
+    ADDED = 5
 
     @property
     def key(self) -> str:

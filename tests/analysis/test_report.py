@@ -16,7 +16,7 @@ from PIL import Image
 from gsbench.analysis.images import choose_views, jpeg_uri, read_compared, texture_energy
 from gsbench.analysis.pairs import Pairs, pair_trials
 from gsbench.analysis.quantities import quantity
-from gsbench.analysis.report.build import _forest, build_report, search_summary, trial_figures
+from gsbench.analysis.report.build import _forest, build_report, search_summary
 from gsbench.analysis.report.charts import (
     Axis,
     forest_color,
@@ -55,21 +55,6 @@ def experiment(runs):
 @pytest.fixture(scope="module")
 def page(experiment):
     return build_report(experiment)
-
-
-def test_a_picture_that_arms_share_is_shown_once(tmp_path):
-    for path in write_runs(tmp_path, scenes=["garden"], views=1):
-        shade = 10 if path.parent.name == "sfm-adc" else 200
-        (path / "figures").mkdir()
-        for name, level in [("initial_cloud", 90), ("ellipsoids", shade)]:
-            picture = Image.fromarray(np.full((4, 4, 3), level, np.uint8))
-            picture.save(path / f"figures/{name}.png")
-    captions = [caption for caption, _ in trial_figures(trials_of(tmp_path))]
-    assert captions == [
-        "ellipsoids: garden, sfm-adc, seed 0",
-        "initial cloud: garden, sfm-adc, seed 0; sfm-volumetric, seed 0",
-        "ellipsoids: garden, sfm-volumetric, seed 0",
-    ]
 
 
 def test_the_page_is_well_formed_and_needs_no_other_file(page):

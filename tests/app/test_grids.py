@@ -16,12 +16,12 @@ from tests.trials import write_results
 
 # Some trials of `threshold` by their names, which stay as they are from version to version.
 KNOWN = {
-    "sfm-volumetric-0.001/65c55ebe-seed0",
-    "sfm-volumetric-0.003/d280b464-seed1",
-    "sfm-volumetric-0.01/e8907559-seed2",
-    "sfm-volumetric-0.03/3681018c-seed0",
-    "sfm-volumetric-0.1/203719ce-seed1",
-    "sfm-volumetric-0.3/5c9e184d-seed2",
+    "sfm-volumetric-0.001/f032b69c-seed0",
+    "sfm-volumetric-0.003/0e41f96f-seed1",
+    "sfm-volumetric-0.01/13627950-seed2",
+    "sfm-volumetric-0.03/acc74860-seed0",
+    "sfm-volumetric-0.1/6cdf70e1-seed1",
+    "sfm-volumetric-0.3/4495d499-seed2",
 }
 
 

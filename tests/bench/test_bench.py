@@ -78,7 +78,7 @@ def reports(monkeypatch):
 
 def test_rows_have_the_medians_of_each_setting_and_rasterizer(reports):
     both = ["cpu", "reference"]
-    settings = [Setting("trained", 40, 30, 50), Setting("skewed", 33, 17, 1000)]
+    settings = [Setting("trained", 40, 30, 50), Setting("crowded", 33, 17, 1000)]
     rows = run_bench(both, settings, repeats=3)
     assert [(row["size"], row["count"], row["raster"]) for row in rows] == [
         (setting.size, setting.count, raster) for setting in settings for raster in both
@@ -86,7 +86,7 @@ def test_rows_have_the_medians_of_each_setting_and_rasterizer(reports):
     assert ScriptedStepper.calls[:10] == both * 5  # they take turns
     one, other = rows[2:]
     assert one == {
-        **{"raster": "cpu", "scene": "skewed", "size": "33x17", "count": 1000},
+        **{"raster": "cpu", "scene": "crowded", "size": "33x17", "count": 1000},
         **{"step_ms": 3, "step_ratio": 1, "steps_per_second": 333.333, "fps": 666.667},
         **{"threads": 4, "device": "cpu", "peak_memory_mb": 23},
     }

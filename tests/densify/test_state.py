@@ -1,7 +1,6 @@
 """The state of every densifier: statistics that follow edits, lineage, saving, and causes."""
 
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 import pytest
@@ -88,13 +87,6 @@ def test_a_subclass_adds_to_the_statistics_of_its_base():
 
     assert list(Own.STATISTICS) == [*ADC.STATISTICS, "hits"]
     assert Volumetric.STATISTICS == ADC.STATISTICS
-
-
-def test_every_cause_has_its_own_words_and_colour():
-    assert [cause.value for cause in Cause] == list(range(len(Cause)))  # lineage.npz indexes by it
-    for first, second in combinations(Cause, 2):
-        assert first.words != second.words
-        assert np.abs(np.subtract(first.color, second.color)).max() > 60
 
 
 def test_an_event_balances_only_if_its_counts_add_up():

@@ -129,7 +129,7 @@ def test_no_keypoint_lies_on_an_ignored_pixel(captures, tmp_path, make, request)
     options = {"init": {"first_octave": 0, "max_num_features": 1500}, "net": {"max_keypoints": 500}}
     words = options["init" if make is Sfm else "net"] | {"two_view_tracks": True}
     if make is Dim:
-        words |= {"extractor": "aliked", "matcher": "mutual_nearest", "aliked_model": "t16"}
+        words |= {"extractor": "aliked", "matcher": "mutual_nearest"}
         words |= {"download": False, "weights": request.getfixturevalue("shared") / "weights"}
     capture = read_colmap(captures[0], masks="masks")
     work = tmp_path / "work"

@@ -17,7 +17,7 @@ KEY = "densify.volume_threshold"
 TRIAL = SMALL + split(
     "train.iterations=4 train.densify_start=1 train.densify_interval=2 train.densify_stop=4 "
     "scene.views=9 scene.width=48 scene.height=36 init.count=200 raster=reference "
-    "eval.lpips=[] eval.flip=false eval.maps=false tracking=none device=cpu "
+    "eval.lpips=[] eval.flip=false tracking=none device=cpu "
     f"densify=volumetric {KEY}=1e-9"
 )
 

@@ -11,7 +11,6 @@ import torch
 
 from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.facts import (
-    FPS,
     METRICS,
     facts_of,
     from_record,
@@ -35,9 +34,7 @@ def test_facts_and_protocols_load_no_torch():
 def test_the_evaluator_has_exactly_the_metrics_of_the_table():
     evaluator = Evaluator(PAPER, lpips=["vgg"], more=further_keys(), download=False)
     values = evaluator.evaluate_view(IMAGE, IMAGE)
-    of_images = {facts.key for facts in METRICS}
-    assert values.keys() | evaluator.unavailable.keys() == of_images
-    assert set(known_keys()) == of_images | {FPS.key}
+    assert values.keys() | evaluator.unavailable.keys() == set(known_keys())
     assert all(f"lpips_{protocol.lpips}" in known_keys() for protocol in PROTOCOLS.values())
     assert set(lpips_variants()) == {"vgg_raw", "vgg", "alex", "squeeze"}
 
@@ -106,9 +103,7 @@ def test_a_metric_without_attributes_has_no_direction():
 
 def test_the_page_on_metrics_shows_the_table():
     page = (Path(__file__).parents[2] / "docs" / "metric.md").read_text(encoding="utf-8")
-    for facts in (*METRICS, FPS):
-        if facts.key.endswith("_cc"):
-            continue  # a paragraph describes them
+    for facts in METRICS:
         better = {1: "more", -1: "less", 0: ""}[facts.direction]
         low, high = (
             "" if bound is None else f"{bound:g}" for bound in (facts.lowest, facts.highest)

@@ -93,7 +93,7 @@ def values_of(runs, densify, seed, threshold):
     scene = {"name": "courtyard", "kind": "courtyard", "test_every": 8, "width": 64, "height": 48}
     tracking = {"enabled": True, "uri": None, "flush_seconds": 1.0, "patience_seconds": 1.0}
     return trial_values(runs, seed, EXPERIMENT) | {
-        "scene": scene | {"downscale": 1, "max_size": None},
+        "scene": scene | {"max_size": None},
         "raster": {"name": "cpu"},
         "init": {"name": "sfm", "poses": "shared"},
         "densify": {"name": densify, "volume_threshold": threshold},

@@ -9,12 +9,11 @@ import torch
 from numpy.testing import assert_array_equal
 from torch.testing import assert_close
 
-from gsbench.init import MODEL_FOLDER, Dim, read_cloud
-from gsbench.init.networks import models
-from gsbench.init.networks.features import Features
-from gsbench.init.networks.models import (
+from gsbench.init import MODEL_FOLDER, Dim, networks, read_cloud
+from gsbench.init.networks import (
     EXTRACTORS,
     SUPERPOINT_BORDER,
+    Features,
     build_matcher,
     extract_features,
     match,
@@ -146,15 +145,15 @@ def test_lightglue_reads_the_published_names(untrained_weights, tmp_path, monkey
         published[name] = value
     published.pop("confidence_thresholds")
     torch.save(published, tmp_path / "published.pth")
-    networks, load_into = [], models.load_into
+    loaded_into, load_into = [], networks.load_into
 
     def note(network, *rest):
-        networks.append(network)
+        loaded_into.append(network)
         return load_into(network, *rest)
 
-    monkeypatch.setattr(models, "load_into", note)
+    monkeypatch.setattr(networks, "load_into", note)
     matcher_of(tmp_path / "published.pth")
-    loaded = networks[0].state_dict()
+    loaded = loaded_into[0].state_dict()
     assert all(torch.equal(loaded[name], value) for name, value in state.items())
 
 
@@ -170,33 +169,16 @@ def test_no_network_is_downloaded_by_the_libraries(untrained_weights, monkeypatc
     )
 
 
-def test_disk_is_loaded_from_its_published_layout(tmp_path):
-    from kornia.feature import DISK
-
-    torch.manual_seed(0)
-    content = {"extractor": DISK().state_dict(), "optimizer": {"lr": 1.0}}
-    torch.save(content, tmp_path / "depth-save.pth")
-    settings = Dim(extractor="disk", matcher="mutual_nearest", max_keypoints=50).extraction
-    extract = EXTRACTORS["disk"](settings, tmp_path / "depth-save.pth", CPU)
-    with torch.inference_mode():
-        keypoints, descriptors, scores = extract(torch.rand(1, 3, 75, 101))
-    assert len(keypoints) == len(scores) <= 50
-    assert descriptors.shape == (len(keypoints), 128)
-    assert (keypoints >= 0).all()
-    assert (keypoints < torch.tensor([101, 75])).all()
-
-
 @pytest.mark.parametrize("extractor, threshold, radius", TABLES["detection by extractor"])
 def test_detection_settings_are_the_extractors_own_unless_given(extractor, threshold, radius):
     """The defaults are those of deep-image-matching and the authors."""
     own = Dim(extractor=extractor)
     found = own.extraction["keypoint_threshold"], own.extraction["nms_radius"]
     assert found == (threshold, radius)
-    given = {"keypoint_threshold": 0.0, "nms_radius": 7}
+    given = {"keypoint_threshold": 0.0}
     # features depend on exactly these settings
-    more = {"aliked_model": "n16"} if extractor == "aliked" else {}
-    rest = {"extractor": extractor, "max_image_size": 1600, "max_keypoints": 2048} | more
-    assert replace(own, **given).extraction == rest | given
+    rest = {"extractor": extractor, "max_image_size": 1600, "max_keypoints": 2048}
+    assert replace(own, **given).extraction == rest | given | {"nms_radius": radius}
     assert own.matching == {"matcher": "lightglue", "filter_threshold": 0.1}
     nearest = {"matcher": "mutual_nearest", "max_ratio": 0.95}
     assert replace(own, **nearest).matching == nearest
@@ -245,11 +227,6 @@ def test_an_empty_image_has_no_matches():
     assert match(mutual_nearest_matcher(0.9, CPU), some, none).shape == (0, 2)
 
 
-def test_lightglue_has_no_weights_for_the_small_aliked():
-    with refusal("init.matcher=lightglue has no weights"):
-        Dim(extractor="aliked", aliked_model="t16")
-
-
 def test_an_unknown_device_is_refused(courtyard, untrained_weights, tmp_path):
     with refusal(r"init\.device=tpu is not known to torch"):
         superpoint(untrained_weights, device="tpu").run(courtyard, tmp_path)
@@ -257,12 +234,9 @@ def test_an_unknown_device_is_refused(courtyard, untrained_weights, tmp_path):
 
 @pytest.mark.shared
 @pytest.mark.slow
-@pytest.mark.parametrize("extractor", ["aliked", "disk"])
-def test_lightglue_with_real_weights_finds_points_on_the_surfaces(
-    few, trained_weights, tmp_path, extractor
-):
+def test_lightglue_with_real_weights_finds_points_on_the_surfaces(few, trained_weights, tmp_path):
     own = {"max_keypoints": 500, "threads": 1, "pairs": "sequential", "overlap": 2}
-    init = Dim(extractor=extractor, weights=trained_weights, download=False, **own)
+    init = Dim(extractor="aliked", weights=trained_weights, download=False, **own)
     report = init.run(few, tmp_path)
     assert len(report.settings["weights_sha256"]) == 2
     assert report.versions["kornia"]

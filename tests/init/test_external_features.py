@@ -19,8 +19,7 @@ from gsbench.init.colmap.database import (
 )
 from gsbench.init.colmap.mapping import map_images
 from gsbench.init.colmap.matches import extract_sift, match_sift, verify_pairs
-from gsbench.init.networks.features import Features
-from gsbench.init.networks.models import extract_features
+from gsbench.init.networks import Features, extract_features
 from gsbench.logs import no_progress
 
 KNOWN = Sfm(camera="single", camera_model="PINHOLE", focal_length=300.0, threads=1)

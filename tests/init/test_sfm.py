@@ -52,7 +52,7 @@ def test_own_poses_agree_with_the_exact_ones(own):
     report, _ = own
     assert report.num_registered == report.num_images == 8
     assert report.pose_errors.exact
-    assert report.pose_errors.center_max < 0.02  # m, on a ring of 4.5 m radius
+    assert report.pose_errors.center_rmse < 0.02  # m, on a ring of 4.5 m radius
     # cameras on an arc of 52 degrees determine the rotation about the arc weakly
     assert report.pose_errors.rotation_max_deg < 1.5
     assert report.focal_lengths[0] == pytest.approx(300.9, rel=0.01)  # 320 / (2 tan 28 degrees)
@@ -90,14 +90,14 @@ def test_the_progress_of_each_phase_is_reported_from_start_to_end(shared, told):
 
 
 @pytest.mark.parametrize(
-    "poses, intrinsics, points_from, names, needed",
+    "poses, points_from, names, needed",
     TABLES["images and references"],
 )
 def test_poses_and_points_from_choose_the_photographs_and_the_need_for_a_reference(
-    poses, intrinsics, points_from, names, needed
+    poses, points_from, names, needed
 ):
     """There are four photographs; b is a test view, and a is not in the reference."""
-    options = Sfm(poses=poses, intrinsics=intrinsics, points_from=points_from)
+    options = SfmDense(poses=poses, points_from=points_from)
     capture = Capture("x", Path("x"), ("a", "b", "c", "d"), ("b",), None, False, "0")
     reference = model_with({name: camera_at([0, 0, 0]) for name in "dcb"})
     assert options.select_images(capture, reference) == list(names)

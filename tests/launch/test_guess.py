@@ -54,7 +54,6 @@ def test_pictures_are_measured_at_the_size_of_the_training(tmp_path):
     scene = values("photos", path=str(tmp_path))["scene"]
     assert picture_size(scene) == (80, 60)
     assert picture_size(scene | {"max_size": 40}) == (40, 30)
-    assert picture_size(scene | {"downscale": 4}) == (20, 15)
 
 
 def test_a_dry_run_guesses_the_first_trial(tmp_path):

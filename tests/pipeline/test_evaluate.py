@@ -15,15 +15,13 @@ from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.protocol import PAPER
 from gsbench.gaussians.ply import write_ply
 from gsbench.pipeline.parts import Parts
-from gsbench.pipeline.steps import evaluate as evaluate_module
-from gsbench.pipeline.steps.evaluate import evaluate_step, measure_speed, one_color_psnr
-from gsbench.raster.contract import CASES
+from gsbench.pipeline.steps.evaluate import evaluate_step, one_color_psnr
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.runs import keys
 from gsbench.runs.code import UserCode
 from gsbench.runs.keys import INIT, TRAIN, Step
 from gsbench.runs.store import Store
-from gsbench.scene.types import ANGLE, COUNTED, DISTANCE, Scene, View
+from gsbench.scene.types import ANGLE, COUNTED, DISTANCE
 from gsbench.train.trainer import snapshot_file
 from tests.helpers import read_json
 
@@ -31,14 +29,14 @@ TRAINED = Step(TRAIN, {}, lambda folder: None)
 FOUR_LPIPS = ["lpips_alex", "lpips_squeeze", "lpips_vgg", "lpips_vgg_raw"]
 
 
-def parts_of(fps, evaluator=None, **changes):
+def parts_of(evaluator=None, **changes):
     """The parts of a trial that is evaluated without LPIPS."""
     parts = {
         "evaluator": evaluator or Evaluator(PAPER, lpips=[], flip=False),
         "rasterizer": ReferenceRasterizer(),
         "device": torch.device("cpu"),
         "train": SimpleNamespace(background=(0.1, 0.2, 0.3)),
-        "eval": SimpleNamespace(maps=False, fps=fps, regions=None),
+        "eval": SimpleNamespace(regions=None),
         "measured_earlier": [],
         "user_code": UserCode(),
         "program": None,
@@ -54,41 +52,18 @@ def built(folder, step):
         return folder, {row["view"]: row for row in csv.DictReader(stream)}
 
 
-def inputs(fps=None, **options):
+def inputs(**options):
     """The inputs of an evaluation without LPIPS; a key needs no views."""
-    parts = parts_of(fps, Evaluator(PAPER, lpips=[], **options))
-    found = evaluate_step(None, TRAINED, parts).inputs
-    parts.program = SimpleNamespace(leaves_model=False)
-    measured = evaluate_step(None, TRAINED, parts).inputs
-    assert all(measured.get(key) == found.get(key) for key in ("more", "fps"))
-    return dict(found)
+    parts = parts_of(Evaluator(PAPER, lpips=[], **options))
+    return dict(evaluate_step(None, TRAINED, parts).inputs)
 
 
 def test_an_evaluation_without_newer_settings_keeps_its_key(monkeypatch):
     monkeypatch.setattr(keys, "edited", lambda files: {})  # as in a release
     old = {"train": TRAINED.key, "protocol": "paper-1", "unavailable": FOUR_LPIPS, "maps": False}
     assert inputs() == old
-    assert inputs([640, 480]) == old | {"fps": [640, 480]}
-    for more in (["ssim_cc", "psnr_cc"], ["psnr_cc", "ssim_cc"]):
-        assert inputs(more=more) == old | {"more": ["psnr_cc", "ssim_cc"]}
-
-
-def test_speed_is_measured_at_the_given_size(monkeypatch):
-    case, sizes = CASES[-1], []
-
-    class Watched(ReferenceRasterizer):
-        def render(self, gaussians, camera, *rest):
-            sizes.append((camera.width, camera.height))
-            return super().render(gaussians, camera, *rest)
-
-    image = np.zeros((case.height, case.width, 3), np.uint8)
-    scene = Scene("made", (), (View("a", case.camera(), image),))
-    clock = SimpleNamespace(perf_counter=iter((10.0, 12.0)).__next__)
-    monkeypatch.setattr(evaluate_module, "time", clock)
-    black = torch.zeros(3, dtype=torch.float64)
-    found = measure_speed(Watched(), case.gaussians(), scene, black, [64, 20])
-    assert sizes == [(64, 20)] * 6  # the first render is not timed
-    assert found == {"a": 2.5}
+    for more in (["gmsd", "fsim"], ["fsim", "gmsd"]):
+        assert inputs(more=more)["more"] == ["fsim", "gmsd"]
 
 
 def test_an_evaluation_measures_the_pixels_of_its_png_files(tmp_path, truth, tiny_scene, told):
@@ -103,10 +78,8 @@ def test_an_evaluation_measures_the_pixels_of_its_png_files(tmp_path, truth, tin
     write_ply(truth, training / "point_cloud.ply")
     earlier = faint.select(torch.arange(50))
     write_ply(earlier, training / snapshot_file(7))
-    np.savez(training / "lineage.npz", causes=np.zeros(80, dtype=np.int64), ids=np.arange(80))
     # a time limit ended the training before iteration 9
-    parts = parts_of([20, 16], measured_earlier=[7, 9])
-    parts.eval.maps = True
+    parts = parts_of(measured_earlier=[7, 9])
     views = SimpleNamespace(store=store, scene=scene, init=init)
     folder, rows = built(tmp_path / "built", evaluate_step(views, TRAINED, parts))
 
@@ -133,43 +106,13 @@ def test_an_evaluation_measures_the_pixels_of_its_png_files(tmp_path, truth, tin
         assert float(row[ANGLE]) == pytest.approx(np.degrees(min(angles)), abs=1e-5)
         places = [np.linalg.norm(view.camera.center - other.camera.center) for other in scene.train]
         assert float(row[DISTANCE]) == pytest.approx(min(places) / scene.extent)
-        assert float(row["fps"]) > 0
     metrics = read_json(folder / "metrics.json")
     assert metrics["metrics"]["psnr"] == pytest.approx(means["last"], abs=1e-5)
     assert metrics["at"].keys() == {"7"}
     assert metrics["at"]["7"]["num_gaussians"] == 50
     assert metrics["at"]["7"]["metrics"]["psnr"] == pytest.approx(means["earlier"], abs=1e-3)
     assert len(list((folder / "renders").iterdir())) == 2
-    figure = np.asarray(Image.open(folder / "figures/ellipsoids.png"))[:32].astype(int)
-    unlike = [
-        np.abs(figure - np.asarray(Image.open(folder / f"renders/{view.name}"))).mean()
-        for view in scene.test
-    ]
-    assert figure.shape == (32, 40, 3)
-    assert unlike[0] < unlike[1]  # the figure is of the first view
     assert told == [("views", 1, 2), ("views", 2, 2), ("iteration 7", 1, 2), ("iteration 7", 2, 2)]
-
-
-def test_renders_of_another_program_are_measured_without_changes(tmp_path, tiny_scene, told):
-    store = Store(tmp_path)
-    renders = store.path(TRAINED) / "renders"
-    renders.mkdir(parents=True)
-    for shift, view in enumerate(tiny_scene.test, 4):
-        Image.fromarray((view.image // 2 + shift).astype(np.uint8)).save(renders / view.name)
-    parts = parts_of([20, 16], program=SimpleNamespace(leaves_model=False))
-    step = evaluate_step(SimpleNamespace(store=store, scene=tiny_scene), TRAINED, parts)
-    assert step.inputs["renders"] == TRAINED.key
-    folder, rows = built(tmp_path / "built", step)
-    found = [float(row["psnr"]) for row in rows.values()]
-    expected = [
-        10 * np.log10(255**2 / ((view.image // 2 + shift - view.image.astype(float)) ** 2).mean())
-        for shift, view in enumerate(tiny_scene.test, 4)
-    ]
-    assert found == pytest.approx(expected, abs=1e-5)
-    missing = read_json(folder / "metrics.json")["unavailable"]["fps"]
-    assert missing == "only the renders of the other program are known, not its model"
-    assert len(list((folder / "renders").iterdir())) == 2
-    assert told == [("views", 1, 2), ("views", 2, 2)]
 
 
 def test_the_mean_colour_of_counted_training_pixels_is_measured_against_the_test_views(tiny_scene):

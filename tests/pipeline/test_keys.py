@@ -29,13 +29,13 @@ BARE = Capture(
     "garden", Path("photos"), ("a.jpg", "b.jpg", "c.jpg"), ("a.jpg",), None, False, "0" * 64
 )
 KEYS = [
-    ("config", "efb880968c80cdd904651c24a9fa44e607e6283f150f6dbad8f47651f0e9d49f"),
+    ("config", "f0bb95969e4a0f1bd626e24196a1668aa0bdcc21d94c5295dbaa3af6f077b384"),
     # of the reference cameras
-    ("init", "991c126deb4c8459394f2310586bfbb26251e999e306344a946a5826c7fb07d9"),
-    ("init", "be87afd1f24decd7478d620990cb56e1cc80f616bd5045809f5a0ed92ef3a68a"),
-    ("train", "faf230c48612eddd14d6476ed24f063202faa9d70628a6b4403336516d42a95d"),
-    ("ground_truth", "3989bfa30383b1f506f4107150a86428b608f6e06dd12db46466e1d0d20cab1e"),
-    ("evaluate", "25bd0eccbb4e655e8384a52618a6e0624d3d0d977f8c3dc7fe234f4ed6fee1b8"),
+    ("init", "b92ef1cdec8634bd52daa8afeaec7fce0b13d00d70d0f715b5eb9a1c73fd5759"),
+    ("init", "a3a44618398e68c025836e1031642269da49e069c9d615c9de8217baab805301"),
+    ("train", "309405282cd6d7496ff0dae46cdc0d30037747897cdb12504ec01aa76aefc272"),
+    ("ground_truth", "2713e948ccf37750ea64717542d37c5a6697a184fe9c108264563c57a4b1b66d"),
+    ("evaluate", "c175b2c136be470af29c232855cb842a3c298bae24916726b3663f5b1ddd55ee"),
 ]
 
 

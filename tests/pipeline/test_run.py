@@ -115,7 +115,7 @@ def test_files_of_the_steps_are_published_in_the_trials_folder(tmp_path, normali
     content = {
         INIT: "picture.png report.json",
         TRAIN: "lineage.npz metrics.jsonl events.jsonl checkpoint-1.pt",
-        EVALUATE: "per_view.csv renders/a.png renders/b.png figures/c.png metrics.json",
+        EVALUATE: "per_view.csv renders/a.png renders/b.png metrics.json",
         GROUND_TRUTH: "a.png b.png masks/b.png",
     }
     entries = {}
@@ -131,7 +131,7 @@ def test_files_of_the_steps_are_published_in_the_trials_folder(tmp_path, normali
     published = _publish(folder, entries, normalization)
     texts = {
         **{name: f"train {name}" for name in ("lineage.npz", "metrics.jsonl", "events.jsonl")},
-        **{name: f"evaluate {name}" for name in content[EVALUATE].split()[:4]},
+        **{name: f"evaluate {name}" for name in content[EVALUATE].split()[:3]},
         **{f"ground_truth/{name}": f"ground_truth {name}" for name in ("a.png", "b.png")},
         "masks/b.png": "ground_truth masks/b.png",
     }

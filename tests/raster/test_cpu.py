@@ -17,6 +17,7 @@ import torch
 from numba import types
 from numpy.testing import assert_allclose, assert_array_equal
 
+from gsbench.raster.contract import Case, render_with_gradients
 from gsbench.raster.cpu import (
     CpuRasterizer,
     binning,
@@ -32,7 +33,6 @@ from gsbench.raster.reference import project, tile_rectangles
 from tests.conftest import ROOT
 from tests.processes import completed
 from tests.raster.promises import BLACK, PROMISES, Subject, bits_of
-from tests.raster.strategies import Case, render_with_gradients
 
 CASE = Case(97, 65, 250, sh_degree=3, principal=(7.3, -5.1))
 MANY = Case(150, 110, 4000, sh_degree=3, log_scale=-3.0)
@@ -209,7 +209,7 @@ def test_hosts_without_wide_vectors_match_the_reference(tmp_path):
 import sys, torch
 from gsbench.raster.cpu import CpuRasterizer
 from gsbench.raster.reference import ReferenceRasterizer, project, tile_rectangles
-from tests.raster.strategies import Case, render_with_gradients
+from gsbench.raster.contract import Case, render_with_gradients
 case = Case(33, 49, 50, sh_degree=3)
 output, gradients = render_with_gradients(CpuRasterizer(threads=2), case, torch.float32)
 expected, references = render_with_gradients(ReferenceRasterizer(), case, torch.float64)

@@ -35,7 +35,7 @@ def test_three_runs_give_the_same_bits(width, height, count):
     from gsbench.train.loss_triton import TritonLoss
 
     device = "cuda" if ON_A_GPU else "cpu"
-    gaussians, scene = make_scene("skewed", width, height, count)
+    gaussians, scene = make_scene("crowded", width, height, count)
     target = torch.from_numpy(scene.train[0].image).to(device)
     background = torch.zeros(3, device=device)
 

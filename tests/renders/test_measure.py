@@ -130,7 +130,7 @@ def test_a_named_metric_writes_the_question_about_all_seeds_of_the_baseline(tria
 
 @pytest.mark.parametrize(
     "word, said",
-    [("eval.primary=psnr", "add --as"), ("eval.maps=true", "no effect on renders")],
+    [("eval.primary=psnr", "add --as"), ("eval.at=[7]", "no effect on renders")],
 )
 def test_settings_without_effect_on_renders_are_refused(trial, runs, refused, word, said):
     assert said in refused("evaluate", trial / "renders", "--truth", trial, word)
@@ -237,7 +237,7 @@ def test_renders_of_other_photographs_than_the_experiments_are_refused(
 def test_printed_lines_have_the_views_their_mean_and_the_reasons_of_missing_metrics():
     evaluator = SimpleNamespace(
         protocol=SimpleNamespace(id="paper-1"),
-        unavailable={"lpips_vgg_raw": "no weights", "fps": "renders alone"},
+        unavailable={"lpips_vgg_raw": "no weights", "flip": "renders alone"},
         awaited={"lpips_vgg_raw"},
         own={},
     )

@@ -18,7 +18,7 @@ from gsbench.scene.colmap import (
 from gsbench.scene.types import Camera
 from tests.helpers import refusal
 from tests.scene.cameras import cameras_of
-from tests.scene.captures import read_colmap, read_photos
+from tests.scene.captures import read_colmap
 from tests.scene.tables import TABLES
 
 from .conftest import smooth_image
@@ -94,11 +94,6 @@ def test_an_image_of_another_shape_than_its_camera_is_refused(make_scene):
     Image.fromarray(smooth_image(30, 40)).save(root / "images/01.png", exif=exif)
     with refusal(r"01\.png.*on its side, and COLMAP ignores EXIF"):
         read_reference(read_colmap(root))
-
-
-def test_bare_photos_have_no_reference_model(make_scene):
-    with refusal("no COLMAP model came with"):
-        read_reference(read_photos(make_scene()))
 
 
 def test_distorted_cameras_are_not_pinholes(make_scene):

@@ -54,16 +54,14 @@ def test_damaged_files_are_named(tmp_path, suffix):
     TABLES["sizes of Mip-NeRF 360"],
 )
 def test_downscaled_sizes_are_those_of_mipnerf360(native, factor, expected):
-    assert downscaled_size(*native, downscale=factor) == tuple(expected)
+    assert downscaled_size(*native, expected[0]) == tuple(expected)
     assert same_up_to_rounding(expected, native)
 
 
 def test_sizes_never_grow_and_the_longest_side_is_exact():
     assert downscaled_size(900, 600, max_size=1600) == (900, 600)
-    assert downscaled_size(900, 600, downscale=2, max_size=500) == (450, 300)
-    assert downscaled_size(900, 600, downscale=2, max_size=300) == (300, 200)
     assert all(max(downscaled_size(side, 777, max_size=640)) == 640 for side in range(800, 1500))
-    assert downscaled_size(3, 3000, downscale=100) == (1, 30)
+    assert downscaled_size(3, 3000, max_size=30) == (1, 30)
     assert downscaled_size(9, 6, max_size=1) == (1, 1)
 
 
@@ -75,11 +73,7 @@ def test_sides_may_be_rounded_by_one_pixel(size, same):
     assert same_up_to_rounding(size, (40, 30)) == same
 
 
-def test_area_is_the_block_mean_and_lanczos_keeps_a_ramp():
-    image = smooth_image(40, 30)
-    blocks = image.reshape(15, 2, 20, 2, 3).mean(axis=(1, 3))
-    # Pillow rounds after each of two passes
-    assert np.abs(resize_image(image, 20, 15, "area") - blocks).max() <= 1.0
+def test_shrinking_keeps_a_ramp():
     ramp = np.repeat(np.arange(0, 200, 2, dtype=np.uint8)[None, :, None], 30, 0).repeat(3, 2)
-    small = resize_image(ramp, 50, 15, "lanczos")
+    small = resize_image(ramp, 50, 15)
     assert_allclose(small[7, 5:-5, 0], np.arange(1, 200, 4)[5:-5], atol=1.01)

@@ -9,7 +9,7 @@ import torch
 from torch.testing import assert_close
 
 from gsbench.analysis.differences import ingredients
-from gsbench.densify import EdgeAware, NoDensifier
+from gsbench.densify import NoDensifier
 from gsbench.densify.scores import blended_sums
 from gsbench.eval.ssim import ssim_map
 from gsbench.raster.reference import ReferenceRasterizer
@@ -25,7 +25,7 @@ from gsbench.train.views import (
 )
 from tests.config.test_schema import composed
 from tests.train.conftest import orbit_camera
-from tests.train.lab import CPU, EVENTS, METRICS, STATEFUL, StopError, options, same, small, stop_at
+from tests.train.lab import CPU, options, same, small
 
 SHORT = {"densify_start": 20, "densify_stop": 100, "densify_interval": 20}
 
@@ -168,21 +168,6 @@ def test_sizes_change_after_rounds_and_position_rates_wait_for_full_size(tiny_sc
     assert resolution.position_step((120 + wait) / 2) == pytest.approx(60)
     resolution.options.position_steps = wait  # no iteration is left for the schedule
     assert resolution.position_step(wait + 1) == wait
-
-
-@pytest.mark.parametrize("kind", [*STATEFUL, "edgeaware"])
-@pytest.mark.slow
-def test_an_interrupted_training_ends_with_the_same_bits(kind, lab):
-    make = STATEFUL.get(kind, lambda: small(EdgeAware, max_gaussians=200, cap="root"))
-    settings = {"resolution_schedule": "pictures", "checkpoint_every": 30, **SHORT}
-    whole = lab.train(make(), "whole", **settings)
-    with pytest.raises(StopError):
-        lab.train(make(), "broken", stop_at(70), **settings)
-    assert same(whole, lab.train(make(), "broken", **settings))
-    assert lab.text(EVENTS, "broken") == lab.text(EVENTS, "whole")
-    sizes = {record["scale"] for record in lab.records(METRICS, "whole")}
-    assert min(sizes) == 1
-    assert max(sizes) >= 2
 
 
 def test_masks_are_as_small_as_their_pictures(lab):

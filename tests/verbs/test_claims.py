@@ -76,7 +76,6 @@ def test_pilot_trials_on_one_scene_give_no_plan_for_scenes_like_these(pilots, ca
         ("exp --difference 0", "above 0"),
         ("alone", "one arm"),
         ("apart", r"no trials of sfm-adc and sfm-volumetric can be paired in PSNR"),
-        ("exp --metric cc_gain", "unknown metric|--difference is needed"),
         ("nothing", "no experiment"),
     ],
 )

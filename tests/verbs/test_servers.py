@@ -20,6 +20,7 @@ from gsbench.runs.experiments import make_home
 from gsbench.tracking import connect
 from gsbench.verbs import servers
 from tests.helpers import write
+from tests.tracking.helpers import ended_trial
 
 SECONDS = 120
 
@@ -110,6 +111,16 @@ def test_the_dashboard_shows_the_only_experiment_or_the_one_named(runs, served, 
     pages = said("ui cde").split()
     assert pages[:3] == ["ideas", f"{LOCAL}/#/experiments/3/runs", "bars"]
     assert served == [(uri, 5000)]
+
+
+def test_the_dashboard_gets_first_what_it_lacks(runs, said, monkeypatch):
+    ended_trial(runs, name="mine", enabled=False)
+    monkeypatch.setattr(servers, "serve", lambda uri, port: 0)
+    assert "ideas" in said("ui")
+    client = connect(None, runs)
+    found = client.get_experiment_by_name("mine")
+    kinds = {run.data.tags["kind"] for run in client.search_runs([found.experiment_id])}
+    assert kinds == {"trial", "idea"}
 
 
 def test_no_second_server_is_started(runs, served, said, monkeypatch):

@@ -30,9 +30,8 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import scipy  # loads scipy.special at its first use: 0.4 s
 from numpy.typing import NDArray
-from scipy import special
-from scipy.ndimage import map_coordinates
 
 from gsbench.runs.commands import ERROR_RATE
 
@@ -85,7 +84,7 @@ class Region:
             (self.even, known["knots"]),
         )
         places = [np.interp(value, axis, np.arange(len(axis))) for value, axis in axes]
-        f = map_coordinates(known["f"], np.broadcast_arrays(*places), order=1)
+        f = scipy.ndimage.map_coordinates(known["f"], np.broadcast_arrays(*places), order=1)
         f = np.where(np.less(level, LEAST_LEVEL) | (self.scenes == 1), 0.0, f)
         return np.asarray(self._student(level) * np.exp(f * self._ratio(level)))
 
@@ -99,12 +98,12 @@ class Region:
         return np.exp(high)
 
     def _student(self, level: Array | float) -> Array:
-        return np.asarray(-special.stdtrit(self.seeds - 1, np.asarray(level) / 2))
+        return np.asarray(-scipy.special.stdtrit(self.seeds - 1, np.asarray(level) / 2))
 
     def _ratio(self, level: Array | float) -> Array:
         """log(normal / Student's threshold); below the lowest level of the table, that of it."""
         own = np.clip(level, table()["levels"][-1], MOST_P)
-        return np.asarray(np.log(-special.ndtri(own / 2) / self._student(own)))
+        return np.asarray(np.log(-scipy.special.ndtri(own / 2) / self._student(own)))
 
 
 def evenness(variances: Array) -> Array:
@@ -146,7 +145,7 @@ class StudentT:
         size = abs(self.mean / self.error)
         if self.region is not None:
             return float(self.region.p_values(np.array([size]))[0])
-        return float(2 * special.stdtr(self.degrees, -size))
+        return float(2 * scipy.special.stdtr(self.degrees, -size))
 
     def interval(self, alpha: float = ALPHA) -> Interval:
         """The values that the test with error rate ``alpha`` does not reject.
@@ -156,7 +155,7 @@ class StudentT:
         if self.region is not None:
             threshold = float(self.region.limits(alpha)[0])
         else:
-            threshold = float(special.stdtrit(self.degrees, 1 - alpha / 2))
+            threshold = float(scipy.special.stdtrit(self.degrees, 1 - alpha / 2))
         half = threshold * self.error
         return Interval(self.mean - half, self.mean + half)
 
@@ -264,7 +263,7 @@ def judge_like_these(
 def median_interval(values: Array, level: float) -> Interval | None:
     """The exact interval of the median of which ``values`` [n] are a sample; None for too few."""
     count = len(values)
-    outer = [k for k in range(count // 2) if 2 * float(special.bdtr(k, count, 0.5)) <= level]
+    outer = [k for k in range(count // 2) if 2 * float(scipy.special.bdtr(k, count, 0.5)) <= level]
     if not outer:
         return None
     ordered = np.sort(values)
@@ -277,7 +276,7 @@ def sign_test_needs(scenes: int, level: float) -> int | None:
         (
             agree
             for agree in range(scenes // 2 + 1, scenes + 1)
-            if 2 * float(special.bdtrc(agree - 1, scenes, 0.5)) <= level
+            if 2 * float(scipy.special.bdtrc(agree - 1, scenes, 0.5)) <= level
         ),
         None,
     )

@@ -20,9 +20,6 @@ FIRST_DEPTH, DEPTH_RATIO = 2.0, 12.0  # trained-like scene: least depth, and lar
 MEDIAN_SIGMA = 1.6 / (FOCAL * 500)
 SIGMA_EXPONENT = 0.4  # sigma is proportional to count^-0.4: many Gaussians are smaller
 SIGMA_SPREAD = 0.7  # standard deviation of log sigma
-# Skewed scene: number of spots, share of Gaussians in them, standard deviation of x/z and y/z. For
-# comparison, a trained courtyard has 117 entries per block on average, and at most 1,054.
-SPOTS, SPOT_SHARE, SPOT_RADIUS = 40, 0.5, 0.05
 # Crowded scene: share of Gaussians over one tile, and its side in units of the field of view's.
 CROWD_SHARE, CROWD_SIDE = 0.05, 0.007
 
@@ -51,25 +48,6 @@ def trained_like_gaussians(count: int, seed: int = SEED) -> Gaussians:
     )
 
 
-def skewed_gaussians(count: int, seed: int = SEED) -> Gaussians:
-    """Make `trained_like_gaussians`, but move half of them to a few spots of the image.
-
-    Most go to the first spots, like detail in photographs. The longest list of a tile is eight to
-    nine times the mean; without the spots it is 1.3 times the mean.
-    """
-    gaussians = trained_like_gaussians(count, seed)
-    generator = torch.Generator().manual_seed(seed + 1)
-    weights = 1 / torch.arange(1, SPOTS + 1)  # Zipf's
-    fields = torch.tensor([1.0, 0.7])
-    spots = (torch.rand(SPOTS, 2, generator=generator) - 0.5) * fields  # [S, 2] x/z, y/z
-    chosen = torch.multinomial(weights, count, replacement=True, generator=generator)  # [N]
-    slopes = spots[chosen] + SPOT_RADIUS * torch.randn(count, 2, generator=generator)  # [N, 2]
-    moved = torch.rand(count, generator=generator) < SPOT_SHARE  # [N]
-    depth = gaussians.means[:, 2:]  # [N, 1]
-    gaussians.means[:, :2] = torch.where(moved[:, None], slopes * depth, gaussians.means[:, :2])
-    return gaussians
-
-
 def crowded_gaussians(count: int, seed: int = SEED) -> Gaussians:
     """Make `trained_like_gaussians`, but a twentieth of them is over one tile near the middle.
 
@@ -87,7 +65,6 @@ def crowded_gaussians(count: int, seed: int = SEED) -> Gaussians:
 
 SCENES = {
     "trained": trained_like_gaussians,
-    "skewed": skewed_gaussians,
     "crowded": crowded_gaussians,
 }
 

@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from gsbench.errors import InputError
 from gsbench.events import Cause
-from gsbench.files import DAMAGE
 
 
 class Lineage:
@@ -71,26 +65,3 @@ class Lineage:
         lineage._history, lineage._total = [history], len(history["parents"])
         lineage.initial_count = int((history["parents"] < 0).sum())
         return lineage
-
-
-def read_causes(path: Path, num_gaussians: int) -> NDArray[np.uint8]:
-    """The `Cause` of each Gaussian of a model, [N], from its ``lineage.npz``.
-
-    Raises InputError for a file that is damaged or of another model.
-    """
-    try:
-        with np.load(path) as arrays:
-            causes, ids = arrays["causes"], arrays["ids"]
-        for name, values, end in ("causes", causes, len(Cause)), ("ids", ids, len(causes)):
-            if values.dtype.kind not in "iu" or ((values < 0) | (values >= end)).any():
-                raise ValueError(f"{name} must be whole numbers from 0 to {end - 1}")
-        living: NDArray[np.uint8] = causes[ids].astype(np.uint8)
-    except DAMAGE as error:
-        raise InputError(f"{path} cannot be read ({error}): run this trial again") from error
-    # a model and a record of two runs would give Gaussians the causes of others
-    if living.shape != (num_gaussians,):
-        raise InputError(
-            f"{path} is of {len(living)} Gaussians, the model has {num_gaussians}: run this trial "
-            "again"
-        )
-    return living

@@ -17,7 +17,6 @@ from torch import Tensor
 
 from gsbench.errors import InputError, TrainingError
 from gsbench.eval.facts import (
-    CORRECTED,
     LPIPS,
     METRICS,
     MORE,
@@ -41,7 +40,7 @@ from gsbench.eval.metric import (
     UnavailableError,
     require_size,
 )
-from gsbench.eval.more import STRUCTURAL, after_correction, load_structural
+from gsbench.eval.more import STRUCTURAL, load_structural
 from gsbench.eval.protocol import Protocol
 from gsbench.eval.regions import LEAST_SHARE, Regions
 from gsbench.eval.ssim import ssim
@@ -94,10 +93,6 @@ def measure_gsbench(key: str, evaluator: Evaluator) -> Measure:
             )
         case "flip":
             return partial(_flip, protocol.flip_ppd)
-        case "cc_gain":
-            return after_correction(measure_psnr(protocol), gain=True)
-    if key.endswith(CORRECTED):
-        return after_correction(measure_gsbench(key.removesuffix(CORRECTED), evaluator))
     if key.startswith(LPIPS):
         net, _, raw = key.removeprefix(LPIPS).partition("_")
         return partial(_lpips, evaluator.network(net), bool(raw))

@@ -44,16 +44,12 @@ class MetricFacts:
         return f"{self.label} ({self.unit})" if self.unit else self.label
 
 
-# the end of the key of a metric that is measured after an affine correction of the colours
-CORRECTED = "_cc"
-# `gsbench.eval.evaluator.Evaluator` measures each but the last, which is measured of the trained
-# model, not of its pictures, and separately in the evaluation.
-*METRICS, FPS = ALL = [MetricFacts(**row) for row in table_beside(__file__, "metrics.yaml")]
+METRICS = [MetricFacts(**row) for row in table_beside(__file__, "metrics.yaml")]
 
 
 def known_keys() -> tuple[str, ...]:
     """The keys of gsbench's own metrics, in the order of tables."""
-    return tuple(facts.key for facts in ALL)
+    return tuple(facts.key for facts in METRICS)
 
 
 def lpips_variants() -> tuple[str, ...]:
@@ -70,7 +66,7 @@ def further_keys() -> tuple[str, ...]:
 def find_metric(key: str) -> MetricFacts | None:
     """The facts about gsbench's metric ``key``, such as ``psnr`` or ``psnr@far``, or None."""
     metric, _, region = key.partition(AT)
-    facts = next((facts for facts in ALL if facts.key == metric), None)
+    facts = next((facts for facts in METRICS if facts.key == metric), None)
     return None if facts is None else in_region(facts, region)
 
 

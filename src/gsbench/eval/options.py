@@ -5,12 +5,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
-from annotated_types import Interval, Len, Predicate, doc
+from annotated_types import Predicate, doc
 from pydantic import PositiveInt
 
 from gsbench.errors import InputError
 from gsbench.eval.facts import (
-    FPS,
     LPIPS,
     MORE,
     find_metric,
@@ -44,8 +43,6 @@ AT_RULE = "a list of different iterations, at which the test views are measured 
 CONTROLS_RULE = "a mapping {ARM: ARM}: the arm, beside the baseline, that an arm is compared with"
 LPIPS_RULE = f"a list of {', '.join(lpips_variants())}, each at most once"
 LpipsVariant = Annotated[str, Predicate(lambda name: name in lpips_variants())]
-FPS_RULE = "two sides in px, width and height, each from 16 to 16384"
-Side = Annotated[int, Interval(ge=16, le=16_384)]
 REGIONS_RULE = f"{DISTANCE} ({', '.join(DISTANCES)}), or a mapping {{NAME: FOLDER of masks}}"
 MORE_RULE = f"a list of {', '.join(further_keys())}, each at most once"
 FurtherMetric = Annotated[str, Predicate(lambda name: name in further_keys())]
@@ -74,9 +71,6 @@ class EvalConfig:
     baseline: FolderName = "adc"  # the densifier that ideas are compared with
     # {longaxis: absgrad}
     controls: Annotated[dict[str, FolderName], doc(CONTROLS_RULE)] = field(default_factory=dict)
-    maps: bool = False  # draw the large Gaussians over a test view
-    # [1920, 1080]: the speed at this size, px
-    fps: Annotated[list[Side], Len(2, 2), doc(FPS_RULE)] | None = None
     weights: PathName | None = None  # folder; null: $GSBENCH_WEIGHTS, then the torch hub cache
     download: bool = True  # fetch missing weights, checked by checksum
 
@@ -126,7 +120,6 @@ class EvalConfig:
         variant = key.removeprefix(LPIPS)
         is_lacking, mend = {
             "eval.flip": (not self.flip, " with eval.flip=false"),
-            FPS.setting: (self.fps is None, ": add eval.fps=[1920,1080]"),
             MORE: (key not in self.more, f": add {key} to eval.more"),
             "eval.lpips": (variant not in self.lpips, f": add {variant} to eval.lpips"),
         }.get(facts.setting, (False, ""))

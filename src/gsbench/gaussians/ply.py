@@ -48,8 +48,6 @@ REST_COUNTS = tuple(3 * ((degree + 1) ** 2 - 1) for degree in range(MAX_SH_DEGRE
 # Replaces an infinite logit; negated for an opacity of 0. Its opacity, 1 - 2^-23, is as close to 1
 # as float32 allows with a gradient.
 MAX_LOGIT = 23 * math.log(2)
-# typical scale of a Gaussian over the size of its model; medians of trained models: 0.009 to 0.035
-TYPICAL_SCALE = 0.02
 
 
 def write_ply(gaussians: Gaussians, path: Path, normalization: Normalization = IDENTITY) -> None:
@@ -108,36 +106,17 @@ def _check_finite(column: Column, name: str, path: Path) -> None:
 
 def _warn_of_activated(vertices: Mapping[str, Column], path: Path) -> None:
     """Log a warning if values look as if 3DGS's activations, exp and sigmoid, were applied."""
-    opacity = vertices["opacity"]
-    if _look_like_lengths(_stacked(vertices, SCALES), _stacked(vertices, POSITION)):
-        log.warning(
-            "%s: all scales are positive: they look like lengths, where 3DGS stores their "
-            "logarithms",
-            path,
-        )
-    # As logits, half of all opacities would be 1 to seven digits: then they are bytes.
-    for most, is_activated in ((1, opacity.max() <= 1), (255, np.median(opacity) > MAX_LOGIT)):
-        if opacity.min() >= 0 and is_activated:
+    for what, columns, stored in (
+        ("scale", SCALES, "logarithms of lengths"),
+        ("opacity", ["opacity"], "logits"),
+    ):
+        if (_stacked(vertices, columns) >= 0).all():
             log.warning(
-                "%s: all opacities lie in [0, %d]: they look like opacities, where 3DGS stores "
-                "their logits",
+                "%s: no %s is below 0, and 3DGS stores %s: are the activations applied already?",
                 path,
-                most,
+                what,
+                stored,
             )
-
-
-def _look_like_lengths(scales: Column, positions: Column) -> bool:
-    """Return whether stored scales [N, 3] are more plausible as lengths than as their logarithms.
-
-    The sign does not decide: in a scene measured in millimetres, all logarithms can be positive.
-    """
-    if not (scales > 0).all():
-        return False
-    size = float(np.median(np.linalg.norm(positions - np.median(positions, axis=0), axis=1)))
-    if size == 0:
-        return False
-    typical, scale = math.log(TYPICAL_SCALE * size), float(np.median(scales))
-    return abs(math.log(scale) - typical) < abs(scale - typical)
 
 
 def read_ply(
@@ -198,8 +177,7 @@ def _read_columns(path: Path) -> dict[str, Column]:
         )
     if OWN_COMMENT not in content.comments:
         _warn_of_activated(vertices, path)
-        elements = [element.name for element in content]
-        report_header([*content.comments, *content.obj_info], elements, path)
+        report_header([*content.comments, *content.obj_info], path)
     for name in [name for name in table.dtype.names or () if is_filter(name)][:1]:
         logits, sizes = _stacked({**vertices, name: table[name]}, ["opacity", name]).T
         scales, logits = filtered(_stacked(vertices, SCALES), logits, sizes, path)

@@ -1,11 +1,8 @@
 """PLY files of other programs: how they are read, formats that are no PLY, and unknown columns."""
 
-import codecs
 import io
 import logging
 import re
-import zipfile
-import zlib
 from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,8 +12,7 @@ from numpy.typing import NDArray
 from plyfile import PlyData, PlyParseError, PlyProperty
 
 from gsbench.errors import InputError
-from gsbench.files import DAMAGE, GIT_LFS, LFS_REMEDY, require_regular
-from gsbench.words import some_of
+from gsbench.files import GIT_LFS, LFS_REMEDY, require_regular
 
 log = logging.getLogger(__name__)
 
@@ -24,15 +20,18 @@ MAX_HEADER = 1 << 16  # bytes
 END = b"end_header"
 MIN_TEXT_BYTES = 2  # minimum bytes of a value in an ASCII file: a digit and a space
 NOT_ASCII = re.compile(rb"[^\x00-\x7f]")
-# Formats that are not PLY, by the first bytes of a file. Sources: Niantic's repository "spz" (files
-# are compressed by gzip until version 3, later they start with NGSP); PlayCanvas's page on SOG (a
-# ZIP archive, or meta.json next to WebP images).
-SPZ, SOG = "SPZ", "SOG"
-# the first two have no magic number
-SUFFIXES = {".splat": "splat", ".ksplat": "ksplat", ".spz": SPZ, ".sog": SOG}
-GZIP, ZIP, PICKLE = b"\x1f\x8b", b"PK\x03\x04", b"\x80"
 CHECKPOINT = "a checkpoint of PyTorch: give the PLY that its trainer wrote or exports"
-CHECKPOINT_SUFFIXES = (".pth", ".pt", ".ckpt")
+UNPACK = "unpack it with npx @playcanvas/splat-transform {name} out.ply"
+# Files that are no PLY: endings, first bytes, and what they are. NGSP begins a file of SPZ 3 or
+# newer; older ones are compressed by gzip.
+OTHER_FORMATS: list[tuple[tuple[str, ...], tuple[bytes, ...], str]] = [
+    ((), (GIT_LFS,), LFS_REMEDY),
+    ((".pth", ".pt", ".ckpt"), (b"\x80",), CHECKPOINT),
+    ((".splat", ".ksplat", ".spz", ".sog"), (b"NGSP",), f"a packed model: {UNPACK}"),
+    ((), (b"PK\x03\x04",), "a ZIP archive: unpack it, and give the PLY in it"),
+    ((), (b"\x1f\x8b",), "compressed by gzip: gunzip {name}"),
+    ((), (b"{",), "JSON: give the PLY of a model"),
+]
 
 
 def read_header(path: Path) -> bytes:
@@ -44,14 +43,14 @@ def read_header(path: Path) -> bytes:
     require_regular(path)
     with path.open("rb") as stream:
         start = stream.read(MAX_HEADER)
-    start = start.removeprefix(codecs.BOM_UTF8)
     if not start.startswith(b"ply") and (kind := _other_format(path, start)):
         raise ValueError(f"it is {kind}")
     header, end, _ = start.partition(END)
     if not end:
         raise ValueError("it has no header")
     if b"element chunk" in header and b"packed_position" in header:
-        raise ValueError(f"it is a compressed PLY, as SuperSplat writes it: {_how_to_unpack(path)}")
+        unpack = UNPACK.format(name=path.name)
+        raise ValueError(f"it is a compressed PLY, as SuperSplat writes it: {unpack}")
     _check_length(header, path.stat().st_size)
     return header
 
@@ -84,67 +83,23 @@ def recognised_format(path: Path) -> str:
 
 
 def _other_format(path: Path, start: bytes) -> str:
-    """Describe a file that is no PLY by its first bytes and its name, and what to do; else ""."""
-    if start.startswith(GIT_LFS):
-        return LFS_REMEDY
-    suffix = path.suffix.lower()
-    if suffix in CHECKPOINT_SUFFIXES or start.startswith(PICKLE):
-        return CHECKPOINT
-    packed = SUFFIXES.get(suffix, "")
-    if start.startswith(ZIP) and not packed:
-        names = _names_in_zip(path)
-        if "data.pkl" in names:
-            return CHECKPOINT
-        if "meta.json" not in names:
-            return "a ZIP archive: unpack it, and give the PLY in it"
-        packed = SOG
-    elif start.startswith(GZIP) and not packed:
-        if _gunzipped(start).startswith(b"ply"):
-            return f"a PLY compressed by gzip: gunzip {path.name}"
-        packed = SPZ
-    elif start.startswith(b"{") and not packed:
-        if path.name != "meta.json" and b'"means"' not in start:
-            return "JSON: give the PLY of a model"
-        packed = SOG
-    if start.startswith(b"NGSP"):
-        packed = SPZ
-    return f"in the format {packed}: {_how_to_unpack(path)}" if packed else ""
-
-
-def _names_in_zip(path: Path) -> set[str]:
-    """The names of the files in a ZIP archive, without their folders; none if it is damaged."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return {name.rpartition("/")[2] for name in archive.namelist()}
-    except DAMAGE:
-        return set()
-
-
-def _gunzipped(start: bytes) -> bytes:
-    """The first bytes of gzip's data."""
-    try:
-        return zlib.decompressobj(wbits=31).decompress(start, 16)
-    except zlib.error:
-        return b""
-
-
-def _how_to_unpack(path: Path) -> str:
-    return f"unpack it with npx @playcanvas/splat-transform {path.name} out.ply"
+    """Describe a file that is no PLY by its name and its first bytes, and what to do; else ""."""
+    for endings, magic, words in OTHER_FORMATS:
+        if path.name.lower().endswith(endings) or start.startswith(magic):
+            return words.format(name=path.name)
+    return ""
 
 
 def read_ply_data(path: Path) -> tuple[PlyData, NDArray[Any]]:
     """Return the content of a PLY file, and the table of its vertices.
 
-    Unlike plyfile, it accepts a byte order mark and comments with characters beyond ASCII. Raises
-    as `read_header` does, ValueError without vertices, and other errors of `gsbench.files.DAMAGE`.
+    Unlike plyfile, it accepts comments with characters beyond ASCII. Raises as `read_header` does,
+    ValueError without vertices, and other errors of `gsbench.files.DAMAGE`.
     """
     header = read_header(path)
-    with path.open("rb") as stream:
-        marked = stream.read(len(codecs.BOM_UTF8)) == codecs.BOM_UTF8
     source: Any = str(path)
-    if marked or not header.isascii():
-        content = path.read_bytes().removeprefix(codecs.BOM_UTF8)
-        source = io.BytesIO(NOT_ASCII.sub(b"?", header) + content[len(header) :])
+    if not header.isascii():
+        source = io.BytesIO(NOT_ASCII.sub(b"?", header) + path.read_bytes()[len(header) :])
     try:
         data = PlyData.read(source)
     except PlyParseError as error:
@@ -173,28 +128,16 @@ HARMLESS = re.compile("red|green|blue")
 
 # Comments in a PLY's header. Brush writes SplatRenderMode, Postshot antialiased.
 ANTIALIASED = re.compile(r"SplatRenderMode:\s*mip|(antialiased|anti.?aliasing)\W*(1|true)", re.I)
-USUAL = re.compile(
-    r"\s*|(written|generated|exported|created|made|converted|saved|edited)\b.*|vertical axis.*"
-    r"|SplatRenderMode:\s*default|(antialiased|anti.?aliasing)\W*(0|false)|.*https?://.*",
-    re.I,
-)
 
 
-def report_header(comments: Sequence[str], elements: Collection[str], path: Path) -> None:
-    """Log what the header says beyond the columns: a render mode, unknown comments and elements."""
-    for comment in comments:
-        if ANTIALIASED.search(comment):
-            log.warning(
-                "%s: %r: its opacities belong to an antialiased rasterizer (Mip-Splatting); "
-                "gsbench draws them without it, and thin Gaussians come out too opaque",
-                path,
-                comment,
-            )
-    unknown = [text for text in comments if not (ANTIALIASED.search(text) or USUAL.fullmatch(text))]
-    unknown += [f"element {name}" for name in elements if name != "vertex"]
-    if unknown:
+def report_header(comments: Sequence[str], path: Path) -> None:
+    """Log a warning if a comment in the header says that the model is for another rasterizer."""
+    for comment in filter(ANTIALIASED.search, comments):
         log.warning(
-            "%s: not known and not used: %s", path, some_of([repr(text[:60]) for text in unknown])
+            "%s: %r: its opacities belong to an antialiased rasterizer (Mip-Splatting); gsbench "
+            "draws them without it, and thin Gaussians come out too opaque",
+            path,
+            comment,
         )
 
 

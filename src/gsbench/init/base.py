@@ -9,7 +9,6 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
-import numpy as np
 from annotated_types import Interval
 
 from gsbench.errors import InputError
@@ -60,15 +59,11 @@ class PointCloud:
     colors: ByteArray
 
     def __post_init__(self) -> None:
-        if self.points.ndim != 2 or self.points.shape[1] != 3 or self.points.dtype != np.float64:
-            raise ValueError(
-                f"points must be [P, 3] float64, got {self.points.shape} {self.points.dtype}"
-            )
-        if self.colors.shape != self.points.shape or self.colors.dtype != np.uint8:
-            raise ValueError(
-                f"colors must be {self.points.shape} uint8, got {self.colors.shape} "
-                f"{self.colors.dtype}"
-            )
+        shape = len(self.points), 3
+        for name, kind in (("points", "float64"), ("colors", "uint8")):
+            array = getattr(self, name)
+            if array.shape != shape or array.dtype != kind:
+                raise ValueError(f"{name} must be {shape} {kind}, got {array.shape} {array.dtype}")
 
     def __len__(self) -> int:
         return len(self.points)
@@ -95,8 +90,6 @@ class PoseErrors:
     num_images: int
     exact: bool
     center_rmse: float  # the absolute trajectory error (ATE)
-    center_mean: float
-    center_max: float
     center_rmse_relative: float | None  # None if the extent is 0
     rotation_mean_deg: float
     rotation_max_deg: float
@@ -118,7 +111,6 @@ class Gauge:
     threshold_over_extent_cubed: float | None
     threshold_radius: float  # radius of the sphere of volume V_th, in the model's units
     threshold_radius_over_extent: float | None
-    threshold_in_reference: float | None  # V_th as a volume in reference units
 
 
 @dataclass(frozen=True)
@@ -175,6 +167,7 @@ class Initializer(ABC):
         If only the points are new, derive from `PlacedCloud`. Its ``run`` adds cameras and
         report.
 
+        >>> import numpy as np
         >>> from gsbench.init.placed import PlacedCloud
         >>> @dataclass(frozen=True, kw_only=True)
         ... class Grid(PlacedCloud):

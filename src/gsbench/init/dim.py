@@ -7,9 +7,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar
 
-from annotated_types import Interval
 from pydantic import NonNegativeFloat, PositiveInt, TypeAdapter
 
 from gsbench.errors import InputError
@@ -28,7 +27,7 @@ from gsbench.words import some_of
 
 if TYPE_CHECKING:
     from gsbench.init.colmap.database import DatabaseTask
-    from gsbench.init.networks.features import Features, FeatureStore, Matches
+    from gsbench.init.networks import Features, FeatureStore, Matches
 
 logger = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -42,17 +41,16 @@ EXTRACTOR_WEIGHTS, LIGHTGLUE_WEIGHTS = (
     TypeAdapter(dict[str, WeightsFile]).validate_python(rows)
     for rows in table_beside(__file__, "weights.yaml").values()
 )
-Extractor = Literal["superpoint", "aliked", "disk"]
+Extractor = Literal["superpoint", "aliked"]
 Matcher = Literal["lightglue", "mutual_nearest"]
-AlikedModel = Literal["n16", "n16rot", "n32", "t16"]
 # Detection scores are not comparable between extractors. The thresholds and radii are
-# deep-image-matching's for superpoint, the authors' for the others.
-DETECTION = {"superpoint": (0.0005, 3), "aliked": (0.2, 2), "disk": (0.0, 2)}  # radii in px
+# deep-image-matching's for superpoint, the authors' for aliked.
+DETECTION = {"superpoint": (0.0005, 3), "aliked": (0.2, 2)}  # radii in px
 
 
 @dataclass(frozen=True, kw_only=True)
 class Dim(Reconstruction):
-    """Deep image matching: SuperPoint, ALIKED or DISK; LightGlue or mutual nearest neighbours.
+    """Deep image matching: SuperPoint or ALIKED; LightGlue or mutual nearest neighbours.
 
     ``max_image_size`` is in px of the longest side. Features and matches are stored in the
     ``work_dir`` of `run`, by image and by pair, so an interrupted run continues there.
@@ -68,26 +66,13 @@ class Dim(Reconstruction):
     max_image_size: ImageSize = 1600
     # mutual_nearest: distance to the best over the second-best match, tested in both directions
     max_ratio: MatchRatio = 0.95
-    # least detection score; null: the extractor's (superpoint 0.0005, aliked 0.2, disk 0); 0: no
-    # threshold
+    # least detection score; null: the extractor's (superpoint 0.0005, aliked 0.2); 0: no threshold
     keypoint_threshold: NonNegativeFloat | None = None
-    # px between keypoints; null: the extractor's (superpoint 3, aliked 2, disk 2)
-    nms_radius: Annotated[int, Interval(ge=1, le=50)] | None = None
-    aliked_model: AlikedModel = "n16"  # n16 | n16rot | n32 | t16 (LightGlue's weights are for n16)
     filter_threshold: Fraction = 0.1  # lightglue: least score of a match
     # folder with the weights files; null: $GSBENCH_WEIGHTS, then the torch hub cache
     weights: AnyPath | None = None
     download: bool = True  # fetch missing weights into the torch hub cache
     device: str = "cpu"  # of the networks
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        choice = self.extractor, self.matcher, self.aliked_model
-        if choice == ("aliked", "lightglue", "t16"):
-            raise InputError(
-                "init.matcher=lightglue has no weights for init.aliked_model=t16: use "
-                "mutual_nearest"
-            )
 
     @property
     def extraction(self) -> dict[str, Any]:
@@ -100,8 +85,8 @@ class Dim(Reconstruction):
             "keypoint_threshold": (
                 threshold if self.keypoint_threshold is None else self.keypoint_threshold
             ),
-            "nms_radius": radius if self.nms_radius is None else self.nms_radius,
-        } | ({"aliked_model": self.aliked_model} if self.extractor == "aliked" else {})
+            "nms_radius": radius,
+        }
 
     @property
     def matching(self) -> dict[str, Any]:
@@ -122,8 +107,7 @@ class Dim(Reconstruction):
     @property
     def _weights(self) -> tuple[list[WeightsFile], Path | None]:
         """The files, and the folder that is searched first."""
-        model = f"-{self.aliked_model}" if self.extractor == "aliked" else ""
-        files = [EXTRACTOR_WEIGHTS[self.extractor + model]]
+        files = [EXTRACTOR_WEIGHTS[self.extractor]]
         if self.matcher == "lightglue":
             files.append(LIGHTGLUE_WEIGHTS[self.extractor])
         return files, None if self.weights is None else Path(self.weights).expanduser()
@@ -157,11 +141,6 @@ class Dim(Reconstruction):
         with timer.phase("match"):
             matches = {pair: store.matches(*pair) for pair in _steps(pairs, "match", progress)}
         found = {pair: indices for pair, indices in matches.items() if len(indices)}
-        if not found:  # also true if no pair was selected
-            raise InputError(
-                f"{self.name}: no pair of images has a match: the photos need more overlap or "
-                "texture"
-            )
         counts |= {
             "pairs_selected": len(pairs),
             "pairs_without_matches": len(pairs) - len(found),
@@ -185,29 +164,29 @@ class Dim(Reconstruction):
         """The features and matches of the job's photographs, computed where none are stored."""
         import torch
 
-        from gsbench.init.networks import features, models
+        from gsbench.init import networks
         from gsbench.system.resources import select_device
 
         torch.set_num_threads(self.num_threads)
         device = select_device(self.device, "init.device")
         extraction, matching = self.extraction, self.matching
         # loaded when an image needs them, since a run that is continued may need no network
-        build = models.EXTRACTORS[self.extractor]
+        build = networks.EXTRACTORS[self.extractor]
         extractor = cache(partial(build, extraction, weights[0], device))
-        matcher = cache(partial(models.build_matcher, extraction, matching, weights[-1], device))
+        matcher = cache(partial(networks.build_matcher, extraction, matching, weights[-1], device))
 
         def extract(name: str) -> Features:
             path, mask = job.capture.images / name, job.capture.masks.get(name)
-            found = models.extract_features(path, extractor(), extraction, device)
+            found = networks.extract_features(path, extractor(), extraction, device)
             return found if mask is None else found.within(read_mask(mask))
 
         def match(*pair: Features) -> Matches:
-            return models.match(matcher(), *pair)
+            return networks.match(matcher(), *pair)
 
         room = 2 + CACHE_BYTES // (BYTES_OF_KEYPOINT * self.max_keypoints)
         settings = extraction, matching, digests
-        folder = features.store_folder(job.work_dir, job.capture, names, *settings)
-        return features.FeatureStore(folder, extract, match, room)
+        folder = networks.store_folder(job.work_dir, job.capture, names, *settings)
+        return networks.FeatureStore(folder, extract, match, room)
 
 
 def _steps(items: Sequence[T], phase: str, progress: Progress) -> Iterator[T]:

@@ -58,8 +58,6 @@ class ColmapOptions(Initializer):
     camera_model: CameraModel = "SIMPLE_RADIAL"
     # px of the image files, an initial value; null: from EXIF, else 1.2 x the longest side
     focal_length: PositiveFloat | None = None
-    # with own poses: estimate | reference (those of the reference, fixed)
-    intrinsics: Literal["estimate", "reference"] = "estimate"
     # exhaustive | auto (above 30 images, pairs that a preview proposes) | sequential (file names
     # in the order of shooting)
     pairs: Pairing = "exhaustive"
@@ -70,7 +68,6 @@ class ColmapOptions(Initializer):
     # auto (incremental; if it places few images: smaller angles, global, assumed focal lengths) |
     # incremental | global
     mapper: Literal["auto", "incremental", "global"] = "auto"
-    min_model_size: Annotated[int, Ge(2)] = 3  # images; smaller models of the mapper are dropped
     # keep points that only two images see: 1.7 times the points of sfm, but less accurate
     two_view_tracks: bool = False
     # all views | train (test views contribute no points or colours: docs/splits.md)
@@ -88,18 +85,12 @@ class ColmapOptions(Initializer):
 
     def needs_reference(self, capture: Capture) -> bool:
         """Return whether `run` needs a ``reference`` because the capture came without cameras."""
-        needs_poses = self.poses == "shared" and not self.is_own_reference
-        return capture.model is None and (needs_poses or self.intrinsics == "reference")
+        return capture.model is None and self.poses == "shared" and not self.is_own_reference
 
     @property
     def num_threads(self) -> int:
         """``threads`` as a number; ``auto`` is the number of cores that this process may use."""
         return available_cores() if self.threads == "auto" else self.threads
-
-    @property
-    def uses_reference_cameras(self) -> bool:
-        """Return whether at least the intrinsics are taken from the reference, if there is one."""
-        return self.poses == "shared" or self.intrinsics == "reference"
 
     def ignores_test_photographs(self, reference: pycolmap.Reconstruction | None) -> bool:
         """Return whether test photographs are not read at all: given cameras do not need them."""
@@ -109,7 +100,7 @@ class ColmapOptions(Initializer):
         self, capture: Capture, reference: pycolmap.Reconstruction | None
     ) -> list[str]:
         """The sorted names of the images to use: those of the reference if its cameras are used."""
-        if reference is None or not self.uses_reference_cameras:
+        if reference is None or self.poses == "own":
             return sorted(capture.image_names)
         names = {image.name for image in reference.images.values() if image.has_pose}
         if self.ignores_test_photographs(reference):
@@ -134,5 +125,3 @@ class SiftOptions(ColmapOptions):
     # -1 doubles the image before detection; 0 is several times faster, with fewer points
     first_octave: Annotated[int, Interval(ge=-1, le=5)] = -1
     max_ratio: MatchRatio = 0.8  # distance to the best over the second-best match
-    cross_check: bool = True  # matches must be mutual
-    guided_matching: bool = False  # match again along the epipolar lines

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import numpy as np
 from annotated_types import Interval
-from numpy.typing import NDArray
 from pydantic import PositiveFloat, PositiveInt
 
 from gsbench.errors import InputError
@@ -31,9 +30,7 @@ from gsbench.init.base import (
 )
 from gsbench.init.point_files import read_points
 from gsbench.logs import Progress, no_progress
-from gsbench.scene.beside import read_mask
-from gsbench.scene.images import read_image
-from gsbench.scene.types import Array, Capture
+from gsbench.scene.types import Capture
 from gsbench.settings import AnyPath, check_settings
 from gsbench.system.isolate import run_isolated
 
@@ -179,26 +176,8 @@ class Random(PlacedCloud):
         return PointCloud(center + self.size * extent * cube, colors)
 
 
-def points_in_view(
-    points: Array, name: str, model: pycolmap.Reconstruction
-) -> tuple[NDArray[np.int64], Array, Array]:
-    """Indices [V], pixels [V, 2] and distances [V] of the ``points`` [P, 3] in view of ``name``.
-
-    All three are empty if the image has no pose in the model. Occlusion is ignored.
-    """
-    image = model.find_image_with_name(name)
-    if image is None or not image.has_pose:
-        return np.empty(0, np.int64), np.empty((0, 2)), np.empty(0)
-    local, camera = image.cam_from_world() * points, model.cameras[image.camera_id]
-    pixels = np.asarray(camera.img_from_cam(local))  # [P, 2]; NaN behind the camera
-    with np.errstate(invalid="ignore"):
-        inside = (pixels >= 0) & (pixels < (camera.width, camera.height))
-    (seen,) = np.nonzero(inside.all(axis=1))
-    return seen, pixels[seen], np.linalg.norm(local[seen], axis=1)
-
-
 MAX_LISTED = 3  # models that an error lists
-GREY = 128  # for points without a colour in the file and out of view of all training cameras
+GREY = 128  # of points without a colour
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -228,8 +207,7 @@ class FromFile(PlacedCloud):
 class Points(FromFile):
     """The points of a file, which must have the coordinates of the reference cameras.
 
-    At most ``max_points`` random points are kept. If the file has no colours, a point's colour
-    comes from the photograph of the nearest training camera that has it in view.
+    At most ``max_points`` random points are kept. Without colours in the file, all are grey.
     """
 
     name: ClassVar[str] = "points"
@@ -242,34 +220,9 @@ class Points(FromFile):
         order = np.random.default_rng(self.seed).permutation(len(points))
         chosen = np.sort(order[: self.max_points])
         points = capture.normalization.apply(points)[chosen]
-        if colors is not None:
-            return PointCloud(points, colors[chosen])
-        seen = seen_colors(points, capture, model)
-        return PointCloud(points, np.where(seen < 0, GREY, seen).astype(np.uint8))
-
-
-def seen_colors(
-    points: Array, capture: Capture, model: pycolmap.Reconstruction
-) -> NDArray[np.int16]:
-    """Colours [P, 3] of ``points`` from the nearest training camera that has them in view, else -1.
-
-    Occlusion is ignored; the nearest camera is the least likely to be occluded. Pixels that a mask
-    ignores give no colour.
-    """
-    colors = np.full((len(points), 3), -1, dtype=np.int16)
-    nearest = np.full(len(points), np.inf)
-    for name in capture.train_names:
-        seen, pixels, distance = points_in_view(points, name, model)
-        if name in capture.masks and len(seen):
-            column, row = pixels.astype(np.int64).T
-            counted = read_mask(capture.masks[name])[row, column]  # [V]
-            seen, pixels, distance = seen[counted], pixels[counted], distance[counted]
-        nearer = distance < nearest[seen]
-        kept, (column, row) = seen[nearer], pixels[nearer].astype(np.int64).T
-        if len(kept):
-            colors[kept] = read_image(capture.images / name)[row, column]
-        nearest[kept] = distance[nearer]
-    return colors
+        if colors is None:
+            return PointCloud(points, np.full(points.shape, GREY, np.uint8))
+        return PointCloud(points, colors[chosen])
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,10 +1,9 @@
-"""Reading clouds of points: PLY files of any program, and tables of numbers as text."""
+"""Reading clouds of points: PLY files of any program."""
 
-import io
 import logging
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -13,57 +12,37 @@ from numpy.typing import NDArray
 from gsbench.errors import InputError
 from gsbench.files import DAMAGE, require_regular
 from gsbench.gaussians.ply_files import read_ply_data, recognised_format
-from gsbench.parsing import one_line, without_byte_order_mark
+from gsbench.parsing import one_line
 from gsbench.scene.types import Array, ByteArray
 
 log = logging.getLogger(__name__)
 
-Columns = Mapping[str, NDArray[np.generic]]  # [P] by the names in the file
-
 DC_NAMES = ("f_dc_0", "f_dc_1", "f_dc_2")
 SH_C0 = 0.5 / math.sqrt(math.pi)  # the constant spherical harmonic, by which 3DGS multiplies f_dc
-TEXT_SUFFIXES = (".xyz", ".txt", ".csv", ".pts", ".asc")
 COLOR_NAMES = (("red", "green", "blue"), ("r", "g", "b"))
 WITHOUT_COLOR = frozenset(("x", "y", "z", "nx", "ny", "nz"))
 # Before the name of a column: CloudCompare writes colours that it computed as scalar_R.
-PREFIX = re.compile(
-    r"^(pos(ition)?|coord(inate)?|point|vertex|colou?r|rgb|diffuse|ambient|scalar)(?=[\W_])"
-)
-# Columns of a table without names, by their number.
-LAYOUTS = {3: "x y z", 6: "x y z red green blue"}
-# scanners write the intensity before the colour
-PTS_LAYOUTS = LAYOUTS | {4: "x y z intensity", 7: "x y z intensity red green blue"}
+PREFIX = re.compile(r"^(colou?r|rgb|diffuse|ambient|scalar)_")
 # Colours up to this are fractions, even if tone mapping or rounding went beyond 1. As bytes they
 # would all be black.
 MAX_FRACTION = 2.0
-ROW = re.compile(r'"?[-+]?(\.?\d[\d.]*(e[-+]?\d+)?|nan|inf(inity)?)"?(?=[\s,;]|$)', re.I)
-NO_ROW = re.compile(r"\d+$|#|//")  # a count of points, or a comment
 OF_COLMAP = "it belongs to a COLMAP model: init=dataset reads its folder"
-REMEDY = (
-    "wanted are rows of x y z [red green blue] with decimal points, below a first line such as "
-    "x,y,z,red,green,blue if there are other columns: save it so, or as PLY with CloudCompare"
-)
+REMEDY = "convert it to PLY with the properties x, y, z [red, green, blue], such as by CloudCompare"
 
 
 def read_points(path: Path) -> tuple[Array, ByteArray | None]:
     """Read points [P, 3] float64 and colours [P, 3], or None for a file without colours.
 
-    The suffix tells the format. A ``.ply`` file, text or binary, has vertices with x, y, z in any
-    order and type, and colours as whole numbers or in [0, 1]. A text file has the columns that its
-    first line names, else those of `LAYOUTS`. Raises ``InputError`` for a file that cannot be read,
+    The file is a PLY, text or binary, whose vertices have x, y, z in any order and type, and
+    colours as whole numbers or in [0, 1]. Raises ``InputError`` for a file that cannot be read,
     holds no point, or has a coordinate or colour that is not a finite number.
     """
-    suffix = path.suffix.lower()
     require_regular(path)
     try:
-        if suffix == ".ply":
-            _, vertices = read_ply_data(path)
-            columns: Columns = {name: vertices[name] for name in vertices.dtype.names or ()}
-        elif suffix in TEXT_SUFFIXES:
-            columns = _read_table(path)
-        else:
+        if path.suffix.lower() != ".ply":
             raise ValueError(_other_format(path))
-        points, colors = _points_and_colors(columns, path)
+        _, vertices = read_ply_data(path)
+        points, colors = _points_and_colors(vertices, path)
     except DAMAGE as error:
         raise InputError(
             f"{path}: not a readable file of points ({one_line(str(error))})"
@@ -86,46 +65,14 @@ def read_points(path: Path) -> tuple[Array, ByteArray | None]:
 def _other_format(path: Path) -> str:
     if path.stem in ("points3D", "images", "cameras"):
         return OF_COLMAP
-    if kind := recognised_format(path):
-        return f"it is {kind}"
-    known = ", ".join((".ply", *TEXT_SUFFIXES))
-    return f"known are {known}: convert it to PLY, for example with CloudCompare"
+    kind = recognised_format(path)
+    return f"it is {kind}" if kind else f"it is no PLY: {REMEDY}"
 
 
-def _read_table(path: Path) -> Columns:
-    """Read rows of numbers; raises ValueError for other tables.
-
-    Names may come first, also behind ``//`` or ``#``. A line of one number is the count of points,
-    with which each scan of a ``.pts`` file begins.
-    """
-    import pandas as pd  # here, since it is slow to import
-
-    text = without_byte_order_mark(path.read_bytes()).decode(errors="replace")
-    if "POINT3D_ID" in text[:1000]:
-        raise ValueError(OF_COLMAP)
-    lines = [line.strip(" \t,;") for line in text.splitlines() if line.strip()]
-    first = next((k for k, line in enumerate(lines) if ROW.match(line)), len(lines))
-    rows = [line for line in lines[first:] if not NO_ROW.match(line)]
-    if not rows:
-        raise ValueError(f"no line is a row of numbers: {REMEDY}")
-    between = next((mark for mark in ",;" if mark in rows[0]), r"\s+")
-    try:
-        table = pd.read_csv(io.StringIO("\n".join(rows)), sep=between, header=None)
-        values = table.to_numpy(dtype=np.float64)  # [P, columns]
-    except ValueError as error:  # pandas' errors are
-        raise ValueError(f"{error}; {REMEDY}") from error
-    head, count = lines[first - 1].strip(" \t,;/#") if first else "", values.shape[1]
-    words = re.split("[,;]" if re.search("[,;]", head) else r"\s+", head)
-    if len(words) != count:
-        layouts = PTS_LAYOUTS if path.suffix.lower() == ".pts" else LAYOUTS
-        words = layouts.get(count, "").split()
-    if not words:
-        raise ValueError(f"it has {count} columns without names: {REMEDY}")
-    return {word.strip(" \t\"'"): column for word, column in zip(words, values.T, strict=True)}
-
-
-def _points_and_colors(columns: Columns, path: Path) -> tuple[Array, NDArray[np.generic] | None]:
-    """Points [P, 3] and colours [P, 3], or None, from columns with any of the known names.
+def _points_and_colors(
+    vertices: NDArray[np.void], path: Path
+) -> tuple[Array, NDArray[np.generic] | None]:
+    """Points [P, 3] and colours [P, 3], or None, from properties with any of the known names.
 
     One log line names the columns that are not used if there is no colour.
     """
@@ -133,8 +80,9 @@ def _points_and_colors(columns: Columns, path: Path) -> tuple[Array, NDArray[np.
     def stacked(names: Iterable[str]) -> NDArray[np.generic]:
         return np.stack([known[name] for name in names], axis=1)
 
-    known = {_plain(name): column for name, column in columns.items()}
-    known |= {name.lower(): column for name, column in columns.items()}
+    names = vertices.dtype.names or ()
+    known = {PREFIX.sub("", name.lower()): vertices[name] for name in names}
+    known |= {name.lower(): vertices[name] for name in names}
     if lacking := [name for name in "xyz" if name not in known]:
         raise ValueError(f"it has no column {', '.join(lacking)}: {REMEDY}")
     points = stacked("xyz").astype(np.float64)
@@ -144,18 +92,11 @@ def _points_and_colors(columns: Columns, path: Path) -> tuple[Array, NDArray[np.
     for group in COLOR_NAMES:
         if known.keys() >= {*group}:
             return points, stacked(group)
-    if others := [name for name in columns if _plain(name) not in WITHOUT_COLOR]:
+    if others := [name for name in names if name.lower() not in WITHOUT_COLOR]:
         log.warning(
             "%s: it has no red, green and blue, and its %s is not used", path, ", ".join(others)
         )
     return points, None
-
-
-def _plain(word: str) -> str:
-    """The name of a column without its unit: ``x`` for ``X [m]``, ``r`` for ``Color R``."""
-    name = PREFIX.sub("", re.sub(r"[\[(].*", "", word.lower()).strip())
-    name = re.sub(r"[^a-z_]", "", name).strip("_")
-    return name[0] if name in ("rf", "gf", "bf") else name  # as CloudCompare writes
 
 
 def _eight_bits(colors: NDArray[np.generic]) -> ByteArray:

@@ -61,15 +61,13 @@ def measure_gauge(extent: float, scale_to_reference: float | None) -> Gauge:
     """Express the paper's V_th in the units of a model with the scene extent ``extent``."""
     # a sphere of volume V_th: 4/3 pi r^3 = V_th
     radius = (3 * VOLUME_THRESHOLD / (4 * math.pi)) ** (1 / 3)
-    scale = scale_to_reference
     return Gauge(
         scene_extent=extent,
-        scale_to_reference=scale,
+        scale_to_reference=scale_to_reference,
         volume_threshold=VOLUME_THRESHOLD,
         threshold_over_extent_cubed=VOLUME_THRESHOLD / extent**3 if extent > 0 else None,
         threshold_radius=radius,
         threshold_radius_over_extent=radius / extent if extent > 0 else None,
-        threshold_in_reference=None if scale is None else VOLUME_THRESHOLD * scale**3,
     )
 
 

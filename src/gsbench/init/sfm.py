@@ -73,8 +73,7 @@ class Reconstruction(ColmapOptions):
         if reference is None and self.needs_reference(capture):
             raise InputError(
                 f"init={self.name} takes its cameras from a reference, and scene {capture.name} "
-                "came without: make one with init=sfm first, or set init.poses=own and "
-                "init.intrinsics=estimate"
+                "came without: make one with init=sfm first, or set init.poses=own"
             )
 
     def run(
@@ -91,7 +90,7 @@ class Reconstruction(ColmapOptions):
         ``output_dir`` until the run succeeds, so that an interrupted run continues there.
         """
         self.check(capture, reference)
-        if self.uses_reference_cameras and (reference or capture.model) is not None:
+        if self.poses == "shared" and (reference or capture.model) is not None:
             report_unused(self)
         elif self.camera == "exif":
             report_lenses(capture)
@@ -113,7 +112,7 @@ def report_unused(options: ColmapOptions) -> None:
         if (value := getattr(options, name)) != getattr(ColmapOptions, name):
             logger.warning(
                 "init.%s=%s is not used, since the cameras are given: init.poses=own "
-                "init.intrinsics=estimate estimates them",
+                "estimates them",
                 name,
                 value,
             )
@@ -121,7 +120,7 @@ def report_unused(options: ColmapOptions) -> None:
 
 def report_lenses(capture: Capture) -> None:
     """Write one line if the photographs have several lenses or zooms, which get cameras each."""
-    counts = Counter(str(lens_of(capture.images / name)) for name in capture.image_names)
+    counts = Counter(lens_of(capture.images / name) for name in capture.image_names)
     if len(counts) > 1:
         logger.warning(
             "%s: by EXIF, the photographs have %d focal lengths or lenses, and get a camera for "

@@ -286,7 +286,6 @@ def _publish(
     links[folder / layout.PER_VIEW] = evaluated / layout.PER_VIEW
     pictures = {
         layout.RENDERS: evaluated / layout.RENDERS,
-        layout.FIGURES: evaluated / layout.FIGURES,
         layout.GROUND_TRUTH: truth,
         layout.MASKS: truth / layout.MASKS,
     }

@@ -100,8 +100,8 @@ class CameraNumbers(NamedTuple):
             camera.height,
             -(-camera.width // tile),
             -(-camera.height // tile),
-            camera.fx,
-            camera.fy,
+            float(camera.fx),  # kernels would be compiled again for whole numbers
+            float(camera.fy),
             camera.cx - 0.5,
             camera.cy - 0.5,
             *slope_limits(camera),

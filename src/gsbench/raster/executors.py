@@ -80,7 +80,7 @@ def find_executor(name: str) -> Executor:
             return executor
     raise InputError(
         f"raster={name} is not known; choose {', '.join(names())}, or set raster._target_ to a "
-        "class of your own"
+        f"class of your own{did_you_mean(name, names())}"
     )
 
 
@@ -192,9 +192,5 @@ class RasterConfig:
 
     def __post_init__(self) -> None:
         check_settings(self, "raster")
-        if self._target_ is None and self.name not in names():
-            choices = ", ".join(names())
-            raise InputError(
-                f"raster must be one of {choices}, got "
-                f"{self.name!r}{did_you_mean(self.name, names())}"
-            )
+        if self._target_ is None and self.name != AUTO:
+            find_executor(self.name)

@@ -71,7 +71,7 @@ INIT = Stage("init", 4, resumable=True)
 TRAIN = Stage("train", 4, resumable=True, scratch=("checkpoint-*.pt",))
 GROUND_TRUTH = Stage("ground_truth", 1)
 EVALUATE = Stage("evaluate", 3)
-VIEWS = Stage("views", 4)  # undistorted photographs of their final size; no step of a trial
+VIEWS = Stage("views", 5)  # undistorted photographs of their final size; no step of a trial
 
 STAGES = (CAPTURE, INIT, TRAIN, GROUND_TRUTH, EVALUATE)
 

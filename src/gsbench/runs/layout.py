@@ -47,5 +47,3 @@ TRAINER_LOG = "trainer.log"  # the output of another program that trained
 LINEAGE = "lineage.npz"  # each Gaussian's parent, and the rule that made it
 RENDERS, GROUND_TRUTH = "renders", "ground_truth"  # a picture per test view
 MASKS = "masks"  # masks of test views: ignored pixels are black
-FIGURES = "figures"  # pictures for the report
-ELLIPSOIDS = "ellipsoids.png"  # in FIGURES

@@ -344,7 +344,7 @@ class TrialFolder:
             raise DamagedError(path, f"is damaged ({one_line(repr(error))})") from None
 
     def pictures(self, kind: str) -> list[Path]:
-        """The pictures of a kind (``renders``, ``ground_truth``, ``figures``), sorted by name."""
+        """The pictures of a kind (``renders``, ``ground_truth``), sorted by name."""
         return sorted((self.path / kind).glob("*.png"))
 
     def _unchanged(self, name: str) -> bytes:

@@ -78,14 +78,10 @@ def read_reference(capture: Capture) -> pycolmap.Reconstruction:
     the model has a track. The ids of cameras, images and points are kept; if the files of one
     camera have different sizes, each further size gets a new camera.
 
-    Raises `InputError` if there is no model, or if the aspect ratios of an image and its camera
-    differ by more than rounding.
+    Raises `InputError` if the aspect ratios of an image and its camera differ by more than
+    rounding.
     """
-    if capture.model is None:
-        raise InputError(
-            f"scene {capture.name}: no COLMAP model came with these photos: use init=sfm "
-            "init.poses=own"
-        )
+    assert capture.model is not None
     model = read_model(capture.model)
     posed = posed_images(model)
     names = match_anywhere(sorted(posed), capture.image_names)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from gsbench.errors import InputError
+from gsbench.scene.names import match
 from gsbench.scene.options import SplitRule
 from gsbench.scene.types import Array
 from gsbench.words import counted, some_of
@@ -136,6 +137,19 @@ def select_images(names: Sequence[str], max_images: int) -> list[str]:
     if len(names) <= max_images:
         return list(names)
     return [names[k * len(names) // max_images] for k in range(max_images)]
+
+
+def resolve(wanted: Sequence[str] | None, names: Sequence[str]) -> list[str] | None:
+    """The image files among ``names`` that a list names; extensions may be missing or differ."""
+    if wanted is None:
+        return None
+    matches = match(wanted, names)
+    if unknown := [name for name in wanted if name not in matches]:
+        raise InputError(
+            f"the split lists name {some_of(unknown)}, not among the usable images: correct the "
+            "lists"
+        )
+    return sorted(matches.values())
 
 
 def split_names(

@@ -10,7 +10,6 @@ import sys
 from collections import Counter
 from collections.abc import Iterable
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from PIL import Image, UnidentifiedImageError
 from gsbench.errors import InputError
 from gsbench.files import GIT_LFS, LFS_REMEDY, MAX_NAME_BYTES, require_regular
 from gsbench.scene.names import FILES, IMAGE_SUFFIXES
-from gsbench.scene.options import Backdrop, Resample
+from gsbench.scene.options import Backdrop
 from gsbench.scene.types import ByteArray
 from gsbench.words import counted, is_one_line, some_of
 
@@ -32,11 +31,6 @@ NOT_READ = {suffix: kind for kind, own in FILES["not_read"].items() for suffix i
 # on every file.
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")  # JPEG includes MPO, which holds several JPEGs
 EXIF_ORIENTATION = 0x0112
-_FILTERS = {
-    "lanczos": Image.Resampling.LANCZOS,
-    "area": Image.Resampling.BOX,
-    "bicubic": Image.Resampling.BICUBIC,
-}
 _SIXTEEN_BIT_MODES = ("I;16", "I;16L", "I;16B", "I;16N")
 _WIDE_MODES = ("I", "F")  # 32-bit integers and floats, which have no agreed value for white
 
@@ -148,18 +142,14 @@ def read_image(path: Path, backdrop: Backdrop = "black") -> ByteArray:
         return np.array(image.convert("RGB"), dtype=np.uint8)
 
 
-def resize_image(
-    image: ByteArray, width: int, height: int, resample: Resample = "lanczos"
-) -> ByteArray:
-    """The image [H, W, 3] at another size.
+def resize_image(image: ByteArray, width: int, height: int) -> ByteArray:
+    """The image [H, W, 3] at another size, by a windowed sinc with three lobes.
 
-    ``lanczos`` is Pillow's windowed sinc with three lobes, widened by the scale against aliasing.
-    ``bicubic`` is Pillow's with a = -0.5, widened too. ``area`` is the mean over each new pixel's
-    area.
+    Pillow widens it by the scale against aliasing.
     """
     if image.shape[:2] == (height, width):
         return image
-    return np.array(Image.fromarray(image).resize((width, height), _FILTERS[resample]))
+    return np.array(Image.fromarray(image).resize((width, height), Image.Resampling.LANCZOS))
 
 
 def check_size(path: Path, size: tuple[int, int], camera_size: tuple[int, int]) -> None:
@@ -218,51 +208,36 @@ def write_png(image: ByteArray, path: Path, exif: bytes = b"") -> None:
 
 
 MAKE, MODEL, EXIF_IFD = 0x010F, 0x0110, 0x8769
-MAX_TEXT = 80  # characters
 FOCAL_LENGTH, FOCAL_LENGTH_35MM, DIGITAL_ZOOM, LENS = 0x920A, 0xA405, 0xA404, 0xA434
+MAX_TEXT = 80  # characters
+UNKNOWN_CAMERA = "unknown camera"
 
 
-@dataclass(frozen=True)
-class Lens:
-    """Camera and lens of a photograph; photographs with equal ones can share their intrinsics.
+def lens_of(path: Path) -> str:
+    """Camera, lens and focal lengths of a photograph, as far as its EXIF data say them.
 
-    ``focal_length`` in mm, ``equivalent`` in mm on 35 mm film, which a digital zoom changes too.
+    Photographs with equal ones can share their intrinsics. A digital zoom changes the focal length
+    on 35 mm film, too.
     """
-
-    camera: str = ""
-    lens: str = ""
-    focal_length: float | None = None
-    equivalent: float | None = None
-    digital_zoom: float | None = None
-
-    def __str__(self) -> str:
-        parts = [self.camera or "unknown camera", self.lens]
-        if self.equivalent is not None:
-            parts.append(f"{self.equivalent:g} mm (on 35 mm film)")
-        elif self.focal_length is not None:
-            parts.append(f"{self.focal_length:g} mm")
-        if self.digital_zoom is not None:
-            parts.append(f"digital zoom {self.digital_zoom:g}")
-        return " ".join(filter(None, parts))
-
-
-def lens_of(path: Path) -> Lens:
-    """The lens of a photograph; the fields that its EXIF data do not say stay empty."""
     with open_image(path) as image:
         try:
             exif = image.getexif()
             own = exif.get_ifd(EXIF_IFD)
         except Exception:  # noqa: BLE001 - as in `open_image`; the pixels may still be intact
-            return Lens()
+            return UNKNOWN_CAMERA
     make, model = _text(exif.get(MAKE)), _text(exif.get(MODEL))
-    zoom = _number(own.get(DIGITAL_ZOOM))
-    return Lens(
-        camera=model if model.startswith(make) else f"{make} {model}".strip(),
-        lens=_text(own.get(LENS)),
-        focal_length=_number(own.get(FOCAL_LENGTH)),
-        equivalent=_number(own.get(FOCAL_LENGTH_35MM)),
-        digital_zoom=None if zoom == 1 else zoom,  # as if the photograph did not say
+    camera = model if model.startswith(make) else f"{make} {model}".strip()
+    focal, on_film, zoom = map(
+        _number, map(own.get, (FOCAL_LENGTH, FOCAL_LENGTH_35MM, DIGITAL_ZOOM))
     )
+    parts = [
+        camera or UNKNOWN_CAMERA,
+        _text(own.get(LENS)),
+        f"{focal:g} mm" if focal else "",
+        f"({on_film:g} mm on 35 mm film)" if on_film else "",
+        f"digital zoom {zoom:g}" if zoom and zoom != 1 else "",
+    ]
+    return " ".join(filter(None, parts))
 
 
 def _text(value: Any) -> str:

@@ -11,11 +11,11 @@ length. It runs on pixels in memory, so images are not compressed as JPEG again.
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from pydantic import Field
@@ -38,8 +38,8 @@ from gsbench.scene.beside import (
 )
 from gsbench.scene.colmap_files import model_files
 from gsbench.scene.images import read_image, resize_image, write_png
-from gsbench.scene.options import PrincipalPoint, Resample, downscaled_size
-from gsbench.scene.rules import MIN_IMAGES, inspect, settle
+from gsbench.scene.options import PrincipalPoint, downscaled_size, require_enough
+from gsbench.scene.rules import inspect, settle
 from gsbench.scene.types import Camera, CameraModel, Capture, Scene, View, to_pinhole
 from gsbench.scene.undistortion import lens_findings, undistort
 from gsbench.system.install import version_of
@@ -49,7 +49,6 @@ from gsbench.system.resources import in_threads
 log = logging.getLogger(__name__)
 
 CAMERAS_FILE = "cameras.json"
-INTRINSICS = ("width", "height", "fx", "fy", "cx", "cy")
 # images per isolated process: limits what a crash loses, and progress is reported after each chunk
 _CHUNK = 16
 
@@ -65,16 +64,12 @@ class PreparedView(Record):
     pose: tuple[Row, Row, Row]  # world to camera
     width: Count
     height: Count
-    fx: Length
-    fy: Length
-    cx: Number
-    cy: Number
+    params: tuple[Length, Length, Number, Number]  # fx, fy, cx, cy
 
     @property
     def camera(self) -> Camera:
         pose = np.array(self.pose, dtype=np.float64)  # [3, 4]
-        intrinsics: dict[str, Any] = {key: getattr(self, key) for key in INTRINSICS}
-        return Camera(**intrinsics, rotation=pose[:, :3], translation=pose[:, 3])
+        return Camera(self.width, self.height, *self.params, pose[:, :3], pose[:, 3])
 
 
 class PreparedViews(Record):
@@ -88,9 +83,7 @@ def load_scene(
     capture: Capture,
     model_dir: Path,
     store: Store,
-    downscale: int = 1,
     max_size: int | None = None,
-    resample: Resample = "lanczos",
     principal_point: PrincipalPoint = "used",
     progress: Progress = no_progress,
     beside: Sequence[str] = (),
@@ -98,17 +91,15 @@ def load_scene(
 ) -> Scene:
     """Load the views of a capture with the cameras of the COLMAP model in ``model_dir``.
 
-    Images of a distorted camera are undistorted. Then all images are shrunk by ``downscale`` and to
-    a longest side of ``max_size`` px (see `downscaled_size`). ``principal_point="centred"`` moves
-    principal points to the image centre, as 3DGS assumes. Views without a pose in the model are
-    left out with a warning. ``beside`` are kinds of pictures beside the photographs
-    (`gsbench.scene.beside`). ``progress`` counts images.
+    Images of a distorted camera are undistorted. Then all images are shrunk to a longest side of
+    ``max_size`` px. ``principal_point="centred"`` moves principal points to the image centre, as
+    3DGS assumes. Views without a pose in the model are left out with a warning. ``beside`` are
+    kinds of pictures beside the photographs (`gsbench.scene.beside`). ``progress`` counts images.
 
     Raises `InputError` if fewer than three views or no training view have a pose, or an image does
     not fit its camera.
     """
-    shrinking = {"downscale": downscale, "max_size": max_size, "resample": resample}
-    folder = store.get(views_step(capture, model_dir, shrinking, progress)).path
+    folder = store.get(views_step(capture, model_dir, max_size, progress)).path
     prepared = read_typed(folder / CAMERAS_FILE, PreparedViews)
     entries = prepared.views
     oddities = settle(prepared.oddities, f"scene {capture.name}", capture.accept)
@@ -162,12 +153,8 @@ def load_scene(
     )
 
 
-def views_step(
-    capture: Capture, model_dir: Path, shrinking: Mapping[str, Any], progress: Progress
-) -> Step:
+def views_step(capture: Capture, model_dir: Path, max_size: int | None, progress: Progress) -> Step:
     """The step that prepares all posed images of the capture; no pixel depends on points.
-
-    ``shrinking`` are the last three fields of `ImageToPrepare`.
 
     Pillow reads and shrinks images, pycolmap undistorts them.
     """
@@ -176,7 +163,7 @@ def views_step(
         "capture": capture.fingerprint,
         "names": list(capture.image_names),
         "cameras": {file.name: file_sha256(file) for file in files},
-        **shrinking,
+        "max_size": max_size,
         **{package: version_of(package) for package in ("pycolmap", "pillow")},
     }
 
@@ -186,9 +173,9 @@ def views_step(
         models = _model_cameras(capture, model_dir)
         for index, (name, (lens, _)) in enumerate(models.items()):
             target, mask = folder / f"{index:05d}.png", capture.masks.get(name)
-            image = ImageToPrepare(capture.images / name, lens, target, mask, **shrinking)
+            image = ImageToPrepare(capture.images / name, lens, target, mask, max_size)
             size = lens.width, lens.height
-            if lens.distorted or image.final_size(*size) != size:
+            if lens.distorted or downscaled_size(*size, max_size) != size:
                 changes[name] = image
             else:
                 cameras[name] = to_pinhole(lens)
@@ -200,7 +187,7 @@ def views_step(
             name: {
                 "file": changes[name].target.name if name in changes else "",
                 "pose": pose,
-                **{key: getattr(cameras[name], key) for key in INTRINSICS},
+                **{key: getattr(cameras[name], key) for key in ("width", "height", "params")},
             }
             for name, (_, pose) in models.items()
         }
@@ -224,12 +211,9 @@ def _model_cameras(
         if name in wanted:
             fitted = camera_of_file(model.cameras[image.camera_id], capture.images / name)
             cameras[name] = plain_camera(fitted), image.cam_from_world().matrix().tolist()
-    if len(cameras) < MIN_IMAGES:
-        raise InputError(
-            f"scene {capture.name}: {len(cameras)} of {len(wanted)} images have a pose in "
-            f"{model_dir}, but at least {MIN_IMAGES} are needed: take more overlapping photos, or "
-            "another init"
-        )
+    which = f"of {len(wanted)} of scene {capture.name} have a pose"
+    mend = "take more overlapping photos, or another init"
+    require_enough(len(cameras), model_dir, which, mend)
     _inspect_views(capture, cameras)  # before hours of work
     return dict(sorted(cameras.items()))
 
@@ -262,13 +246,7 @@ class ImageToPrepare:
     camera: CameraModel
     target: Path
     mask: Path | None = None
-    downscale: int = 1
     max_size: int | None = None
-    resample: Resample = "lanczos"
-
-    def final_size(self, width: int, height: int) -> tuple[int, int]:
-        """The final size in px of an image of ``width`` x ``height`` px."""
-        return downscaled_size(width, height, self.downscale, self.max_size)
 
 
 def mask_file(image_file: str) -> str:
@@ -314,8 +292,8 @@ def prepare_image(image: ImageToPrepare) -> Camera:
         pixels, camera = undistort(pixels, image.camera)
     else:
         camera = to_pinhole(image.camera)
-    width, height = image.final_size(camera.width, camera.height)
-    pixels = resize_image(pixels, width, height, image.resample)
+    width, height = downscaled_size(camera.width, camera.height, image.max_size)
+    pixels = resize_image(pixels, width, height)
     image.target.parent.mkdir(parents=True, exist_ok=True)
     write_png(pixels, image.target)
     if image.mask is not None:

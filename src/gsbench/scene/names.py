@@ -21,6 +21,7 @@ FILES: dict[str, Any] = table_beside(__file__, "files.yaml")
 IMAGE_SUFFIXES = frozenset(FILES["photographs"])
 
 Key = Callable[[str], str]
+Step = Callable[[Sequence[str]], Sequence[str]]
 
 
 def stem_of(name: str) -> str:
@@ -114,10 +115,6 @@ def same_folder(one: str, other: str) -> bool:
     return parts_of(one)[:-1] == parts_of(other)[:-1] or one.casefold() == other.casefold()
 
 
-SAME_NAMES = ""
-BY_ORDER = "by order"
-
-
 @dataclass(frozen=True)
 class Matching:
     """The picture of each photograph. ``left_out`` are the pictures without a photograph.
@@ -135,16 +132,14 @@ def match_pictures(
 ) -> Matching:
     """Match names (relative paths) by the first rule under which every photograph has a picture.
 
-    The rules, from strict to loose, compare names: as they are; without the extension; with folders
-    written as part of the name; without case; without a start and an end that all names share;
-    without leading zeros; and by the last three rules without folders. Raises `InputError` if that
-    rule gives a photograph several pictures, or if no rule gives each a picture. ``by_order`` is
-    the option that error messages suggest for `match_by_order`.
+    The rules are `PICTURE_RULES`, from strict to loose. Raises `InputError` if that rule gives a
+    photograph several pictures, or if no rule gives each a picture. ``by_order`` is the option that
+    error messages suggest for `match_by_order`.
     """
     missing = photographs  # by the rule that leaves the fewest
-    for rule, how in PICTURE_RULES.items():
-        keys = _keys(photographs, *how)
-        by_key = grouped(pictures, _keys(pictures, *how).__getitem__)
+    for rule, steps in PICTURE_RULES.items():
+        keys = _keys(photographs, steps)
+        by_key = grouped(pictures, _keys(pictures, steps).__getitem__)
         lacking = [name for name in photographs if keys[name] not in by_key]
         missing = min(missing, lacking, key=len)
         if lacking or len({*keys.values()}) < len(photographs):
@@ -187,32 +182,28 @@ def match_by_order(photographs: Sequence[str], pictures: Sequence[str]) -> Match
             "pictures after their photographs"
         )
     pairs = dict(zip(in_order, sorted(pictures, key=_by_value), strict=True))
-    return Matching({photograph: pairs[photograph] for photograph in photographs}, BY_ORDER, ())
+    return Matching({photograph: pairs[photograph] for photograph in photographs}, "by order", ())
 
 
-def _stem(name: str) -> str:
-    return PurePosixPath(name).with_suffix("").as_posix()
+def _flat(names: Sequence[str]) -> list[str]:
+    return [stem_of(name).replace("/", "__") for name in names]
 
 
-def _flat(name: str) -> str:
-    return _stem(name).replace("/", "__")
+def _base(names: Sequence[str]) -> list[str]:
+    return [word.split("__")[-1] for word in _flat(names)]
 
 
-def _base(name: str) -> str:
-    return re.split(r"/|__", _stem(name))[-1]
-
-
-def _folded(words: list[str]) -> list[str]:
+def _folded(words: Sequence[str]) -> list[str]:
     return [word.casefold() for word in words]
 
 
-def _stripped(words: list[str]) -> list[str]:
+def _stripped(words: Sequence[str]) -> list[str]:
     """The words without the start and the end that all of them share.
 
     Digits next to the rest are kept, so that numbers stay whole.
     """
     if len(words) < 2:
-        return words
+        return list(words)
     # Letters are compared, not parts of paths.
     start = len(commonprefix(words).rstrip("0123456789"))  # noqa: RUF071
     ends = [word[start:][::-1] for word in words]
@@ -220,32 +211,32 @@ def _stripped(words: list[str]) -> list[str]:
     return [word[start : len(word) - end] for word in words]
 
 
-def _unpadded(words: list[str]) -> list[str]:
+def _unpadded(words: Sequence[str]) -> list[str]:
     return [re.sub(r"\d+", lambda digits: str(int(digits[0])), word) for word in words]
 
 
 def _by_value(name: str) -> list[tuple[int, int, str]]:
-    parts = re.split(r"(\d+)", _flat(name))
+    parts = re.split(r"(\d+)", _flat([name])[0])
     return [(1, int(part), part) if part.isdigit() else (0, 0, part) for part in parts]
 
 
-def _keys(names: Sequence[str], form: Key, steps: int) -> dict[str, str]:
-    words = [form(name) for name in names]
-    for step in (_folded, _stripped, _unpadded)[:steps]:
+def _keys(names: Sequence[str], steps: Sequence[Step]) -> dict[str, str]:
+    words = names
+    for step in steps:
         words = step(words)
     return dict(zip(names, words, strict=True))
 
 
-# From strict to loose: a form of the names, and how many steps go on from there. Names are equal if
-# their keys are.
-PICTURE_RULES: dict[str, tuple[Key, int]] = {
-    SAME_NAMES: (str, 0),
-    "apart from the extension": (_stem, 0),
-    "with folders as part of the name": (_flat, 0),
-    "apart from case": (_flat, 1),
-    "apart from what all names begin or end with": (_flat, 2),
-    "apart from leading zeros": (_flat, 3),
-    "apart from folders": (_base, 1),
-    "apart from folders and what all names begin or end with": (_base, 2),
-    "apart from folders and leading zeros": (_base, 3),
+# From strict to loose: the steps that change names to words, which are compared.
+PICTURE_RULES: Mapping[str, Sequence[Step]] = {
+    "": (),
+    "apart from the extension": (_flat,),  # a/b.png may be written a__b.png
+    "apart from case": (_flat, _folded),
+    "apart from folders": (_base, _folded),
+    "apart from folders, what all names begin or end with, and leading zeros": (
+        _base,
+        _folded,
+        _stripped,
+        _unpadded,
+    ),
 }

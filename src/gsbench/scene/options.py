@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from annotated_types import Ge, Interval
-from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import NonNegativeInt, PositiveFloat
 
 from gsbench.errors import InputError
 from gsbench.scene.rules import MIN_IMAGES, MIN_SIZE, check_accept, given
@@ -22,39 +22,31 @@ from gsbench.settings import (
 MAX_IMAGES = 200  # the paper's limit per scene
 
 
-def downscaled_size(
-    width: int, height: int, downscale: int = 1, max_size: int | None = None
-) -> tuple[int, int]:
-    """The size divided by ``downscale``, with the longest side at most ``max_size``.
+def downscaled_size(width: int, height: int, max_size: int | None = None) -> tuple[int, int]:
+    """The size with the longest side at most ``max_size``, which never grows.
 
-    Sides are rounded half up to at least 1. The size never grows.
+    The other side is rounded half up to at least 1.
 
     Examples:
-        >>> downscaled_size(4946, 3286, downscale=4)
-        (1237, 822)
         >>> downscaled_size(4946, 3286, max_size=1600)
         (1600, 1063)
     """
     longest = max(width, height)
-    numerator, denominator = 1, downscale
-    if max_size and max_size * downscale < longest:
-        # One fraction for both sides, so that the longest side becomes exactly max_size.
-        numerator, denominator = max_size, longest
+    if max_size is None or max_size >= longest:
+        return width, height
 
     def scaled(side: int) -> int:
-        return max(1, math.floor(side * numerator / denominator + 0.5))
+        return max(1, math.floor(side * max_size / longest + 0.5))
 
     return scaled(width), scaled(height)
 
 
-def check_final_size(
-    size: tuple[int, int], downscale: int, max_size: int | None, what: str
-) -> None:
+def check_final_size(size: tuple[int, int], max_size: int | None, what: str) -> None:
     """Raise InputError if ``what``, of ``size`` (width, height), would have a side below 16 px."""
-    width, height = downscaled_size(*size, downscale, max_size)
-    limit = "" if max_size is None else f" with scene.max_size={max_size}"
+    width, height = downscaled_size(*size, max_size)
     sizes = {"size": f"{width}x{height}", "full": f"{size[0]}x{size[1]}"}
-    given("view-size", min(width, height), what, downscale=downscale, limit=limit, **sizes)
+    limit = "" if max_size is None else f" with scene.max_size={max_size}"
+    given("view-size", min(width, height), what, limit=limit, **sizes)
 
 
 def require_enough(count: int, folder: Path, which: str, remedy: str = "") -> None:
@@ -123,7 +115,6 @@ class SplitRule:
 
 
 Backdrop = Literal["black", "white"]  # the colour under transparent pixels
-Resample = Literal["lanczos", "area", "bicubic"]
 PrincipalPoint = Literal["used", "centred"]
 MAX_SIZE = 16_384  # px, the longest side of a view of the courtyard
 
@@ -154,9 +145,7 @@ class SceneConfig(SplitRule):
     beside: list[FolderName] = field(default_factory=list)
     # world units of one step of an integer depth map; null: 0.001
     depth_scale: PositiveFloat | None = None
-    downscale: PositiveInt = 1  # divides both sides
     max_size: Annotated[int, Ge(MIN_SIZE)] | None = None  # longest side, px; never enlarges
-    resample: Resample = "lanczos"
     max_images: Annotated[int, Ge(MIN_IMAGES)] = MAX_IMAGES  # evenly spaced over the sorted names
     # ids of rules (docs/captures.md) whose refusal becomes a line in log, results and tables
     accept: list[str] = field(default_factory=list)
@@ -198,9 +187,7 @@ class SceneConfig(SplitRule):
                 "COLMAP model (scene=colmap; gsbench export writes that of a trial)"
             )
         if self.kind == "courtyard":
-            check_final_size(
-                (self.width, self.height), self.downscale, self.max_size, "the courtyard"
-            )
+            check_final_size((self.width, self.height), self.max_size, "the courtyard")
 
     def _check_that_all_is_read(self) -> None:
         """Raise InputError for a setting that the scene's kind or split would ignore."""

@@ -3,7 +3,7 @@
 import hashlib
 import logging
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
@@ -16,9 +16,8 @@ from gsbench.normalization import IDENTITY, find_normalization
 from gsbench.parsing import text_of
 from gsbench.scene.beside import DEPTH, check_masks, find_masks
 from gsbench.scene.colmap_files import model_files, require_subfolder
-from gsbench.scene.hold_out import SplitLists, hold_out, select_images
+from gsbench.scene.hold_out import SplitLists, hold_out, resolve, select_images
 from gsbench.scene.images import check_picture_names
-from gsbench.scene.names import match
 from gsbench.scene.options import (
     LISTS,
     SceneConfig,
@@ -30,7 +29,6 @@ from gsbench.scene.record import RawCapture, Role
 from gsbench.scene.rules import inspect
 from gsbench.scene.twins import copies_by_name, copies_of_test_views
 from gsbench.scene.types import Capture
-from gsbench.words import some_of
 
 log = logging.getLogger(__name__)
 
@@ -44,7 +42,7 @@ def drop_copies(raw: RawCapture, lists: SplitLists) -> RawCapture:
 def hold_out_views(raw: RawCapture, options: SceneConfig, lists: SplitLists) -> RawCapture:
     """Choose the photographs that are used, and give each its role."""
     names, by_name = raw.names, {row.name: row for row in raw.photographs}
-    train, test = (_resolve(wanted, names, raw.folder) for wanted in lists)
+    train, test = (resolve(wanted, names) for wanted in lists)
     if train is not None and test is not None:
         names = sorted({*train, *test})
     names = select_images(names, options.max_images)
@@ -103,7 +101,7 @@ def prepare(raw: RawCapture, options: SceneConfig, root: Path, model: Path | Non
     raw = match_masks(raw, root, options.masks)
     check_picture_names(raw.named("test"), raw.folder)
     for row in raw.photographs:
-        check_final_size(row.size, options.downscale, options.max_size, str(row.file))
+        check_final_size(row.size, options.max_size, str(row.file))
     oddities += inspect("capture", raw, str(raw.folder), accept)
     # Only the courtyard has exact poses, and its units fit the paper's threshold.
     exact = options.kind == "courtyard"
@@ -161,19 +159,6 @@ def _without(raw: RawCapture, copies: Mapping[str, str]) -> RawCapture:
     """The capture without ``copies``, each mapped to the photograph that is used instead."""
     kept = tuple(row for row in raw.photographs if row.name not in copies)
     return replace(raw, photographs=kept, left_out={**raw.left_out, **copies})
-
-
-def _resolve(wanted: Sequence[str] | None, names: Sequence[str], folder: Path) -> list[str] | None:
-    """The image files that a split list names; extensions may be missing or differ."""
-    if wanted is None:
-        return None
-    matches = match(wanted, names)
-    if unknown := [name for name in wanted if name not in matches]:
-        raise InputError(
-            f"the split lists name {some_of(unknown)}, not among the usable images of {folder}: "
-            "correct the lists"
-        )
-    return sorted(matches.values())
 
 
 def _read_lists(root: Path, options: SceneConfig) -> SplitLists:

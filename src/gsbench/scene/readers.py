@@ -8,6 +8,7 @@ import logging
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cache
 from pathlib import Path, PurePosixPath
@@ -185,7 +186,6 @@ def companions_beside(raw: RawCapture, root: Path) -> RawCapture:
     folder's name. Folders of masks are read by ``scene.masks`` alone.
     """
     rows = {row.name: row for row in raw.photographs}
-    stems = {stem_of(name): name for name in rows}
     for folder in sorted(root.iterdir()):
         words = {word.rstrip("s") for word in _words(folder.name) if word in FOLDER_WORDS}
         if not words or "mask" in words or not folder.is_dir() or folder == raw.folder:
@@ -195,16 +195,13 @@ def companions_beside(raw: RawCapture, root: Path) -> RawCapture:
             for path in folder.rglob("*")
             if path.is_file()
         }
-        try:
-            found = match_anywhere(stems, files)
-        except InputError:  # several files may be a photograph's
-            continue
-        for stem, file in found.items():
-            row = rows[stems[stem]]
-            if words.isdisjoint(DEPTH_WORDS) or row.depth is not None:
-                rows[row.name] = replace(row, more={**row.more, folder.name: files[file]})
-            else:
-                rows[row.name] = replace(row, depth=files[file])
+        with suppress(InputError):  # several files may be a photograph's
+            for name, file in match_anywhere(rows, files).items():
+                row, own = rows[name], files[file]
+                if words.isdisjoint(DEPTH_WORDS) or row.depth is not None:
+                    rows[name] = replace(row, more={**row.more, folder.name: own})
+                else:
+                    rows[name] = replace(row, depth=own)
     return replace(raw, photographs=tuple(rows.values()))
 
 

@@ -18,7 +18,6 @@ from gsbench.scene.undistortion import as_colmap
 
 if TYPE_CHECKING:
     from gsbench.scene.colmap import Cloud
-    from gsbench.scene.transforms_cameras import AppliedTransform
 
 Role = Literal["", "train", "test", "unused"]
 EQUIRECTANGULAR = b"equirectangular"  # GPano:ProjectionType in the XMP of a panorama
@@ -75,6 +74,19 @@ class Photograph:
         _, rotation, translation = self.posed
         center: Array = -rotation.T @ translation
         return center
+
+
+@dataclass(frozen=True, eq=False)
+class AppliedTransform:
+    """The transform and scale that were applied to the original data before it was saved."""
+
+    matrix: Array = field(default_factory=lambda: np.eye(3, 4))  # rotation and translation
+    scale: float = 1.0
+
+    def undo(self, saved: Array) -> Array:
+        """Convert saved points [P, 3] to the coordinates of the original data."""
+        original: Array = (saved / self.scale - self.matrix[:, 3]) @ self.matrix[:, :3]
+        return original
 
 
 @dataclass(frozen=True)

@@ -123,10 +123,10 @@ def likeness(one: SmallPicture, other: SmallPicture) -> float:
     both = one[1] & other[1]
     if both.sum() < LEAST_CELLS:
         return float("nan")
-    first, second = (picture[0][both] - picture[0][both].mean() for picture in (one, other))
+    first, second = one[0][both], other[0][both]
     if min(first.std(), second.std()) < LEAST_DEVIATION:
         return float("nan")
-    return float((first * second).mean() / (first.std() * second.std()))
+    return float(np.corrcoef(first, second)[0, 1])
 
 
 def same_pixels(one: View, other: View) -> bool:

@@ -6,7 +6,7 @@ cameras.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -231,19 +231,23 @@ def nearest_training_cameras(
     ``distance_to_nearest`` is the smallest distance between the centres, in scene extents; it is
     left out if the extent is 0.
     """
+    from scipy.spatial.distance import cdist  # slow to import
+
     if not cameras or not training:
         return [{} for _ in cameras]
 
-    (ahead, references), (centers, places) = (
-        [np.array([value(camera) for camera in group]) for group in (cameras, training)]
-        for value in (lambda camera: camera.rotation[2], lambda camera: camera.center)
-    )
+    def from_nearest(place: Callable[[Camera], Array]) -> Array:
+        """The distance [V] of each camera's place from the nearest one of training."""
+        apart: Array = cdist(*(list(map(place, group)) for group in (cameras, training)))
+        return apart.min(axis=1)
+
     # The chord is accurate near an angle of 0, the arc cosine is not.
-    chords = np.linalg.norm(ahead[:, None] - references, axis=-1).min(axis=1)  # [V]
+    chords = from_nearest(lambda camera: camera.rotation[2])
     angles = 2 * np.degrees(np.arcsin(np.clip(chords / 2, 0.0, 1.0)))
     measured = [{ANGLE: float(angle)} for angle in angles]
     if extent > 0:
-        apart = np.linalg.norm(centers[:, None] - places, axis=-1)  # [V, W]
-        for values, distance in zip(measured, apart.min(axis=1), strict=True):
+        for values, distance in zip(
+            measured, from_nearest(lambda camera: camera.center), strict=True
+        ):
             values[DISTANCE] = float(distance) / extent
     return measured

@@ -27,8 +27,7 @@ if TYPE_CHECKING:
 # half a pixel and averages neighbours.
 MAX_IGNORED_DISTORTION = 0.05
 GRID = 33  # points per side at which the distance is measured, borders included
-FOLD_GRID, FOLD_STEPS = 40, 40  # pixels per side and steps towards each for `folded_share`
-FOLD_MOVE = 1e-5  # of a ray on the plane at distance 1, for its derivatives
+FOLD_GRID = 40  # pixels per side for `folded_share`
 
 Flattened = tuple[float, int, int]
 
@@ -157,24 +156,17 @@ def folded_share(camera: pycolmap.Camera, pinhole: pycolmap.Camera) -> float:
     """The share of the undistorted image in which the lens model turns back.
 
     A polynomial of few terms may fall again outside the region where it was measured. From there
-    on, an undistorted image repeats its inner part, mirrored. Along lines from the principal point
-    to each pixel of ``pinhole``, the mapping must keep its orientation; from the first place where
-    it does not, or where the camera sees no ray, the line is lost.
+    on, an undistorted image repeats its inner part, mirrored. So for a ray there, as for one that
+    the camera does not see, COLMAP does not find the ray again from the place where it is seen.
     """
     middles = np.arange(FOLD_GRID) + 0.5
     pixels = grid(middles * pinhole.width / FOLD_GRID, middles * pinhole.height / FOLD_GRID)
-    ends = rays_through(pixels, *_pinhole_parameters(pinhole))[:, :2]  # [P, 2]
-    rays = ends[:, None] * (np.arange(1, FOLD_STEPS + 1) / FOLD_STEPS)[:, None]  # [P, S, 2]
-
-    def project(offset: tuple[float, float]) -> Array:
-        moved = (rays + offset).reshape(-1, 2)
-        pixels = camera.img_from_cam(np.column_stack([moved, np.ones(len(moved))]))
-        return np.asarray(pixels, dtype=np.float64).reshape(rays.shape)
-
-    origin = project((0.0, 0.0))
-    along_x, along_y = (project(move) - origin for move in ((FOLD_MOVE, 0.0), (0.0, FOLD_MOVE)))
-    orientation = along_x[..., 0] * along_y[..., 1] - along_x[..., 1] * along_y[..., 0]  # [P, S]
-    return float((~(orientation > 0)).any(axis=1).mean())  # NaN is lost too
+    parameters = _pinhole_parameters(pinhole)
+    rays = rays_through(pixels, *parameters)
+    seen: Any = camera.img_from_cam(rays)
+    found: Any = camera.cam_from_img(seen)  # [P, 2]
+    misses = np.linalg.norm((found - rays[:, :2]) * parameters[:2], axis=1)  # px
+    return float((~(misses < 1)).mean())  # NaN is lost too
 
 
 def grid(columns: Array, rows: Array) -> Array:

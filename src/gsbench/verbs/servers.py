@@ -79,15 +79,16 @@ def ui(argv: Sequence[str], runs: Path) -> int:
     if home is None and len(names := list_experiments(runs)) == 1:
         home = experiment_home(runs, names[0])
     require_no_links(runs, runs / DATABASE)
-    if uri == default_uri(runs) and not (runs / DATABASE).exists():
+    if home is None and uri == default_uri(runs) and not (runs / DATABASE).exists():
         raise InputError(
             f"no MLflow database in {runs}: run a trial first, or `gsbench sync`, or give --uri"
         )
     is_served = uri.startswith(("http://", "https://"))
     server = uri if is_served else f"http://127.0.0.1:{options.port}"
-    pages = {"dashboard": server}
+    pages, sent = {"dashboard": server}, list[str]()
     if home is not None:
         try:
+            sent = list(send_missing(_trials_in(home), options.uri))
             pages = addresses(server, show_ideas(home, uri))
         except Exception as error:  # any error of the tracker's client
             raise InputError(
@@ -95,6 +96,8 @@ def ui(argv: Sequence[str], runs: Path) -> int:
             ) from error
     for name, address in pages.items():
         print(f"{name:<10} {address}", flush=True)
+    for line in sent:
+        print(line, flush=True)
     if is_served or (home is not None and _serves(server, home.name, next(iter(pages.values())))):
         return 0
     print("served in some seconds, until Ctrl+C", flush=True)
@@ -158,11 +161,14 @@ def sync(argv: Sequence[str], runs: Path) -> int:
             send_beside(options.beside, sys.stdin)
             return 0
         names = [experiment] if experiment else list_experiments(runs)
-        homes = [experiment_home(runs, name) for name in names]
-        places = [place for home in homes for place in sorted(trial_folders(home))]
-        folders = [TrialFolder(Path(place)) for place in places]
+        folders = [trial for name in names for trial in _trials_in(experiment_home(runs, name))]
         for line in send_missing(folders, options.uri, allowed):
             print(line, flush=True)
     except (MirrorError, OSError) as error:
         raise GsbenchError(f"{error}; the files are complete: try again") from error
     return 0
+
+
+def _trials_in(home: Path) -> list[TrialFolder]:
+    """The folders of an experiment's trials."""
+    return [TrialFolder(Path(place)) for place in sorted(trial_folders(home))]

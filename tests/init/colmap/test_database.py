@@ -118,7 +118,7 @@ def test_a_line_names_the_lenses_of_the_photographs(tmp_path, caplog):
         with_exif(tmp_path / name, **TELEPHONE | ({"film": 52} if k == 0 else {}))
     capture = Capture("a", tmp_path, names, (), None, False, "")
     report_lenses(capture)
-    assert "X 7 26 mm (on 35 mm film): 4, X 7 52 mm (on 35 mm film): 1" in caplog.text
+    assert "X 7 6.8 mm (26 mm on 35 mm film): 4, X 7 6.8 mm (52 mm on 35 mm film): 1" in caplog.text
     caplog.clear()
     report_lenses(replace(capture, image_names=names[1:]))
     assert not caplog.records

@@ -75,7 +75,7 @@ def mapped(database, mapper, **options):
 @pytest.mark.slow
 def test_a_small_baseline_without_a_focal_length_is_placed_by_another_strategy(tmp_path):
     database, truth = small_baseline(tmp_path)
-    with refusal("found no pair of images to start from"):
+    with refusal("placed only 0 of"):
         mapped(database, "incremental")
     result = mapped(database, "auto")
     assert result.model.num_reg_images() == 9
@@ -157,7 +157,10 @@ def test_strategies_are_tried_until_one_places_nine_of_ten_images(ten, ways, fou
     most = [max(sizes, default=(0, 0))[0] for sizes in found[:tried]]
     tries = ", ".join(f"way {k} {count}" for k, count in enumerate(most))
     assert [f"images: {tries})" in line for line in result.warnings] == [True] * (tried > 1)
-    for sizes, said in (([], "found no pair of images"), ([(2, 99)], "placed only 2 of 10 images")):
+    for sizes, said in (
+        ([], "placed only 0 of 10 images"),
+        ([(2, 99)], "placed only 2 of 10 images"),
+    ):
         ways[:] = [("only", sizes)]
         with refusal(said):
             mapped(ten, "auto")
@@ -302,14 +305,13 @@ def test_a_smaller_sound_model_is_kept_and_the_setting_is_named(ten, ways):
         mapped(ten, "auto")
 
 
-@pytest.mark.parametrize("intrinsics", ["estimate", "reference"])
-def test_settings_reach_colmaps_mappers(tmp_path, monkeypatch, intrinsics):
+@pytest.mark.parametrize("tracks", [True, False])
+def test_settings_reach_colmaps_mappers(tmp_path, monkeypatch, tracks):
     given = []
     for name in ("incremental_mapping", "global_mapping"):
         monkeypatch.setattr(pycolmap, name, lambda *_, options, **__: given.append(options) or {})
-    tracks = refine = intrinsics == "estimate"
-    own = {"seed": 7, "mapper_threads": 3, "min_model_size": 5, "two_view_tracks": tracks}
-    mapper = mapper_of(tmp_path, Sfm(**own, intrinsics=intrinsics))
+    own = {"seed": 7, "mapper_threads": 3, "two_view_tracks": tracks}
+    mapper = mapper_of(tmp_path, Sfm(**own))
     mapper.incremental(mapper.task.database)
     mapper.incremental(mapper.task.database, 2.5)
     mapper.global_mapping()
@@ -318,14 +320,15 @@ def test_settings_reach_colmaps_mappers(tmp_path, monkeypatch, intrinsics):
     for options in incremental:
         own, triangulation = options.mapper, options.triangulation
         assert options.num_threads == own.num_threads == 3
-        assert (options.min_model_size, options.multiple_models) == (5, True)
+        assert (options.min_model_size, options.multiple_models) == (3, True)
         assert options.random_seed == own.random_seed == triangulation.random_seed == 7
         assert triangulation.ignore_two_view_tracks == (not tracks)
-        assert options.ba_refine_focal_length == options.ba_refine_extra_params == refine
-        assert own.abs_pose_refine_focal_length == own.abs_pose_refine_extra_params == refine
-    assert (together.num_threads, together.random_seed, together.min_model_size) == (3, 7, 5)
+        assert options.ba_refine_focal_length
+        assert own.abs_pose_refine_focal_length
+    assert (together.num_threads, together.random_seed, together.min_model_size) == (3, 7, 3)
     adjustment = together.mapper.bundle_adjustment
-    assert (adjustment.refine_focal_length, adjustment.refine_extra_params) == (refine, refine)
+    assert adjustment.refine_focal_length
+    assert adjustment.refine_extra_params
 
 
 def test_focal_lengths_are_assumed_in_a_copy_whose_pairs_are_verified_again(tmp_path, monkeypatch):

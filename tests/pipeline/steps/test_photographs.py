@@ -59,8 +59,8 @@ def test_the_courtyard_has_a_step_and_photographs_are_read_directly(photographs)
         SceneConfig(name="own", kind="photos", path=str(photographs), masks="masks")
     )
     assert with_masks.read(None).masks.keys() == set(capture.image_names)
-    small = SceneConfig(name="own", kind="photos", path=str(photographs), downscale=2)
-    with refusal(r"a\.png: scene\.downscale=2 leaves 15x10 px of 30x20"):
+    small = SceneConfig(name="own", kind="photos", path=str(photographs), max_size=20)
+    with refusal(r"a\.png: 20x13 px of 30x20 are left with scene\.max_size=20"):
         CaptureSource(small).read(None)
 
 
@@ -127,9 +127,7 @@ def test_each_setting_that_changes_views_changes_the_key(tmp_path):
     base = SceneConfig(name="own", kind="photos", path=str(tmp_path))
     changes = [
         {},
-        {"downscale": 2},
         {"max_size": 100},
-        {"resample": "area"},
         {"principal_point": "centred"},
     ]
     keys = [
@@ -143,7 +141,7 @@ def test_each_setting_that_changes_views_changes_the_key(tmp_path):
             Views(store, capture, Step(INIT, {"a": 1}, lambda folder: None), base)
         ).key
     )
-    assert len(set(keys)) == len(keys) == 8
+    assert len(set(keys)) == len(keys) == 6
     assert (
         ground_truth_step(Views(store, capture, init, replace(base, max_images=9))).key == keys[0]
     )

@@ -13,7 +13,7 @@ from gsbench.analysis.cells import select_trials, where_words
 from gsbench.analysis.comparison import Answer, chosen, compare
 from gsbench.analysis.differences import between_scenes_notes
 from gsbench.analysis.fairness import caveats, counts_notes, fairness_table
-from gsbench.analysis.images import choose_views, jpeg_uri
+from gsbench.analysis.images import choose_views
 from gsbench.analysis.notes import texts
 from gsbench.analysis.pairs import pair_trials
 from gsbench.analysis.paper import layout_of, load_published, paper_tables
@@ -36,7 +36,6 @@ from gsbench.eval.facts import find_metric
 from gsbench.parsing import read_if_sound
 from gsbench.runs import layout
 from gsbench.runs.experiments import TuningRecord
-from gsbench.scene.images import read_image
 from gsbench.words import command, counted, signed
 
 COSTS_COMPARED = ("gaussians", "train_time")
@@ -98,25 +97,8 @@ def build_report(
         ],
         event_table=event_table(trials, arms),
         events=event_charts(trials, arms),
-        figures=trial_figures(trials),
         provenance=provenance(trials),
     )
-
-
-def trial_figures(trials: Sequence[TrialResult]) -> list[tuple[str, str]]:
-    """(caption, data URI) of trials' ``figures``, for one seed of each scene and arm.
-
-    A picture that arms of a scene share, such as that of their initial cloud, appears once.
-    """
-    sources: dict[tuple[str, str, str], list[str]] = {}  # {(name, scene, data URI): arms and seeds}
-    for group in group_by(trials, "scene", "arm").values():
-        trial = group[0]
-        for path in sorted((trial.path / layout.FIGURES).glob("*.png")):
-            key = path.stem.replace("_", " "), trial.scene, jpeg_uri(read_image(path))
-            sources.setdefault(key, []).append(f"{trial.init}-{trial.densify}, seed {trial.seed}")
-    return [
-        (f"{name}: {scene}, {'; '.join(arms)}", uri) for (name, scene, uri), arms in sources.items()
-    ]
 
 
 def compare_arms(trials: Sequence[TrialResult], judged: Answer) -> dict[str, Any]:

@@ -47,7 +47,7 @@ def create_task(
     """Create a database of the capture's images, with the cameras that ``options`` choose."""
     names = options.select_images(capture, reference)
     images = readable_images(capture.images, names, work_dir)
-    if reference is not None and options.uses_reference_cameras:
+    if reference is not None and options.poses == "shared":
         groups = reference_camera_groups(reference)
     else:
         groups = unknown_camera_groups(images, names, options)

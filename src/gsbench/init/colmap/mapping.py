@@ -13,6 +13,7 @@ import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -38,10 +39,6 @@ MIN_ANGLE_DEG = 0.5
 # largest of the sound captures that were tried; a macro photograph and a drone's differ by 500. In
 # a collapsed model some cameras lie in one point, and others thousands of times as far.
 MAX_DEPTH_SPREAD = 1000.0
-NO_PAIR = (
-    "structure from motion found no pair of images to start from: the photos need more overlap (60 "
-    "% and more between neighbours), more texture, or a focal length (init.focal_length, px)"
-)
 
 
 @dataclass(frozen=True)
@@ -116,12 +113,11 @@ def map_images(
             f"structure from motion made no sound model of {total} images ({', '.join(faulty)}): "
             f"the photos need more overlap or more texture{remedy}"
         )
-    if best is None:
-        raise UnplacedError(NO_PAIR)
-    if best_size[0] < MIN_IMAGES:
+    if best is None or best_size[0] < MIN_IMAGES:
         raise UnplacedError(
-            f"structure from motion placed only {best_size[0]} of {total} images: the "
-            "photos need more overlap, more texture, or a focal length (init.focal_length, px)"
+            f"structure from motion placed only {best_size[0]} of {total} images: the photos need "
+            "more overlap (60 % and more between neighbours), more texture, or a focal length "
+            "(init.focal_length, px)"
         )
     if len(tried) > 1:
         best.warnings.append(
@@ -161,12 +157,10 @@ class _Mapper:
 
     def incremental(self, database: Path, initial_angle: float | None = None) -> Models:
         """Map image by image, from a pair under ``initial_angle`` degrees (None: COLMAP's)."""
-        registered = 0
+        registered = count(1)
 
         def count_image() -> None:
-            nonlocal registered
-            registered += 1
-            self.progress("map", min(registered, self.total), self.total)
+            self.progress("map", min(next(registered), self.total), self.total)
 
         options = pipeline_options(self.options)
         if initial_angle is not None:
@@ -176,14 +170,11 @@ class _Mapper:
 
     def global_mapping(self) -> Models:
         """Map all images together, with COLMAP's global mapper."""
-        refine = self.options.intrinsics == "estimate"
-        adjustment = {"refine_focal_length": refine, "refine_extra_params": refine}
         options = pycolmap.GlobalPipelineOptions(
             {
                 "num_threads": self.options.mapper_threads,
                 "random_seed": self.options.seed,
-                "min_model_size": self.options.min_model_size,
-                "mapper": {"bundle_adjustment": adjustment},
+                "min_model_size": MIN_IMAGES,
             }
         )
         return self._run(partial(pycolmap.global_mapping, self.task.database), options)
@@ -291,19 +282,15 @@ def triangulate(
 
 def pipeline_options(options: ColmapOptions) -> pycolmap.IncrementalPipelineOptions:
     """The options of COLMAP's incremental mapper, which its triangulator reads too."""
-    refine = options.intrinsics == "estimate"
     seed, threads = {"random_seed": options.seed}, {"num_threads": options.mapper_threads}
-    poses = {"abs_pose_refine_focal_length": refine, "abs_pose_refine_extra_params": refine}
     return pycolmap.IncrementalPipelineOptions(
         {
             **seed,
             **threads,
-            "mapper": {**seed, **threads, **poses},
+            "mapper": {**seed, **threads},
             "triangulation": {**seed, "ignore_two_view_tracks": not options.two_view_tracks},
             # mapping must not stop at a first model of a few images (see map_images)
             "multiple_models": True,
-            "min_model_size": options.min_model_size,
-            "ba_refine_focal_length": refine,
-            "ba_refine_extra_params": refine,
+            "min_model_size": MIN_IMAGES,
         }
     )

@@ -20,7 +20,7 @@ import sqlite3
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
-from itertools import chain
+from itertools import chain, groupby
 from pathlib import Path
 
 import pycolmap
@@ -55,9 +55,6 @@ def match_sift(
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
     ids, processes = image_ids(database), sift.num_threads
-    parts = divide_pairs(
-        [(ids[first], ids[second]) for first, second in pairs], _block_size(len(ids), processes)
-    )
     empty = folder / "empty.db"
     shutil.copyfile(database, empty)
     _run_sql(empty, *DROP_FEATURES)
@@ -67,7 +64,8 @@ def match_sift(
             # COLMAP splits the lines of its pair lists at spaces, which names often contain
             image.name = str(image.image_id)
             opened.update_image(image)
-    shares = distribute_parts(parts, processes)
+    numbers = [(ids[first], ids[second]) for first, second in pairs]
+    shares = divide_pairs(numbers, _block_size(len(ids), processes), processes)
     results = [Path(shutil.copyfile(empty, folder / f"{k}.db")) for k in range(len(shares))]
     matched = [0] * len(shares)
 
@@ -107,8 +105,7 @@ def match_parts(
         {
             "use_gpu": False,
             "num_threads": 1,  # see the module's docstring
-            "guided_matching": sift.guided_matching,
-            "sift": {"max_ratio": sift.max_ratio, "cross_check": sift.cross_check},
+            "sift": {"max_ratio": sift.max_ratio},
         }
     )
     pairing = pycolmap.ImportedPairingOptions()
@@ -132,31 +129,29 @@ def match_parts(
         progress("match", done, total)
 
 
-def divide_pairs(pairs: Sequence[IdPair], block: int) -> list[list[IdPair]]:
-    """Divide ``pairs`` into parts with few images: pairs of two groups of ``block`` neighbours.
+def divide_pairs(pairs: Sequence[IdPair], block: int, processes: int) -> list[list[list[IdPair]]]:
+    """Divide ``pairs`` into parts with few images, and these among at most ``processes`` shares.
 
-    Small parts are merged up to the size of a full part.
+    A part has the pairs of two groups of ``block`` neighbours; small parts are merged up to the
+    size of a full one. Shares have about equally many pairs.
 
     Examples:
-        >>> divide_pairs([(1, 2), (1, 3), (1, 4), (2, 3), (2, 4), (3, 4)], 2)
-        [[(1, 2)], [(1, 3), (1, 4), (2, 3), (2, 4)], [(3, 4)]]
+        >>> divide_pairs([(1, 2), (1, 3), (1, 4), (2, 3), (2, 4), (3, 4)], 2, 1)
+        [[[(1, 3), (1, 4), (2, 3), (2, 4)], [(1, 2)], [(3, 4)]]]
     """
-    blocks: dict[tuple[int, int], list[IdPair]] = {}
-    for first, second in sorted(pairs):
-        blocks.setdefault(((first - 1) // block, (second - 1) // block), []).append((first, second))
+
+    def groups(pair: IdPair) -> list[int]:
+        return [(number - 1) // block for number in pair]
+
     parts: list[list[IdPair]] = []
-    for _, members in sorted(blocks.items()):
-        if parts and len(parts[-1]) + len(members) <= block * block:
-            parts[-1] += members
+    for _, members in groupby(sorted(pairs, key=groups), groups):
+        part = list(members)
+        if parts and len(parts[-1]) + len(part) <= block * block:
+            parts[-1] += part
         else:
-            parts.append(members)
-    return parts
-
-
-def distribute_parts(parts: Sequence[list[IdPair]], processes: int) -> list[list[list[IdPair]]]:
-    """Distribute parts over at most ``processes`` shares with about equally many pairs."""
-    ordered = sorted(parts, key=len, reverse=True)
-    return [ordered[start::processes] for start in range(max(1, min(processes, len(parts))))]
+            parts.append(part)
+    parts.sort(key=len, reverse=True)
+    return [parts[start::processes] for start in range(max(1, min(processes, len(parts))))]
 
 
 def _block_size(images: int, processes: int) -> int:

@@ -190,8 +190,6 @@ def compare_poses(
         num_images=len(distances),
         exact=exact,
         center_rmse=rmse,
-        center_mean=float(distances.mean()),
-        center_max=float(distances.max()),
         center_rmse_relative=rmse / reference_extent if reference_extent > 0 else None,
         rotation_mean_deg=float(angles.mean()),
         rotation_max_deg=float(angles.max()),

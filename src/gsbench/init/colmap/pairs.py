@@ -83,20 +83,16 @@ def count_agreements(descriptors: Sequence[NDArray[np.generic]]) -> NDArray[np.i
             tables[k] = (QUANTUM * tables[k]).round()
     squares = [(table**2).sum(axis=1) for table in tables]
     agreements = np.zeros((len(tables), len(tables)), dtype=np.int64)
-    for i, table in enumerate(tables[:-1]):
-        rows, ends = np.arange(len(table)), np.cumsum([len(other) for other in tables[i + 1 : -1]])
-        # one large product is faster than many small ones
-        products = np.split(table @ np.concatenate(tables[i + 1 :]).T, ends, axis=1)
-        for j, product in enumerate(products, i + 1):
-            if not product.size:
-                continue
-            distances = squares[i][:, None] + squares[j] - 2 * product  # [S, S]
-            nearest = distances.argmin(axis=1)
-            mutual = distances.argmin(axis=0)[nearest] == rows
-            best = distances[rows, nearest]
-            distances[rows, nearest] = np.inf
-            distinct = best < SQUARED_RATIO * distances.min(axis=1)
-            agreements[i, j] = np.count_nonzero(mutual & distinct)
+    for i, j in combinations(range(len(tables)), 2):
+        distances = squares[i][:, None] + squares[j] - 2 * tables[i] @ tables[j].T  # [S, S]
+        if not distances.size:
+            continue
+        rows, nearest = np.arange(len(distances)), distances.argmin(axis=1)
+        mutual = distances.argmin(axis=0)[nearest] == rows
+        best = distances[rows, nearest]
+        distances[rows, nearest] = np.inf
+        distinct = best < SQUARED_RATIO * distances.min(axis=1)
+        agreements[i, j] = np.count_nonzero(mutual & distinct)
     return agreements
 
 

@@ -3,51 +3,37 @@
 from __future__ import annotations
 
 import csv
-import math
-import shutil
-import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image
 
-from gsbench.densify.lineage import read_causes
-from gsbench.densify.volumetric import log_volume
 from gsbench.eval.evaluator import Evaluator, measure_psnr, quantize, summarize
 from gsbench.eval.facts import to_record
 from gsbench.eval.images import as_unit_range
 from gsbench.eval.protocol import Protocol
-from gsbench.events import Cause
 from gsbench.files import write_json
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
-from gsbench.gaussians.paper_values import VOLUME_THRESHOLD
 from gsbench.gaussians.ply import read_ply
 from gsbench.logs import progress
 from gsbench.pipeline.steps.regions import region_inputs, regions_of
 from gsbench.pipeline.steps.scene import Views
-from gsbench.raster import Rasterizer
-from gsbench.raster.reference import project
 from gsbench.runs.keys import EVALUATE, Step, options_of, rasterizer_inputs, step_of
 from gsbench.runs.layout import (
-    ELLIPSOIDS,
-    FIGURES,
-    LINEAGE,
     METRICS,
     PER_VIEW,
     POINT_CLOUD,
     RENDERS,
 )
 from gsbench.runs.trial_record import Earlier, Evaluation
-from gsbench.scene.images import png_name, read_image
-from gsbench.scene.types import COUNTED, Camera, Scene, nearest_training_cameras
+from gsbench.scene.images import png_name
+from gsbench.scene.types import COUNTED, Scene, nearest_training_cameras
 from gsbench.system.resources import available_threads
 from gsbench.train.trainer import snapshot_file
 
@@ -55,50 +41,39 @@ if TYPE_CHECKING:
     from gsbench.pipeline.parts import Parts
 
 EXTRA = "eval.extra"  # the setting that names the user's own metrics
-TIMED_RENDERS = 5  # of each view, to measure the speed
 
 
 def evaluate_step(views: Views, trained: Step, parts: Parts) -> Step:
-    """The step that renders and measures the model of ``trained`` and its earlier snapshots.
-
-    If another program left renders instead of a model, the step measures those. ``eval.maps``
-    adds a picture of the large Gaussians; ``eval.fps`` is the image size at which the speed of
-    rendering is measured.
-    """
+    """The step that renders and measures the model of ``trained`` and its earlier snapshots."""
     evaluator, user = parts.evaluator, parts.user_code
     inputs: dict[str, Any] = {
         "protocol": evaluator.protocol.id,
         # part of the key: weights that arrive later give a new result
         "unavailable": sorted(evaluator.unavailable),
+        "train": trained.key,
+        "maps": False,  # a setting of earlier versions
     }
     own = {
         name: options_of("eval", metric, user, f"{EXTRA}.{name}")
         for name, metric in evaluator.extra.items()
     }
     regions = region_inputs(views, parts)
-    further = {
+    further: dict[str, Any] = {
         "regions": regions,
         "extra": own,
         "more": list(evaluator.more),
-        "fps": parts.eval.fps,
+        "earlier": parts.measured_earlier,
     }
-    if parts.program is not None and not parts.program.leaves_model:
-        inputs["renders"] = trained.key
-        measure = _measure_renders
-    else:
-        inputs |= {"train": trained.key, "maps": parts.eval.maps}
-        further["earlier"] = parts.measured_earlier
-        # the key of `trained` covers the rendering only if gsbench trained
-        if parts.program is not None:
-            inputs["raster"] = rasterizer_inputs(parts.rasterizer, user)
-            inputs["background"] = list(parts.train.background)
-        measure = _measure_model
+    # the key of `trained` covers the rendering only if gsbench trained
+    if parts.program is not None:
+        inputs["raster"] = rasterizer_inputs(parts.rasterizer, user)
+        inputs["background"] = list(parts.train.background)
     # Metrics that are off are left out, so that a new one changes no key of others.
     inputs |= {name: value for name, value in further.items() if value}
-    return step_of(EVALUATE, inputs, partial(measure, views, trained, parts), user)
+    return step_of(EVALUATE, inputs, partial(_measure, views, trained, parts), user)
 
 
-def _measure_model(views: Views, trained: Step, parts: Parts, folder: Path) -> None:
+def _measure(views: Views, trained: Step, parts: Parts, folder: Path) -> None:
     """Render the model of ``trained`` and its earlier snapshots, and measure the renders."""
     rasterizer, evaluator, device = parts.rasterizer, parts.evaluator, parts.device
     training, scene = views.store.path(trained), views.scene
@@ -137,68 +112,7 @@ def _measure_model(views: Views, trained: Step, parts: Parts, folder: Path) -> N
             model = read_ply(snapshot, device)
             means = summarize(measure(model, f"iteration {step}", None), evaluator.unavailable)
             at[str(step)] = Earlier(metrics=means, num_gaussians=len(model))
-    if parts.eval.maps:
-        causes = torch.from_numpy(read_causes(training / LINEAGE, len(gaussians)))
-        first = scene.test[0]
-        render = read_image(folder / RENDERS / png_name(first.name))
-        picture = draw_ellipsoids(render, gaussians, causes, first.camera, VOLUME_THRESHOLD)
-        (folder / FIGURES).mkdir(exist_ok=True)
-        picture.save(folder / FIGURES / ELLIPSOIDS)
-    if parts.eval.fps is not None:
-        speeds = measure_speed(rasterizer, gaussians, scene, color, parts.eval.fps)
-        for view, speed in speeds.items():
-            per_view[view]["fps"] = speed
-    _write_metrics(folder, evaluator, per_view, scene, at=at)
-
-
-def _measure_renders(views: Views, trained: Step, parts: Parts, folder: Path) -> None:
-    """Measure the renders that another program left in ``trained``."""
-    evaluator = parts.evaluator
-    scene, per_view = views.scene, {}
-    regions = regions_of(views, parts)
-    shutil.copytree(views.store.path(trained) / RENDERS, folder / RENDERS)
-    with progress("evaluate") as report:
-        for done, view in enumerate(scene.test, 1):
-            image = read_image(folder / RENDERS / png_name(view.name))
-            per_view[view.name] = evaluator.evaluate_view(
-                image, view.image, view.mask, regions.get(view.name, {})
-            )
-            report("views", done, len(scene.test))
-    unknown = {}
-    if parts.eval.fps is not None:
-        unknown["fps"] = "only the renders of the other program are known, not its model"
-    _write_metrics(folder, evaluator, per_view, scene, unknown)
-
-
-def measure_speed(
-    rasterizer: Rasterizer,
-    gaussians: Gaussians,
-    scene: Scene,
-    background: torch.Tensor,
-    size: Sequence[int],
-) -> dict[str, float]:
-    """The renders per second of each test view at ``size`` (width, height) px.
-
-    The first render of a view is not timed.
-    """
-    speeds = {}
-
-    def now() -> float:
-        if background.device.type == "cuda":  # kernels run asynchronously there
-            torch.cuda.synchronize(background.device)
-        return time.perf_counter()
-
-    for view in scene.test:
-        # The whole picture is scaled, and stretched if `size` has another shape: the same Gaussians
-        # stay in view.
-        camera = view.camera.resized(*size)
-        with torch.no_grad():
-            rasterizer.render(gaussians, camera, MAX_SH_DEGREE, background)
-            start = now()
-            for _ in range(TIMED_RENDERS):
-                rasterizer.render(gaussians, camera, MAX_SH_DEGREE, background)
-            speeds[view.name] = TIMED_RENDERS / (now() - start)
-    return speeds
+    _write_metrics(folder, evaluator, per_view, scene, at)
 
 
 def _write_metrics(
@@ -206,8 +120,7 @@ def _write_metrics(
     evaluator: Evaluator,
     per_view: Mapping[str, Mapping[str, float]],
     scene: Scene,
-    unavailable: Mapping[str, str] = MappingProxyType({}),
-    at: Mapping[str, Earlier] = MappingProxyType({}),
+    at: dict[str, Earlier],
 ) -> None:
     """Write the metrics of each view and their means.
 
@@ -223,13 +136,8 @@ def _write_metrics(
         counted = {COUNTED: view.counted} if masked else {}
         rows[view.name] |= distances | counted
     write_per_view(folder / PER_VIEW, rows)
-    summary = summary_of(evaluator, per_view)
-    summary = replace(
-        summary,
-        at=dict(at),
-        unavailable=summary.unavailable | dict(unavailable),
-        one_color_psnr=one_color_psnr(scene, evaluator.protocol),
-    )
+    plain = one_color_psnr(scene, evaluator.protocol)
+    summary = replace(summary_of(evaluator, per_view), at=at, one_color_psnr=plain)
     write_json(folder / METRICS, summary.to_json())
 
 
@@ -275,59 +183,3 @@ def write_per_view(path: Path, per_view: Mapping[str, Mapping[str, float]]) -> N
         writer.writeheader()
         for view, row in per_view.items():
             writer.writerow({"view": view} | {name: repr(value) for name, value in row.items()})
-
-
-# ---- a picture of the large Gaussians
-
-OUTLINE_POINTS = 48
-MAX_OUTLINES = 1500  # of the most voluminous Gaussians; more outlines would hide the picture
-MIN_OPACITY = 0.05  # fainter Gaussians are not seen
-FONT_SIZE, LINE_HEIGHT = 11, 14  # px, of the legend
-TEXT_COLOR = (255, 255, 255)
-
-
-def draw_ellipsoids(
-    render: NDArray[np.uint8],
-    gaussians: Gaussians,
-    causes: torch.Tensor,
-    camera: Camera,
-    volume_threshold: float,
-) -> Image.Image:
-    """The view ``render`` [H, W, 3] with outlines of Gaussians above ``volume_threshold``.
-
-    The threshold is in cubed scene units. An outline is the projected ellipsoid of one standard
-    deviation. Its colour tells which rule made the Gaussian (``causes`` [N], see ``Cause``). At
-    most the 1500 most voluminous Gaussians are drawn. A legend is below the view.
-    """
-    volumes = log_volume(gaussians.log_scales)  # [N]
-    large = (volumes > math.log(volume_threshold)) & (gaussians.opacities > MIN_OPACITY)
-    index = large.nonzero().flatten()
-    index = index[torch.argsort(volumes[index], descending=True)][:MAX_OUTLINES]
-    projected = project(
-        gaussians.select(index).map(lambda tensor: tensor.detach().double().cpu()), camera
-    )
-    image = Image.fromarray(render).convert("RGB")
-    canvas = ImageDraw.Draw(image)
-    angles = np.linspace(0, math.tau, OUTLINE_POINTS)
-    circle = np.stack([np.cos(angles), np.sin(angles)])  # [2, K]
-    for mean, conic, member in zip(projected.means, projected.conics, projected.index, strict=True):
-        a, b, c = conic.tolist()
-        covariance = np.linalg.inv(np.array([[a, b], [b, c]]))  # px^2
-        outline = np.linalg.cholesky(covariance) @ circle + mean.numpy()[:, None]  # [2, K]
-        color = Cause(int(causes[index[member]])).color
-        canvas.line([tuple(point) for point in outline.T.round().astype(int).tolist()], fill=color)
-    drawn = [cause for cause in Cause if (causes[index[projected.index]] == int(cause)).any()]
-    condition = f"volume above {volume_threshold:g}"
-    title = f"{condition}, made by:" if drawn else f"none has a {condition}"
-    return _with_legend(image, title, drawn)
-
-
-def _with_legend(image: Image.Image, title: str, causes: Sequence[Cause]) -> Image.Image:
-    """The image with a legend below: a line for the title, and one in its colour for each cause."""
-    lines = [(title, TEXT_COLOR), *((cause.words, cause.color) for cause in causes)]
-    result = Image.new("RGB", (image.width, image.height + len(lines) * LINE_HEIGHT))
-    result.paste(image, (0, 0))
-    canvas, font = ImageDraw.Draw(result), ImageFont.load_default(FONT_SIZE)
-    for row, (text, color) in enumerate(lines):
-        canvas.text((2, image.height + row * LINE_HEIGHT), text, fill=color, font=font)
-    return result

@@ -144,6 +144,7 @@ def masking_step(capture: Capture, backdrop: Backdrop) -> Step | None:
     inputs: dict[str, Any] = {
         "images": fingerprint(capture.images, capture.image_names),
         "masks": {name: file_sha256(file) for name, file in sorted(capture.masks.items())},
+        "ignored": "as the nearest counted pixel",
     }
     if backdrop != "black":
         inputs["behind"] = backdrop
@@ -201,7 +202,7 @@ class Views:
 
     def __init__(self, store: Store, capture: Capture, init: Step, options: SceneConfig) -> None:
         self.store, self.capture, self.init = store, capture, init
-        names = ("downscale", "max_size", "resample", "principal_point")
+        names = ("max_size", "principal_point")
         self.preparation: dict[str, Any] = {name: getattr(options, name) for name in names}
         self._beside: dict[str, Any] = {}
         if options.beside:

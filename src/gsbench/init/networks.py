@@ -1,21 +1,127 @@
-"""Extractors of local features and matchers of two images' features, by name."""
+"""Networks of `gsbench.init.dim`: local features, extractors and matchers by name, and a store.
+
+The store has one file for each image and each pair, so that an interrupted run continues from
+there. The name of its folder is a hash of everything that the files depend on: the photographs, the
+masks, the settings and the weights.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from gsbench.errors import InputError
-from gsbench.init.networks.features import Features, Matches
+from gsbench.files import DAMAGE, atomic, file_sha256
+from gsbench.runs.configuration import sha256_of
 from gsbench.scene.images import read_image, resize_image
 from gsbench.scene.options import downscaled_size
+from gsbench.scene.types import Capture, Mask
 from gsbench.system.install import install_command
 from gsbench.weights import load_into, load_state
+
+Size = NDArray[np.int64] | tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class Features:
+    """Features of one image, strongest first.
+
+    ``keypoints`` [K, 2] float32 are in px of the image at the network's size, with the centre of
+    the first pixel at (0, 0). `colmap_keypoints` are in px of the file. ``descriptors`` are [K, D]
+    float32, ``scores`` [K] float32.
+    """
+
+    keypoints: NDArray[np.float32]
+    descriptors: NDArray[np.float32]
+    scores: NDArray[np.float32]
+    network_size: Size  # width, height in px
+    file_size: Size
+
+    @property
+    def colmap_keypoints(self) -> NDArray[np.float32]:
+        """Keypoints [K, 2] in px of the file, in COLMAP's convention.
+
+        The centre of the first pixel is (0.5, 0.5).
+        """
+        scale = np.array(self.file_size, dtype=np.float64) / self.network_size
+        return ((self.keypoints.astype(np.float64) + 0.5) * scale).astype(np.float32)
+
+    def within(self, mask: Mask) -> Features:
+        """The features on pixels that count in ``mask`` [H, W], which has the file's size."""
+        height, width = mask.shape
+        columns, rows = np.floor(self.colmap_keypoints).astype(np.int64).T  # [K] each
+        kept = mask[rows.clip(0, height - 1), columns.clip(0, width - 1)]
+        arrays = self.keypoints[kept], self.descriptors[kept], self.scores[kept]
+        return Features(*arrays, self.network_size, self.file_size)
+
+
+FORMAT_VERSION = 2  # to be raised when the same settings give different files
+Matches = NDArray[np.uint32]  # indices [M, 2] of keypoints in the first and the second image
+
+
+def store_folder(work: Path, capture: Capture, names: Sequence[str], *settings: object) -> Path:
+    """The folder below ``work`` for features and matches of the images ``names``."""
+    hashes = [
+        [file_sha256(file) for file in (capture.images / name, capture.masks.get(name)) if file]
+        for name in names
+    ]
+    return work / "features" / sha256_of([FORMAT_VERSION, list(names), hashes, *settings])
+
+
+class FeatureStore:
+    """Store of features and matches in ``folder`` (`store_folder`), a file each.
+
+    What is missing or damaged is computed by ``extract`` and ``match``; features of up to ``room``
+    images are kept in memory.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        extract: Callable[[str], Features],
+        match: Callable[[Features, Features], Matches],
+        room: int,
+    ) -> None:
+        self.folder, self._extract, self._match = folder, extract, match
+        folder.mkdir(parents=True, exist_ok=True)
+        self.features = lru_cache(room)(self._features)
+
+    def path(self, *names: str) -> Path:
+        """The file of an image, or of a pair of images."""
+        return self.folder / f"{hashlib.sha256(repr(names).encode()).hexdigest()}.npz"
+
+    def _features(self, name: str) -> Features:
+        """The features of an image."""
+        return Features(**self._stored(lambda: vars(self._extract(name)), name))
+
+    def matches(self, *pair: str) -> Matches:
+        """The matches of a pair of images."""
+        found = self._stored(lambda: {"found": self._match(*map(self.features, pair))}, *pair)
+        matches: Matches = found["found"]
+        return matches
+
+    def _stored(self, make: Callable[[], Mapping[str, Any]], *names: str) -> Mapping[str, Any]:
+        """The arrays in the file of ``names``, which ``make`` returns if it cannot be read."""
+        path = self.path(*names)
+        with suppress(*DAMAGE), np.load(path, allow_pickle=False) as data:
+            return dict(data)
+        made = make()
+        with atomic(path, sync=False) as temporary, temporary.open("wb") as file:
+            np.savez(file, **made)
+        return made
+
+
+# ---- extractors and matchers
 
 GPU_MEMORY_HINT = "lower init.max_image_size or init.max_keypoints, or set init.device=cpu"
 SUPERPOINT_BORDER = 4  # px without keypoints, as in deep-image-matching
@@ -100,7 +206,7 @@ def _aliked(settings: Settings, weights: Path, device: torch.device) -> Extracto
     from kornia.feature import ALIKED
 
     network = ALIKED(
-        f"aliked-{settings['aliked_model']}",
+        "aliked-n16",
         max_num_keypoints=settings["max_keypoints"],
         detection_threshold=settings["keypoint_threshold"],
         nms_radius=settings["nms_radius"],
@@ -110,25 +216,6 @@ def _aliked(settings: Settings, weights: Path, device: torch.device) -> Extracto
     def extract(image: Tensor) -> Found:
         features = network(image)[0]
         return features.keypoints, features.descriptors, features.keypoint_scores
-
-    return extract
-
-
-def _disk(settings: Settings, weights: Path, device: torch.device) -> Extractor:
-    from kornia.feature import DISK
-
-    network = DISK()
-    load_into(network, load_state(weights, entry="extractor"), weights).to(device)
-
-    def extract(image: Tensor) -> Found:
-        features = network(
-            image,
-            n=settings["max_keypoints"],
-            window_size=2 * settings["nms_radius"] + 1,
-            score_threshold=settings["keypoint_threshold"],
-            pad_if_not_divisible=True,
-        )[0]
-        return features.keypoints, features.descriptors, features.detection_scores
 
     return extract
 
@@ -144,7 +231,6 @@ def _gray(image: Tensor) -> Tensor:
 EXTRACTORS: dict[str, Callable[[Settings, Path, torch.device], Extractor]] = {
     "superpoint": _superpoint,
     "aliked": _aliked,
-    "disk": _disk,
 }
 
 
@@ -184,9 +270,6 @@ def lightglue_matcher(
             old, new = f"{kind}.{layer}.", f"transformers.{layer}.{kind}."
             for name in [name for name in state if name.startswith(old)]:
                 state[name.replace(old, new)] = state.pop(name)
-    # DISK's file also has a constant 1 for each layer, "log_assignment.0.r", that no code reads.
-    unread = [f"log_assignment.{layer}.r" for layer in range(network.conf.n_layers)]
-    state = {name: value for name, value in state.items() if name not in unread}
     load_into(network, state, weights).to(device)
 
     def inputs(features: Features) -> dict[str, torch.Tensor]:

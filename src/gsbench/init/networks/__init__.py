@@ -1,1 +1,0 @@
-"""Extraction and matching of local features by networks."""
