@@ -17,11 +17,8 @@ from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig
 
 
-class GsbenchLauncher(Launcher):
-    """Runs the jobs of another sweeper as the settings ``launch`` say, or by another launcher.
-
-    gsbench's own sweeper runs its trials itself.
-    """
+class _Plugin:
+    """What Hydra gives a launcher or a sweeper: gsbench has read its settings before."""
 
     def __init__(self, **settings: Any) -> None:
         pass
@@ -31,6 +28,13 @@ class GsbenchLauncher(Launcher):
     ) -> None:
         self.task: Any = task_function
         self.context, self.config = hydra_context, config
+
+
+class GsbenchLauncher(_Plugin, Launcher):
+    """Runs the jobs of another sweeper as the settings ``launch`` say, or by another launcher.
+
+    gsbench's own sweeper runs its trials itself.
+    """
 
     def launch(
         self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int
@@ -39,20 +43,8 @@ class GsbenchLauncher(Launcher):
         return returned
 
 
-class GsbenchSweeper(Sweeper):
-    """Runs the grid of all listed values, or several joined grids, as one batch.
-
-    gsbench has read its settings before Hydra makes this object.
-    """
-
-    def __init__(self, **settings: Any) -> None:
-        pass
-
-    def setup(
-        self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
-    ) -> None:
-        self.task: Any = task_function
-        self.context, self.config = hydra_context, config
+class GsbenchSweeper(_Plugin, Sweeper):
+    """Runs the grid of all listed values, or several joined grids, as one batch."""
 
     def sweep(self, arguments: list[str]) -> None:
         self.task.run_sweep(self.context, self.config)

@@ -253,7 +253,7 @@ def test_a_users_metric_is_optimised_in_the_direction_of_its_class(sweep, runs, 
     text = "class Mine:\n    direction = -1\n    def measure(self, *given): ...\n"
     Path("own_measure.py").write_text(text)
     own = ["eval.extra.mine._target_=own_measure.Mine", "allow_targets=[own_measure]"]
-    words = [*own, f"{TUNE}.metric=mine", f"{TUNE}.points=2"]
+    words = [*own, "eval.primary=mine", f"{TUNE}.points=2"]
     assert sweep(Fake(metrics=("psnr", "mine")), *words) == 0
     search = tuning(runs, "adc")
     assert search.direction == -1
@@ -293,7 +293,6 @@ def test_unequal_tuning_is_stated_in_headline_and_tables(sweep, runs):
 
 MISTAKES = [
     (FILE, f"{TUNE}.point=3", "did you mean points?"),
-    (FILE, f"{TUNE}.metric=psnrr", "did you mean psnr?"),
     (FILE, f"{TUNE}.seed='1,2'", "tune.seed: 1 is a seed of the sweep, too"),
     (FILE, f"{TUNE}.seed=one", "must list whole numbers"),
     (FILE, "scene.validation=true", "leave scene.validation out"),

@@ -12,12 +12,11 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from gsbench.app.command import compose_trials
-from gsbench.config.build import build
+from gsbench.config.build import build, build_metrics
 from gsbench.config.command_words import check_words
 from gsbench.config.compose import compose_one
 from gsbench.config.overrides import key_of, parse_word
 from gsbench.config.schema import check, plain, register_schemas
-from gsbench.pipeline.parts import build_metrics
 from gsbench.runs.code import config_hash
 from gsbench.system.install import conf_dir
 from gsbench.train.options import STEPS

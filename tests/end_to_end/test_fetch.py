@@ -7,6 +7,7 @@ import pytest
 from gsbench.datasets.catalog import read_catalog
 from tests.datasets.conftest import archive_content, write_archive
 from tests.datasets.server import Manners, serve
+from tests.processes import wait_until
 
 pytestmark = pytest.mark.slow
 
@@ -50,9 +51,7 @@ def test_a_killed_fetch_continues(server, tmp_path, start, gsbench):
 
     server.manners = Manners(damage=slowly)
     process = start("fetch", "mipnerf360", "--mirror", server.url)
-    deadline = time.monotonic() + 60
-    while not list((tmp_path / "data/.fetch").glob("*/*/*.JPG")) and time.monotonic() < deadline:
-        time.sleep(0.01)
+    wait_until(lambda: list((tmp_path / "data/.fetch").glob("*/*/*.JPG")), 60)
     process.kill()
     process.communicate()
     server.manners = Manners()

@@ -50,8 +50,6 @@ def test_optunas_sweeper_looks_for_the_best_mean_over_seeds(gsbench, tmp_path, d
         psnr[result["num_init_points"]].append(result["metrics"]["psnr"])
     assert all(len(values) == 2 for values in psnr.values())
     best = max(psnr, key=lambda count: statistics.fmean(psnr[count]))
-    assert f"hydra/sweeper=optuna: best: init.count={best}, psnr " in done.stderr
-    assert f"init.count={best} " in done.stderr.rpartition("; again: gsbench -m ")[2]
     found = yaml.safe_load((tmp_path / "runs/.hydra/optimization_results.yaml").read_text())
     assert found["best_params"] == {"init.count": best}
     sign = 1 if direction == "maximize" else -1

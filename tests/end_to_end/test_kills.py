@@ -11,7 +11,7 @@ import pytest
 
 from tests.end_to_end.conftest import SMALL, SWEEP, results_of
 from tests.helpers import read_json
-from tests.processes import bytes_written
+from tests.processes import bytes_written, wait_until
 
 pytestmark = [
     pytest.mark.slow,
@@ -24,9 +24,7 @@ PATIENCE = 240.0
 
 
 def wait_for(runs, pattern, process, seconds=120):
-    deadline = time.monotonic() + seconds
-    while not list(runs.glob(pattern)) and process.poll() is None and time.monotonic() < deadline:
-        time.sleep(0.02)
+    wait_until(lambda: list(runs.glob(pattern)) or process.poll() is not None, seconds)
     assert list(runs.glob(pattern)), f"{pattern} did not appear"
 
 

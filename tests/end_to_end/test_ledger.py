@@ -2,7 +2,6 @@
 
 import json
 import signal
-import time
 from functools import partial
 from shlex import split
 
@@ -10,6 +9,7 @@ import pytest
 
 from gsbench.claims.ledger import read_ledger
 from tests.end_to_end.conftest import SMALL
+from tests.processes import wait_until
 
 pytestmark = pytest.mark.slow
 
@@ -52,9 +52,7 @@ def test_a_killed_try_continues(do, start, tmp_path):
     do(*NEW, "seed=0,1,2")
     home = tmp_path / "runs/night"
     killed = start("ledger", "try", "night", "densify=volumetric")
-    deadline = time.monotonic() + 120
-    while not list(home.glob("*/*/*/results.json")) and time.monotonic() < deadline:
-        time.sleep(0.05)
+    wait_until(lambda: list(home.glob("*/*/*/results.json")), 120)
     killed.send_signal(signal.SIGKILL)
     killed.communicate()
     (idea,) = read_ledger(home).questions

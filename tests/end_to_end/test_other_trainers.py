@@ -24,7 +24,7 @@ from gsbench.view.trials import find_trial, load_viewed
 from tests.datasets.server import serve
 from tests.end_to_end.conftest import program
 from tests.helpers import read_json, write
-from tests.processes import is_running
+from tests.processes import is_running, wait_until
 
 pytestmark = pytest.mark.slow
 
@@ -40,13 +40,6 @@ result: point_cloud/iteration_{{iterations}}/*.ply
 options: {{python: {sys.executable}, mode: good}}
 environment: {{PAINTER: "{{mode}}"}}
 """
-PAINTER = f"""
-defaults: [cloud, _self_]
-name: painter
-command: ["{{python}}", {TRAINER}, --data, "{{data}}", --output, "{{output}}", --iterations, "{{iterations}}",
-  --seed, "{{seed}}", --mode, "{{mode}}", --cameras, "{{test_cameras}}"]
-result: renders/*.png
-"""
 QUICK = [
     *split(
         "init=random init.count=2000 train.iterations=40 train.densify_start=500 tracking=none "
@@ -59,16 +52,15 @@ COURTYARD = ["scene.views=12", "scene.width=96", "scene.height=72", *QUICK]
 
 @pytest.fixture(scope="module")
 def trainers(tmp_path_factory):
-    """A folder of configurations with the two trainers: a user's own YAML files."""
+    """A folder of configurations with the trainer: a user's own YAML file."""
     folder = tmp_path_factory.mktemp("conf")
     write(folder / "densify/cloud.yaml", CLOUD)
-    (folder / "densify/painter.yaml").write_text(PAINTER)
     return folder
 
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory, environment, trainers):
-    """A folder with a fetched scene, and a sweep of an arm of gsbench and two of other programs."""
+    """A folder with a fetched scene, and a sweep of an arm of gsbench and one of another program."""
     home = tmp_path_factory.mktemp("home")
     train = partial(program, environment, home / "runs", cwd=home)
     courtyard = home / "courtyard"
@@ -82,7 +74,7 @@ def home(tmp_path_factory, environment, trainers):
             content.write(file, f"{archive.scenes['garden']}/{name}")
     with serve(archives) as server:
         train("fetch mipnerf360 garden --mirror", server.url)
-    sweep = split("densify=adc,cloud,painter seed=0,1 name=three scene=garden")
+    sweep = split("densify=adc,cloud seed=0,1 name=three scene=garden")
     train("--config-dir", trainers, "-m", *QUICK, *sweep)
     return home
 
@@ -112,7 +104,7 @@ def pixels(path):
     return hashlib.sha256(np.asarray(Image.open(path)).tobytes()).hexdigest()
 
 
-def test_two_programs_and_a_folder_of_renders_in_one_table(home, monkeypatch, capsys, tmp_path):
+def test_a_program_and_a_folder_of_renders_in_one_table(home, monkeypatch, capsys, tmp_path):
     monkeypatch.setenv("GSBENCH_RUNS", str(home / "runs"))
     monkeypatch.chdir(home)
     for seed in (0, 1):
@@ -128,19 +120,18 @@ def test_two_programs_and_a_folder_of_renders_in_one_table(home, monkeypatch, ca
     table = capsys.readouterr().out
     rows = {
         arm: next(line for line in table.splitlines() if f"| {arm} |" in line)
-        for arm in split("adc cloud painter folder")
+        for arm in split("adc cloud folder")
     }
     assert "2.0" in rows["cloud"]  # thousand Gaussians: one for each point
     assert run(["tables", "three", "--format", "html"]) == 0  # with all notes
     table = html.unescape(capsys.readouterr().out)
     # LPIPS; Gaussians of renders; their time
-    assert [row.count("n/a") for row in rows.values()] == [1, 1, 2, 3]
+    assert [row.count("n/a") for row in rows.values()] == [1, 1, 3]
     assert (
         "its model rendered by gsbench (its time is that of the whole program, and it sets its "
         "own budget): "
         "random-cloud (version 1.2.3)." in table
     )
-    assert "its own renders measured as they are (its time" in table
     assert (
         "Renders of another program, measured as they are (its conditions are not known): "
         "random-folder." in table
@@ -150,21 +141,20 @@ def test_two_programs_and_a_folder_of_renders_in_one_table(home, monkeypatch, ca
     # nobody asked about the folder of renders before it was measured
     for arm, verdict in {
         "cloud": "(better|worse)",
-        "painter": "(better|worse)",
         "folder": "not asked beforehand",
     }.items():
         assert re.search(f"random-{arm} against random-adc: {verdict}", report), arm
     explain = "explain three:garden:psnr:"
-    for words in ("status three", f"{explain}cloud", f"{explain}painter", "sync three"):
+    for words in ("status three", f"{explain}cloud", "sync three"):
         assert run(words.split()) == 0, words
     said = capsys.readouterr().out
-    assert "6 done" in said or "8 done" in said
+    assert "4 done" in said or "6 done" in said
     assert f"program   1.2.3: {sys.executable} {TRAINER}" in said
 
 
 def test_a_trial_of_another_program_has_a_full_record(home):
-    model, renders = results(trial(home, "cloud")), results(trial(home, "painter"))
-    assert (model["evaluated_from"], renders["evaluated_from"]) == ("model", "renders")
+    model = results(trial(home, "cloud"))
+    assert model["evaluated_from"] == "model"
     assert model["trained_by"]["said"] == "painter 1.2.3"
     assert model["num_gaussians"] == model["num_init_points"] == 2000
     assert model["iterations"] == 40
@@ -174,19 +164,16 @@ def test_a_trial_of_another_program_has_a_full_record(home):
         find_trial("three:garden:cloud:0", home / "runs"), None, torch.device("cpu")
     )
     assert (len(viewed.gaussians), len(viewed.views)) == (2000, 2)
-    assert (trial(home, "painter") / "trainer.log").is_file()
     assert model["hashes"]["train"] != results(trial(home, "cloud", 1))["hashes"]["train"]
     assert not list((home / "runs/store").rglob("work"))
 
 
-@pytest.mark.parametrize("arm", ["cloud", "painter"])
-def test_no_test_photograph_reaches_another_program(home, arm):
+def test_no_test_photograph_reaches_another_program(home):
     """The trainer lists every file beside and below its input, and follows links."""
-    log = (trial(home, arm) / "trainer.log").read_text()
+    log = (trial(home, "cloud") / "trainer.log").read_text()
     seen = dict(line.split()[1:] for line in log.splitlines() if line.startswith("saw "))
-    held_out = {
-        file.name: pixels(file) for file in (trial(home, arm) / "ground_truth").glob("*.png")
-    }
+    truth = trial(home, "cloud") / "ground_truth"
+    held_out = {file.name: pixels(file) for file in truth.glob("*.png")}
     photographs = {file.name: pixels(file) for file in (home / "data/garden/images_4").iterdir()}
     training = photographs.keys() - held_out.keys()
     assert len(held_out) == 2
@@ -196,11 +183,7 @@ def test_no_test_photograph_reaches_another_program(home, arm):
         name: photographs[name] for name in training
     }
     assert not set(seen.values()) & set(held_out.values())
-    models = {str(Path(name).parent) for name in seen if "sparse" in name}
-    assert models == (
-        {"data/sparse/0"} if arm == "cloud" else {"data/sparse/0", "test_cameras/sparse/0"}
-    )
-    assert ("test_cameras/transforms.json" in seen) == (arm == "painter")
+    assert {str(Path(name).parent) for name in seen if "sparse" in name} == {"data/sparse/0"}
     assert "observations 0" in log
     assert "environment [] good" in log
 
@@ -233,24 +216,19 @@ BAD = {
     "nothing": "left no point_cloud/iteration_40/*.ply (densify.result); it wrote notes.txt; log: ",
     "nan": "f_dc_1 is not a finite number everywhere",
 }
-BAD_RENDERS = {
-    "fewer": "1 of 2 photographs have no picture of their name (0008.png)",
-    "smaller": "is 48x36 px and the view 96x72: sizes are never changed here",
-}
 
 
-@pytest.mark.parametrize("arm, expected", [("cloud", BAD), ("painter", BAD_RENDERS)])
 def test_each_bad_program_is_reported_in_one_line_and_the_other_trials_run(
-    trainers, tmp_path, monkeypatch, capsys, arm, expected
+    trainers, tmp_path, monkeypatch, capsys
 ):
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path))
-    words = [*own(trainers), "-m", *COURTYARD, f"densify={arm}", "name=bad"]
-    assert run([*words, f"densify.options.mode={','.join([*expected, 'good'])}"]) == 1
+    words = [*own(trainers), "-m", *COURTYARD, "densify=cloud", "name=bad"]
+    assert run([*words, f"densify.options.mode={','.join([*BAD, 'good'])}"]) == 1
     error = capsys.readouterr().err
     lines = [line for line in error.splitlines() if line.startswith("gsbench: failed: ")]
-    assert len(lines) == len(expected)
-    for mode, line in zip(expected, lines, strict=True):
-        assert expected[mode] in line, (mode, line)
+    assert len(lines) == len(BAD)
+    for mode, line in zip(BAD, lines, strict=True):
+        assert BAD[mode] in line, (mode, line)
     assert len(list(tmp_path.glob("bad/*/*/*/results.json"))) == 1
     for failed in tmp_path.glob("bad/*/*/*/failed.json"):
         log = re.search(r"log: (\S+)$", read_json(failed)["message"])
@@ -291,10 +269,7 @@ def test_another_program_ends_with_gsbench(hanging, signum):
     assert all(map(is_running, pids))
     os.kill(process.pid, signum)
     process.wait(60)
-    deadline = time.monotonic() + 30
-    while any(map(is_running, pids)) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert not any(map(is_running, pids))
+    wait_until(lambda: not any(map(is_running, pids)), 30)
 
 
 @pytest.mark.parametrize(

@@ -1,13 +1,11 @@
 """A minimal trainer that knows nothing of gsbench.
 
-It reads its COLMAP folder with pycolmap, makes a Gaussian of every point, and writes a 3DGS PLY; or
-paints the points as seen by the test cameras.
+It reads its COLMAP folder with pycolmap, makes a Gaussian of every point, and writes a 3DGS PLY.
 The option ``--mode`` says how it fails.
 """
 
 import argparse
 import hashlib
-import json
 import os
 import signal
 import subprocess
@@ -40,27 +38,6 @@ def write_model(path, points, colors, mode):
     path.write_bytes("\n".join(header).encode() + body)
 
 
-def paint(cameras, output, points, colors, mode):
-    """Draw the points, far ones first, as squares of 3 px."""
-    for frame in json.loads((cameras / "transforms.json").read_text())["frames"]:
-        # world to OpenCV camera
-        pose = np.linalg.inv(np.array(frame["transform_matrix"]) @ np.diag([1, -1, -1, 1]))
-        local = points @ pose[:3, :3].T + pose[:3, 3]
-        picture = np.zeros((frame["h"], frame["w"], 3), np.uint8)
-        for index in np.argsort(-local[:, 2]):
-            if local[index, 2] > 0.1:
-                x = int(frame["fl_x"] * local[index, 0] / local[index, 2] + frame["cx"])
-                y = int(frame["fl_y"] * local[index, 1] / local[index, 2] + frame["cy"])
-                picture[max(0, y - 1) : max(0, y + 2), max(0, x - 1) : max(0, x + 2)] = (
-                    colors[index] * 255
-                )
-        output.mkdir(parents=True, exist_ok=True)
-        size = (frame["w"] // 2, frame["h"] // 2) if mode == "smaller" else (frame["w"], frame["h"])
-        Image.fromarray(picture).resize(size).save(output / frame["file_path"])
-        if mode == "fewer":
-            return
-
-
 def confess(folder):
     """Print every visible file below ``folder``, with a hash of the pixels of a picture."""
     for place, _, files in os.walk(folder, followlinks=True):
@@ -76,7 +53,6 @@ def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("--version", action="version", version="painter 1.2.3")
     parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--cameras", type=Path)
     parser.add_argument("--output", type=Path, required=True)
     parser.add_argument("--mode", default="good")
     parser.add_argument("--seed", type=int, default=0)
@@ -104,11 +80,8 @@ def main():
     points = np.array([point.xyz for _, point in sorted(model.points3D.items())])
     colors = np.array([point.color for _, point in sorted(model.points3D.items())]) / 255
     points = points + np.random.default_rng(options.seed).normal(0, 1e-3, points.shape)
-    if options.cameras is None:
-        place = options.output / f"point_cloud/iteration_{options.iterations}/point_cloud.ply"
-        write_model(place, points, colors, options.mode)
-    else:
-        paint(options.cameras, options.output / "renders", points, colors, options.mode)
+    place = options.output / f"point_cloud/iteration_{options.iterations}/point_cloud.ply"
+    write_model(place, points, colors, options.mode)
 
 
 if __name__ == "__main__":

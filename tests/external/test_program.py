@@ -9,12 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
 from gsbench.errors import TrainingError
-from gsbench.external.exchange import (
-    collect_model,
-    collect_renders,
-    write_test_cameras,
-    write_training_views,
-)
+from gsbench.external.exchange import collect_model, write_training_views
 from gsbench.external.run import run_program
 from gsbench.external.settings import fill_placeholders, split_command
 from gsbench.gaussians.ply import read_ply, write_ply
@@ -24,7 +19,7 @@ from gsbench.runs.code import config_hash
 from gsbench.scene.types import Camera, View
 from tests.config.test_schema import composed
 from tests.gaussians.helpers import differences, random_gaussians
-from tests.helpers import read_json, refusal
+from tests.helpers import refusal
 
 
 @pytest.fixture
@@ -76,23 +71,6 @@ def test_pycolmap_reads_the_training_folder(normalization, views, tmp_path):
         assert_allclose(image.project_point(ahead), wanted, atol=1e-6)
 
 
-def test_the_folder_of_test_cameras_has_no_images_and_the_same_projections(views, tmp_path):
-    write_test_cameras(tmp_path, views)
-    files = {path.name for path in tmp_path.rglob("*") if path.is_file()}
-    stems = ("cameras", "images", "points3D", "rigs", "frames")
-    assert files == {"transforms.json", *(f"{stem}.bin" for stem in stems)}
-    for view, frame in zip(views, read_json(tmp_path / "transforms.json")["frames"], strict=True):
-        points = view.camera.center + np.random.default_rng(2).normal(size=(20, 3))
-        # OpenGL's axes
-        local = np.linalg.inv(frame["transform_matrix"]) @ np.column_stack([points, np.ones(20)]).T
-        seen = local[2] < 0  # the camera looks along -z, and y is up
-        columns = frame["cx"] - frame["fl_x"] * local[0] / local[2]
-        pixels = np.column_stack([columns, frame["cy"] + frame["fl_y"] * local[1] / local[2]])
-        assert 0 < seen.sum() < 20
-        assert_allclose(pixels[seen], project(view.camera, points)[seen], atol=1e-6)
-        assert (frame["w"], frame["h"]) == (view.camera.width, view.camera.height)
-
-
 def test_the_one_model_of_a_program_is_taken_in_the_coordinates_of_the_training(tmp_path):
     gaussians = random_gaussians(9)
     (tmp_path / "out" / "7").mkdir(parents=True)
@@ -116,38 +94,6 @@ def test_the_one_model_of_a_program_is_taken_in_the_coordinates_of_the_training(
     model.write_text("no model")
     with pytest.raises(TrainingError, match=r"7/p\.ply"):
         collect_model(tmp_path / "out", "*/p.ply", tmp_path / "a.ply")
-
-
-@pytest.mark.parametrize(
-    "names, by_order, said",
-    [
-        (("a.png", "left__b.png", "c.png"), False, ""),
-        (("1.png", "2.png", "10.png"), True, ""),  # sorted by value, as a, c and left__b are
-        (("1.png", "2.png", "10.png"), False, "densify.by_order=true takes them as they are"),
-        (("a.png", "c.png"), False, "1 of 3 photographs have no picture of their name"),
-        (("a.png", "c.png"), True, "there are 2 pictures for 3 photographs"),
-        (
-            ("a.png", "c.png", "left__b.png"),
-            False,
-            "left__b.png is 42x28 px and the view 41x29: sizes",
-        ),
-    ],
-)
-def test_renders_of_a_program_get_the_names_of_their_views(names, by_order, said, views, tmp_path):
-    for name, index in zip(names, (0, 2, 1) if by_order else (0, 1, 2), strict=False):
-        (tmp_path / "out" / "test").mkdir(parents=True, exist_ok=True)
-        Image.fromarray(views[index].image).save(tmp_path / "out" / "test" / name)
-
-    def collect():
-        collect_renders(tmp_path / "out", "test/*.png", by_order, views, tmp_path / "target")
-
-    if said:
-        with pytest.raises(TrainingError, match=said):
-            collect()
-        return
-    collect()
-    for view, name in zip(views, ("a.png", "left__b.png", "c.png"), strict=True):
-        assert_array_equal(Image.open(tmp_path / "target" / name), view.image)
 
 
 def test_a_command_is_split_and_its_placeholders_are_filled_once():

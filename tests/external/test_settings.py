@@ -30,19 +30,13 @@ def test_a_setting_of_the_wrong_kind_is_refused_by_its_name(settings):
         External(**(sound | settings))
 
 
-def test_placeholders_are_known_and_tell_whether_test_cameras_are_needed():
+def test_placeholders_are_known():
     for command, result in (("train {data} {lr}", "a.ply"), ("train {data}", "{lr}.ply")):
         key = "command" if "lr" in command else "result"
         with refusal(rf"densify\.{key}: unknown placeholder \{{lr\}}"):
             External(command=command, result=result, version="1")
     with refusal(r"has no \{data\}"):
         External(command=["a"], result="*.ply", version="1")
-    assert external("x/*.PLY").leaves_model
-    assert not external("x/*.png").leaves_model
-    assert not external("a.ply").needs_test_cameras
-    assert external("a.ply", environment={"CAMERAS": "{test_cameras}/x"}).needs_test_cameras
-    command = ["train", "{data}", "--test={test_cameras}"]
-    assert External(command=command, result="a.ply", version="1").needs_test_cameras
 
 
 def test_the_program_is_found_on_its_own_path(tmp_path, monkeypatch):
@@ -55,7 +49,7 @@ def test_the_program_is_found_on_its_own_path(tmp_path, monkeypatch):
     assert external("a.ply", environment=own).executable() == str(tmp_path / "two" / "train")
     monkeypatch.setenv("HOME", str(tmp_path))
     home = External(
-        command="{where}/train {data}", result="a", version="1", options={"where": "~/two"}
+        command="{where}/train {data}", result="a.ply", version="1", options={"where": "~/two"}
     )
     assert home.executable() == str(tmp_path / "two" / "train")
     monkeypatch.setenv("PATH", str(tmp_path))
@@ -66,7 +60,7 @@ def test_the_program_is_found_on_its_own_path(tmp_path, monkeypatch):
 SOUND = (
     "a.ply",
     "**/point_cloud.ply",
-    "out/*/view_*.png",
+    "x/*.PLY",
     "it_{iterations}/a.ply",
     "{option}/x.ply",
     "./a.ply",
@@ -90,7 +84,8 @@ NO_PATTERN = "densify.result=.* not a pattern of files"
         ("C:/a.ply", BELOW),
         (".", BELOW),
         ("a\0.ply", BELOW),
-        ("x" * 300, NO_PATTERN),
+        ("x" * 300 + ".ply", NO_PATTERN),
+        ("out/*/view_*.png", "must name a 3DGS model, as .*; renders .* gsbench evaluate --as"),
     ],
 )
 def test_a_result_is_a_pattern_below_the_output_folder(result, said):

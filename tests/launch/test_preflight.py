@@ -16,6 +16,7 @@ from gsbench.launch.batch import (
 )
 from gsbench.launch.jobs import Outcome
 from gsbench.runs.commands import read_history
+from gsbench.runs.trial_folder import TrialFolder
 from tests.helpers import refusal, table
 from tests.launch.test_jobs import SLURM, nothing
 from tests.trials import LOCAL, bare_trial, write_results
@@ -61,7 +62,7 @@ def test_unfinished_trials_go_to_their_launcher_once_checked_and_planned(
     runs = tmp_path / "runs"
     declaring = {"eval": {"primary": "psnr"}}
     one, two = (trial(runs, seed, launch, **declaring) for seed in (0, 1))
-    monkeypatch.setattr(batch, "_why_not_done", lambda trial: trial.folder != one.folder)
+    monkeypatch.setattr(TrialFolder, "why_not_done", lambda self, *_: self.path != one.folder)
     write_results(one.folder, one.values)
     left = runs / "store/init/.a.removed"
     left.mkdir(parents=True)

@@ -1,4 +1,4 @@
-"""Predictions of nerfbaselines 1.2.12, and places that are no folder of renders."""
+"""Renders with their photographs, and places that are no folder of renders."""
 
 import io
 import json
@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gsbench.renders.sources import find_renders
 from tests.helpers import write
 
 
@@ -17,28 +16,19 @@ def png(values):
     return stream.getvalue()
 
 
-@pytest.mark.parametrize("home", ["", "predictions"], ids=["predictions", "a published result"])
-def test_predictions_are_measured_with_their_photographs_or_others(home, tmp_path, said):
+def test_predictions_of_nerfbaselines_are_measured_with_their_photographs(tmp_path, said, refused):
     """Each render is 10 levels darker than its photograph."""
-    place, views = tmp_path / "result", ("DSC001", "sub/DSC002")
-    write(place / home / "info.json", {})
+    views = ("DSC001", "sub/DSC002")
     rng = np.random.default_rng(0)
     for view in views:
         photograph = rng.integers(20, 255, (24, 32, 3)).astype(np.uint8)
-        write(place / home / f"color/{view}.png", png(photograph - 10))
-        write(place / home / f"gt-color/{view}.png", png(photograph))
-        write(tmp_path / f"photos/{view}.JPG", png(photograph))
-    quick = ["eval.lpips=[]", "eval.flip=false"]
-    measured = json.loads(said("evaluate", place, *quick, "--json"))
+        write(tmp_path / f"color/{view}.png", png(photograph - 10))
+        write(tmp_path / f"gt-color/{view}.png", png(photograph))
+    words = ["evaluate", tmp_path / "color", "eval.lpips=[]", "eval.flip=false", "--json"]
+    measured = json.loads(said(*words, "--truth", tmp_path / "gt-color"))
     assert set(measured["views"]) == {f"{view}.png" for view in views}
     assert measured["metrics"]["psnr"] == pytest.approx(20 * np.log10(255 / 10))
-    assert "names matched" in said("evaluate", place, "--truth", tmp_path / "photos", *quick)
-
-
-def test_a_plain_folder_brings_no_photographs(tmp_path, refused):
-    write(tmp_path / "color/a.png", png(np.zeros((4, 4, 3), np.uint8)))
-    assert find_renders(tmp_path) == (tmp_path, None)
-    assert "--truth PLACE is needed" in refused("evaluate", tmp_path)
+    assert "--truth PLACE is needed" in refused(*words)
     assert "nowhere is not a folder of renders" in refused("evaluate", tmp_path / "nowhere")
 
 

@@ -17,7 +17,7 @@ import pytest
 
 from tests.end_to_end.conftest import SMALL
 from tests.helpers import read_json
-from tests.processes import completed
+from tests.processes import completed, wait_until
 
 pytestmark = [pytest.mark.slurm, pytest.mark.slow]
 
@@ -44,6 +44,7 @@ class Broken(ADC):
 PAUSE, LONG_PAUSE = "0.2", "0.4"
 SWEEP = [*split("--config-dir conf -m"), *SMALL]
 SWEEP += split("name=cluster densify=slow allow_targets=[slow] tracking=none")
+TRAINING = "store/train/.*.partial/metrics.jsonl"
 # Slurm sends its signal up to half a minute before the five seconds.
 CLUSTER = split(
     "launch=slurm launch.timeout_min=1 launch.signal_seconds=5 launch.cpus_per_trial=1 "
@@ -94,12 +95,7 @@ def test_a_requeued_sweep_ends_with_the_models_of_an_undisturbed_one(place, gsbe
 
     runs = place / "runs"
     first = start(*SWEEP, "seed=0,1", *CLUSTER, PAUSE=PAUSE)
-    deadline = time.monotonic() + 120
-    while (
-        len(list(runs.glob("store/train/.*.partial/metrics.jsonl"))) < 2
-        and time.monotonic() < deadline
-    ):
-        time.sleep(0.2)
+    wait_until(lambda: len(list(runs.glob(TRAINING))) == 2, 120, 0.2)
     queued = queue()
     assert len(queued) == 2
     time.sleep(3)
@@ -114,10 +110,8 @@ def test_a_requeued_sweep_ends_with_the_models_of_an_undisturbed_one(place, gsbe
     output, _ = second.communicate(timeout=280)
     logs = job_logs(runs)
     assert second.returncode == 0, output + logs
-    deadline = time.monotonic() + 30  # a job that has ended leaves the queue a little later
-    while set(queue()) & set(queued) and time.monotonic() < deadline:
-        time.sleep(0.5)
-    assert not set(queue()) & set(queued)
+    # a job that has ended leaves the queue a little later
+    wait_until(lambda: not set(queue()) & set(queued), 30, 0.5)
     assert sorted(models(runs)) == sorted(models(place / "whole"))
     assert models(runs) == models(place / "whole")
     assert len(list(runs.glob(".jobs/cluster/*/*_submission.sh"))) == 1, (
@@ -200,11 +194,7 @@ def test_failed_trial_and_killed_job_are_reported(place, gsbench, start):
     slow = start(*SWEEP, "seed=0", *CLUSTER, "launch.timeout_min=10", PAUSE=PAUSE)
     bad = gsbench(*SWEEP, "seed=1,2", "densify.split_size=-1", *CLUSTER, code=2)
     assert "densify.split_size" in bad.stderr
-    deadline = time.monotonic() + 120
-    while (
-        not list(runs.glob("store/train/.*.partial/metrics.jsonl")) and time.monotonic() < deadline
-    ):
-        time.sleep(0.2)
+    wait_until(lambda: list(runs.glob(TRAINING)), 120, 0.2)
     (folder,) = [
         path.parent for path in runs.glob("cluster/*/*/*/.submitted.json") if "seed0" in str(path)
     ]

@@ -22,7 +22,6 @@ STARTS = {
     ("launch/slurm.py", "make_executor", "submitit.SlurmExecutor"): "current",
     ("launch/jobs.py", "run_local", "submitit.LocalExecutor"): "current",
     ("pipeline/steps/external.py", "check_version", "subprocess.run"): "own",
-    ("system/install.py", "_git", "subprocess.run"): "neutral",
     ("system/isolate.py", "_run_child", "subprocess.Popen"): "current",
     ("system/isolate.py", "continue_in_child", "os.fork"): "current",
     ("system/programs.py", "answer_of", "subprocess.run"): "neutral",

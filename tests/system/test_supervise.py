@@ -12,7 +12,7 @@ import pytest
 
 from gsbench.errors import TrainingError
 from gsbench.external.run import run_program
-from tests.processes import heed_interrupts, is_running
+from tests.processes import heed_interrupts, is_running, wait_until
 
 pytestmark = pytest.mark.skipif(
     sys.platform != "linux", reason="daemons get away where nobody can adopt orphans"
@@ -76,13 +76,12 @@ def test_a_daemon_of_a_trainer_ends_with_it(tmp_path, end, code):
     except TrainingError:
         assert end
     assert is_gone(tmp_path / "mark")
-    deadline = time.monotonic() + PATIENCE
-    while any(
-        process.info["cmdline"] == [sys.executable, "-c", FORKS]
-        for process in psutil.process_iter(["cmdline"])
-    ):
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+    forks = [sys.executable, "-c", FORKS]
+    wait_until(
+        lambda: all(one.info["cmdline"] != forks for one in psutil.process_iter(["cmdline"])),
+        PATIENCE,
+        0.05,
+    )
 
 
 @pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
@@ -100,9 +99,7 @@ def test_a_daemon_ends_with_gsbench_however_that_ends(tmp_path, sign):
     parent = subprocess.Popen(
         [sys.executable, str(tmp_path / "main.py")], preexec_fn=heed_interrupts
     )
-    deadline = time.monotonic() + PATIENCE
-    while not (tmp_path / "mark").exists() and time.monotonic() < deadline:
-        time.sleep(0.05)
+    wait_until((tmp_path / "mark").exists, PATIENCE)
     parent.send_signal(sign)
     parent.wait(PATIENCE)
     assert is_gone(tmp_path / "mark")

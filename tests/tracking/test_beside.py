@@ -92,15 +92,9 @@ def test_one_process_is_told_which_trials_are_to_be_sent(processes, tmp_path):
     assert not Path(process.command[-1].removeprefix("--beside=")).exists()
 
 
-@pytest.mark.parametrize("soon", [True, False])
-def test_a_process_that_crashed_is_replaced_and_told_all(
-    processes, tmp_path, monkeypatch, caplog, soon
-):
-    if soon:
-        monkeypatch.setattr(beside, "SECONDS_BETWEEN_STARTS", 0.01)
+def test_a_process_that_crashed_is_replaced_at_the_end_and_told_all(processes, tmp_path, caplog):
     with Mirror([tracked(tmp_path)]):
         processes[0].returncode = -9
-        wait_until(lambda: len(processes) == 1 + soon)
     assert len(processes) == 2
     assert processes[1].told == [*processes[0].told, "the end"]
     assert warnings_in(caplog) == []

@@ -95,7 +95,7 @@ def sink():
 def test_long_texts_are_cut_and_times_are_those_of_the_training(sink):
     update = Update(
         params={"short": "a", "long": "b" * 600},
-        tags={"raster": "cpu", "note": "n" * 6000},
+        tags={"raster": "cpu", "command": "n" * 6000},
         scalars=[Scalar("eval/psnr", 20.5, 30, 2.5)],
         pictures=[PICTURE],
         status="FAILED",
@@ -105,7 +105,7 @@ def test_long_texts_are_cut_and_times_are_those_of_the_training(sink):
     (_, _, sent) = sink._client.calls[0]
     assert [len(param.value) for param in sent["params"]] == [1, 500]
     lengths = {tag.key: len(tag.value) for tag in sent["tags"]}
-    assert lengths == {"raster": 3, "mlflow.note.content": 5000, "error": 5000}
+    assert lengths == {"raster": 3, "command": 5000, "error": 5000}
     (metric,) = sent["metrics"]
     found = (metric.key, metric.value, metric.step, metric.timestamp)
     assert found == ("eval/psnr", 20.5, 30, 1_002_500)

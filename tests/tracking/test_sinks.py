@@ -51,8 +51,7 @@ def test_the_summary_of_a_trial(tmp_path):
     assert [one.key for one in summary.pictures] == names
     assert (summary.pictures[2].pixels == np.full((4, 6, 3), 150)).all()
     assert {(one.step, one.seconds) for one in summary.pictures} == {(STEPS, 2.0)}
-    again = summary.tags["note"].splitlines()[-1].removeprefix("Again: ")
-    assert again == "`gsbench densify=a_densify 'scene.path=/my photos'`"
+    assert summary.tags["command"] == "gsbench densify=a_densify 'scene.path=/my photos'"
     assert trial.summary(results, images=0, with_model=False).pictures == []
     assert set(summary.files) == {"config.yaml", "results.json", "events.jsonl"}
 

@@ -13,7 +13,6 @@ import pytest
 from gsbench.config.compose import compose_one
 from gsbench.errors import GsbenchError
 from gsbench.launch import states
-from gsbench.launch.estimates import SPEED
 from gsbench.launch.record import record
 from gsbench.launch.states import TrialState
 from gsbench.runs.commands import read_history
@@ -131,16 +130,14 @@ def test_watching_looks_again_until_all_trials_have_ended(runs, monkeypatch, cap
     looks = []
     for state in ("running", "waiting", "done"):
         columns = {key: [0] for key in ("done", "running", "failed", "waiting")}
-        looks.append(pd.DataFrame(columns | {state: [1234], SPEED: [8.25]}, index=["adc[lr=1]"]))
-        looks[-1].attrs["seconds_left"] = 120.0
+        looks.append(pd.DataFrame(columns | {state: [1234]}, index=["adc[lr=1]"]))
     waited = []
     monkeypatch.setattr(trials, "progress_frame", lambda *_: looks.pop(0))
     monkeypatch.setattr(time, "sleep", waited.append)
     trials._watch(runs, "x")
     assert waited == [trials.SECONDS_BETWEEN_LOOKS] * 2
     said = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert "adc[lr=1] 1234 0 0 0 8.25" in said
-    assert "about 2 min left" in said
+    assert "adc[lr=1] 1234 0 0 0" in said
 
 
 def test_ctrl_c_ends_only_the_watching(folders, runs, monkeypatch):

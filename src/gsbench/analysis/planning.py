@@ -11,13 +11,14 @@ noise that the pilot's scenes have, and decided by the thresholds of the judge.
 """
 
 import math
+from bisect import bisect_left
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import special
 
 from gsbench.analysis.statistics import ALPHA, MIN_SCENES, Region, evenness, sign_test_needs
 from gsbench.errors import InputError
@@ -91,7 +92,7 @@ def estimate_components(differences: Sequence[NDArray[np.float64]]) -> Component
 def deviation_range(components: Components) -> tuple[float, float]:
     """The deviations between which that of trainings lies in `UNSURE` of such pilots."""
     degrees = components.trials - components.scenes
-    ends = special.chdtri(degrees, [(1 - UNSURE) / 2, (1 + UNSURE) / 2])
+    ends = scipy.special.chdtri(degrees, [(1 - UNSURE) / 2, (1 + UNSURE) / 2])
     low, high = map(float, np.sqrt(degrees / ends))
     return components.within * low, components.within * high
 
@@ -113,8 +114,8 @@ def power_like_these(design: Design, difference: float, components: Components) 
         return 0.0
     spread = math.hypot(components.between, components.within / math.sqrt(design.seeds))
     # that one scene's mean has the sign
-    chance = float(special.ndtr(abs(difference) / spread)) if spread else 1.0
-    return float(special.bdtrc(needed - 1, design.scenes, chance))
+    chance = float(scipy.special.ndtr(abs(difference) / spread)) if spread else 1.0
+    return float(scipy.special.bdtrc(needed - 1, design.scenes, chance))
 
 
 def power_of_mean(
@@ -134,7 +135,7 @@ def power_of_mean(
     if deviation == 0:
         return 1.0 if difference else 0.0
     shift = abs(difference) / deviation * math.sqrt(design.scenes * design.seeds)
-    return float(special.ndtr(shift - _thresholds(design, level, shares)).mean())
+    return float(scipy.special.ndtr(shift - _thresholds(design, level, shares)).mean())
 
 
 @cache
@@ -165,14 +166,11 @@ def fewest_seeds(
     """
     chosen: list[Design] = []
     for count in scenes:
-        low, high = 2, chosen[-1].seeds - 1 if chosen else most
-        if high < low or power(Design(count, high)) < POWER:
-            continue
-        while low < high:
-            middle = (low + high) // 2
-            enough = power(Design(count, middle)) >= POWER
-            low, high = (low, middle) if enough else (middle + 1, high)
-        chosen.append(Design(count, high))
+        designs = [Design(count, seeds) for seeds in range(2, most + 1)]
+        weaker = bisect_left(designs, POWER, key=power)  # how many have less power
+        if weaker < len(designs):
+            chosen.append(designs[weaker])
+            most = chosen[-1].seeds - 1
     return sorted(chosen, key=lambda design: (design.trials, design.scenes))
 
 

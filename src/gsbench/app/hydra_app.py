@@ -6,7 +6,6 @@ the jobs that the sweeper proposes, and runs them itself or by the chosen launch
 
 import logging
 import os
-import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -34,7 +33,7 @@ from gsbench.launch.jobs import Outcome, check_job_links, outcome_of_error
 from gsbench.logs import set_up_logging
 from gsbench.runs.experiments import DEFAULT_METRIC, metric_and_question
 from gsbench.system.programs import allow_modules
-from gsbench.words import command, counted
+from gsbench.words import command
 
 MODE = "hydra.mode"
 LAUNCHER = ("hydra/launcher", "hydra.launcher.")
@@ -60,16 +59,14 @@ class Goal:
     direction: int
     sign: int
     seeds: tuple[str, ...] = ()
-    # the means of the metric, by the words of the jobs
-    values: dict[tuple[str, ...], float] = field(default_factory=dict)
 
     def jobs_of(self, job: Sequence[str]) -> list[list[str]]:
         """The words of a point's trials."""
         words = [*job, *words_of_point(self.home)]
         return [[*words, seed] for seed in self.seeds] or [words]
 
-    def value(self, job: Sequence[str], trials: Sequence[Trial]) -> float:
-        """The value of a job with its ``trials``, which are done.
+    def value(self, trials: Sequence[Trial]) -> float:
+        """The value of a point with its ``trials``, which are done.
 
         Raises GsbenchError if one lacks the metric.
         """
@@ -78,23 +75,7 @@ class Goal:
             raise GsbenchError(
                 f"{trials[0].files.label} has no {self.metric}, which the sweeper needs"
             )
-        self.values[tuple(job)] = mean
         return mean * self.direction * self.sign
-
-    def best_line(self) -> str:
-        """The best values, with the command that trains them; "" if no point has a value."""
-        if not self.values:
-            return ""
-        best = max(self.values, key=lambda job: self.values[job] * self.direction)
-        swept = [word for word in best if not all(word in job for job in self.values)]
-        seeds = ",".join(word.partition("=")[2] for word in self.seeds)
-        words = [*best, *[f"seed={seeds}"] * bool(seeds)]
-        words = ["-m", *words] if len(self.seeds) > 1 else words
-        what, seeds = " ".join(swept) or "the only point", counted(max(1, len(self.seeds)), "seed")
-        return (
-            f"best: {what}, {self.metric} {self.values[best]:.4g} of validation views ({seeds}, in "
-            f"{self.home}); to train it: gsbench {shlex.join(words)}"
-        )
 
 
 def goal_of(sweep: Sweep) -> Goal | None:
@@ -109,7 +90,7 @@ def goal_of(sweep: Sweep) -> Goal | None:
     seeds = grid_points([parse_word(lists["seed"])]) if "seed" in lists else []
     values = sweep.trial([word for word in sweep.words if not is_sweep(word)]).values
     metric = metric_and_question(str(values["eval"].get("primary") or ""))[0] or DEFAULT_METRIC
-    direction, sign = better_direction(metric, values, "eval.primary"), _sign(node)
+    direction, sign = better_direction(metric, values), _sign(node)
     log.info(
         "hydra/sweeper=%s gets %s%s of validation views, %s",
         sweep.other_sweeper,
@@ -219,7 +200,7 @@ class HydraApp:
                 for outcome in (by_folder[trial.folder] for trial in own):
                     if outcome.status == "failed":
                         raise outcome.error
-                ended.return_value = self.goal.value(job, own) if self.goal else None
+                ended.return_value = self.goal.value(own) if self.goal else None
             except GsbenchError as error:
                 ended.return_value, ended.status = error, JobStatus.FAILED
             returned.append(ended)
@@ -330,15 +311,14 @@ def _search(app: HydraApp, words: Sequence[str]) -> None:
         raise InputError(
             f"hydra/sweeper={name} raised {type(error).__name__}: {message}"
         ) from error
-    if not app.ended.trials:
+    home = app.goal.home if app.goal else experiment
+    if app.goal or not app.ended.trials:
         log.info(
             "hydra/sweeper=%s has ended: %s; the table: %s",
             name,
-            command("status", experiment),
-            command("tables", experiment),
+            command("status", home),
+            command("tables", home),
         )
-    elif app.goal and (best := app.goal.best_line()):
-        log.info("hydra/sweeper=%s: %s", name, best)
 
 
 def words_without_sweeper(sweep: Sweep) -> tuple[list[str], bool]:

@@ -14,13 +14,13 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from gsbench.config.build import facts_for
 from gsbench.config.command_words import check_removal, check_words
 from gsbench.config.compose import Composer, Trial, config_loader, hydra_config, hydra_ready
 from gsbench.config.explain import explained
 from gsbench.config.overrides import is_sweep, parse_word
 from gsbench.errors import InputError
 from gsbench.logs import set_up_logging
-from gsbench.pipeline.metric_facts import facts_for
 
 if TYPE_CHECKING:  # loads scipy, which completion does without
     from gsbench.launch.jobs import Outcome
@@ -86,11 +86,13 @@ class Sweep(Composer):
             return OverridesParser.create(config_loader()).parse_overrides(list(words))
 
 
-def better_direction(metric: str, values: Mapping[str, Any], key: str) -> Literal[-1, 1]:
-    """1 if more of a metric is better, else -1. Raises InputError, for ``key``, if neither is."""
+def better_direction(metric: str, values: Mapping[str, Any]) -> Literal[-1, 1]:
+    """1 if more of ``eval.primary`` is better, else -1. Raises InputError if neither is."""
     direction = facts_for(metric, values).direction
     if not direction:
-        raise InputError(f"{key}={metric}: whether more or less of it is better is not known")
+        raise InputError(
+            f"eval.primary={metric}: whether more or less of it is better is not known"
+        )
     return 1 if direction > 0 else -1
 
 

@@ -30,7 +30,6 @@ from gsbench.config.compose import Composer, Trial
 from gsbench.config.overrides import bare_key, key_of, parse_word
 from gsbench.config.schema import TUNE, TuneSettings
 from gsbench.errors import GsbenchError, InputError
-from gsbench.eval.facts import known_keys
 from gsbench.files import make_runs_folder, write_json
 from gsbench.runs.configuration import flatten
 from gsbench.runs.experiments import (
@@ -43,7 +42,7 @@ from gsbench.runs.experiments import (
 from gsbench.runs.layout import TUNING
 from gsbench.settings import check_values
 from gsbench.system.install import require_package
-from gsbench.words import command, counted, did_you_mean, listed
+from gsbench.words import command, counted, listed
 
 if TYPE_CHECKING:
     from optuna import Study
@@ -299,18 +298,11 @@ def _study(record: TuningRecord, at_once: int) -> Study:
 def _asked(tune: TuneSettings, trials: Sequence[Trial]) -> dict[str, Any]:
     """The facts that the records of all searches share.
 
-    Raises InputError for an unknown metric, and for one without a better direction.
+    Raises InputError for a metric without a better direction.
     """
     values = trials[0].values
-    declared = {str(trial.values["eval"].get("primary") or "") for trial in trials}
-    primary = metric_and_question(declared.pop())[0] if len(declared) == 1 else ""
-    metric = tune.metric or primary or DEFAULT_METRIC
-    known = (*known_keys(), *(values["eval"].get("extra") or ()))
-    if metric not in known:
-        raise InputError(
-            f"{TUNE}.metric={metric}: there is no such metric{did_you_mean(metric, known)}"
-        )
-    direction = better_direction(metric, values, f"{TUNE}.metric")
+    metric, _ = metric_and_question(str(values["eval"].get("primary") or DEFAULT_METRIC))
+    direction = better_direction(metric, values)
     try:
         points = grid_points([parse_word(f"seed={tune.seed}")])
         seeds = [int(word.partition("=")[2]) for (word,) in points]

@@ -12,10 +12,10 @@ from gsbench.analysis.quantities import COSTS, NO_DIRECTION
 from gsbench.analysis.questions import read_least
 from gsbench.analysis.results import TrialResult, newest_code, read_experiment
 from gsbench.analysis.verdicts import Verdict, judge
+from gsbench.config.build import facts_for
 from gsbench.config.compose import Trial
 from gsbench.errors import InputError
 from gsbench.eval.facts import known_keys
-from gsbench.pipeline.metric_facts import facts_for
 from gsbench.runs.commands import Digest, Question
 from gsbench.words import counted, did_you_mean
 

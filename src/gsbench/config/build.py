@@ -3,11 +3,14 @@
 Loads neither torch nor Hydra by itself.
 """
 
+from __future__ import annotations
+
 import dataclasses
 import inspect
 import logging
 import sys
-from typing import Any
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 from gsbench.config.groups import GROUPS, REMOVABLE
 from gsbench.config.trust import (
@@ -18,11 +21,16 @@ from gsbench.config.trust import (
     packages_allowed_at,
 )
 from gsbench.errors import InputError
+from gsbench.eval.facts import MetricFacts, facts_of, find_metric, in_region
 from gsbench.external.settings import External
 from gsbench.runs.code import module_digest, unnamed_modules
 from gsbench.runs.configuration import GSBENCH, targets_in
+from gsbench.runs.experiments import AT, metric_and_question
 from gsbench.settings import check_values, unknown_setting
 from gsbench.words import did_you_mean
+
+if TYPE_CHECKING:
+    from gsbench.eval.metric import Metric
 
 log = logging.getLogger(__name__)
 
@@ -142,3 +150,36 @@ def locate(target: str, group: str, allow_targets: list[str]) -> type:
             ", ".join(unnamed),
         )
     return cls
+
+
+# ---- metrics
+
+
+def build_metrics(values: dict[str, Any], allow_targets: list[str]) -> dict[str, Metric]:
+    """The user's own metrics that the settings ``eval`` name.
+
+    Raises InputError for an unusable one.
+    """
+    metrics: dict[str, Metric] = {}
+    for name, options in values.get("extra", {}).items():
+        metrics[name] = build(f"eval.extra.{name}", options, allow_targets)
+        primary = values.get("primary") or ""
+        asked = metric_and_question(primary)[0].partition(AT)[0]
+        if facts_of(name, metrics[name]).direction == 0 and asked == name:
+            raise InputError(
+                f"eval.primary={primary}: {options['_target_']} does not say whether more or less "
+                "is better (direction), so no verdict can be about it"
+            )
+    return metrics
+
+
+def facts_for(metric: str, values: Mapping[str, Any]) -> MetricFacts:
+    """The facts of a metric, gsbench's or the user's own, of trials with the configuration.
+
+    Raises InputError for an unknown metric.
+    """
+    if (shipped := find_metric(metric)) is not None:
+        return shipped
+    name, _, region = metric.partition(AT)
+    metrics = build_metrics(values["eval"], values["allow_targets"])
+    return in_region(facts_of(name, metrics[name]), region)

@@ -6,7 +6,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import yaml
 from hydra.errors import MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import (
@@ -17,9 +16,7 @@ from omegaconf.errors import (
 )
 
 from gsbench.config.groups import EXTERNAL_FOLDER, GROUPS, options
-from gsbench.config.overrides import key_of
 from gsbench.config.schema import class_defaults
-from gsbench.config.search_path import searched_folders
 from gsbench.errors import GsbenchError, InputError
 from gsbench.system.install import conf_dir
 from gsbench.words import did_you_mean
@@ -93,11 +90,10 @@ def unknown_setting(error: Any, words: Sequence[str]) -> str:
     if key in ("hydra.sweeper.grids", "hydra.sweeper.tune"):
         what = "joins grids" if name == "grids" else "tunes arms"
         return f"{key}: gsbench's own sweeper alone {what}, so leave out hydra/sweeper"
-    typed = any(key == given or given.startswith(f"{key}.") for given in map(key_of, words))
-    return not_a_setting(key, node, words, "" if typed else _file_that_sets(key, words))
+    return not_a_setting(key, node, words)
 
 
-def not_a_setting(key: str, node: Any, words: Sequence[str], file: str = "") -> str:
+def not_a_setting(key: str, node: Any, words: Sequence[str]) -> str:
     """The line for a ``key`` that the ``node``, which should have it, does not have."""
     parent, _, name = key.rpartition(".")
     # Hydra's plug-ins are chosen by name, not by class
@@ -118,7 +114,7 @@ def not_a_setting(key: str, node: Any, words: Sequence[str], file: str = "") -> 
     if any(word.startswith(f"{parent}._target_=") for word in words):
         near += f"; a key that only your class has is added with a plus: +{key}=…"
     return (
-        f"{key} is not a setting{file}{near} ({parent or 'top level'} has: "
+        f"{key} is not a setting{near} ({parent or 'top level'} has: "
         f"{', '.join(keys) or 'no settings'})"
     )
 
@@ -144,19 +140,3 @@ def _settings_of_choices(group: str) -> dict[str, list[str]]:
                 found.setdefault(key, []).append(name)
     found.pop("defaults", None)
     return found
-
-
-def _file_that_sets(key: str, words: Sequence[str]) -> str:
-    """`` in experiment/mine.yaml``: the user's file that sets ``key``; "" if none does."""
-    group, _, rest = key.partition(".")
-    for folder in searched_folders(words):
-        for file in sorted([*folder.glob("*/*.yaml"), *folder.glob("*/*/*.yaml")]):
-            place = file.relative_to(folder)
-            own_key = rest if place.parts[0] == group else key
-            try:
-                found = OmegaConf.select(OmegaConf.load(file), own_key, default="")
-            except (OSError, ValueError, RecursionError, yaml.YAMLError, OmegaConfBaseException):
-                continue
-            if found != "":
-                return f" in {place.as_posix()}"
-    return ""

@@ -146,7 +146,6 @@ class TuneSettings:
 
     points: NonNegativeInt = 20
     at_once: PositiveInt = 1  # points of an arm that are proposed and trained together
-    metric: str | None = None  # None: eval.primary, else PSNR
     seed: int | str = 100
 
 
@@ -307,7 +306,7 @@ def groups_are_chosen(values: dict[str, Any]) -> None:
             )
 
 
-def groups_keep_their_schemas(values: dict[str, Any]) -> None:
+def values_fit_their_schemas(values: dict[str, Any]) -> None:
     for group, schema in GROUP_SCHEMAS.items():
         given = values[group]
         target = given.get("_target_") or GSBENCH
@@ -327,14 +326,8 @@ def groups_keep_their_schemas(values: dict[str, Any]) -> None:
         for name in names:
             if not values[group].get(name):
                 values[group].pop(name, None)
-
-
-def root_keeps_its_schema(values: dict[str, Any]) -> None:
     root = {key: value for key, value in values.items() if key not in (*GROUP_SCHEMAS, *COMPONENTS)}
     values |= check_values(Config, root, "")
-
-
-def components_name_classes(values: dict[str, Any]) -> None:
     for group in COMPONENTS:
         named = {key: values[group].get(key) for key in ("name", "_target_")}
         check_values(ComponentConfig, named, group)
@@ -374,9 +367,7 @@ def machine_decides_auto(values: dict[str, Any]) -> None:
 RULES: tuple[Callable[[dict[str, Any]], None], ...] = (
     whole_numbers_fit,
     groups_are_chosen,
-    groups_keep_their_schemas,
-    root_keeps_its_schema,
-    components_name_classes,
+    values_fit_their_schemas,
     measurements_lie_in_the_training,
     white_pictures_have_a_white_background,
     nothing_grows_untrained,

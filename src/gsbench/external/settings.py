@@ -8,7 +8,7 @@ import os
 import re
 import shlex
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from tempfile import TemporaryDirectory
@@ -23,11 +23,9 @@ from gsbench.words import did_you_mean
 
 # Placeholders of a command, in addition to the options of its YAML file.
 DATA = "data"  # folder of the training views: images/ and the COLMAP model sparse/0
-# folder of the test views' cameras: transforms.json and the COLMAP model sparse/0
-TEST_CAMERAS = "test_cameras"
 OUTPUT = "output"  # empty folder, which is also the program's working folder
-PLACEHOLDERS = (DATA, TEST_CAMERAS, OUTPUT, "iterations", "seed", "device", "threads")
-FOLDERS = (DATA, TEST_CAMERAS, OUTPUT)  # absolute paths
+PLACEHOLDERS = (DATA, OUTPUT, "iterations", "seed", "device", "threads")
+FOLDERS = (DATA, OUTPUT)  # absolute paths
 MODEL_SUFFIX = ".ply"
 
 Text = Annotated[
@@ -59,11 +57,6 @@ def program_of(
     return fill_placeholders(split_command(command, key)[0], options, key)
 
 
-def placeholders_in(texts: Iterable[str]) -> set[str]:
-    """The names of the placeholders in ``texts``."""
-    return {name for text in texts for name in PLACEHOLDER.findall(text)}
-
-
 def fill_placeholders(text: str, values: Mapping[str, object], key: str) -> str:
     """Replace each placeholder in ``text`` once. Raises InputError, naming ``key``, if unknown."""
 
@@ -81,7 +74,7 @@ def fill_placeholders(text: str, values: Mapping[str, object], key: str) -> str:
 
 
 def check_pattern(pattern: str) -> None:
-    """Raise InputError for a pattern that cannot fit any file below a folder."""
+    """Raise InputError for a pattern that cannot fit a model below a folder."""
     key = f"densify.result={pattern}"
     parts = PurePosixPath(pattern).parts
     if (
@@ -93,6 +86,11 @@ def check_pattern(pattern: str) -> None:
         raise InputError(
             f"{key}: give a pattern of files below the program's output folder, such as "
             "point_cloud/*.ply"
+        )
+    if not pattern.lower().endswith(MODEL_SUFFIX):
+        raise InputError(
+            f"{key} must name a 3DGS model, as *.ply; renders of a program are entered by gsbench "
+            "evaluate --as"
         )
     try:
         with TemporaryDirectory() as empty:
@@ -106,13 +104,12 @@ def check_pattern(pattern: str) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class External:
-    """A program that trains on a folder of views and writes a model, or renders of the test views.
+    """A program that trains on a folder of views and writes a 3DGS PLY.
 
     ``command`` runs without a shell. ``{data}``, ``{output}``, the other `PLACEHOLDERS` and the
     names of ``options`` are replaced in ``command``, ``result`` and ``environment``. ``result`` is
-    a pattern below the output folder: of one 3DGS PLY, or of pictures of the test views, which are
-    matched by name or ``by_order``. ``version`` is the program's version, which is part of the key
-    of its results. The output of ``version_command`` must contain it.
+    a pattern of the PLY below the output folder. ``version`` is the program's version, which is
+    part of the key of its results. The output of ``version_command`` must contain it.
 
     Examples:
         A program ``train.py`` that writes ``point_cloud.ply``:
@@ -123,10 +120,10 @@ class External:
         ...     version="1.2",
         ...     options={"lr": 0.01},
         ... )
-        >>> trainer.program, trainer.leaves_model
-        ('python', True)
+        >>> trainer.program
+        'python'
         >>> External(
-        ...     command="python train.py", result="*.png", version="1.2"
+        ...     command="python train.py", result="*.ply", version="1.2"
         ... )  # doctest: +ELLIPSIS
         Traceback (most recent call last):
         gsbench.errors.InputError: densify.command has no {data}: the folder that ...
@@ -138,7 +135,6 @@ class External:
     version_command: CommandLine | None = None
     options: dict[str, Any] = field(default_factory=dict)
     environment: dict[str, str] = field(default_factory=dict)  # additional environment variables
-    by_order: bool = False
     # after it, the program is ended and the trial fails
     time_limit_minutes: PositiveFloat | None = None
 
@@ -160,7 +156,7 @@ class External:
         known = dict.fromkeys((*PLACEHOLDERS, *self.options))
         for key, text in [("command", word) for word in self.words] + [("result", self.result)]:
             fill_placeholders(text, known, f"densify.{key}")
-        if not placeholders_in(self.words) & {DATA}:
+        if not any(f"{{{DATA}}}" in word for word in self.words):
             raise InputError(
                 "densify.command has no {data}: the folder that the program is to train on"
             )
@@ -169,15 +165,6 @@ class External:
     def words(self) -> list[str]:
         """The command's words, with their placeholders."""
         return split_command(self.command, "densify.command")
-
-    @property
-    def leaves_model(self) -> bool:
-        """Return whether the result is a model instead of pictures."""
-        return self.result.lower().endswith(MODEL_SUFFIX)
-
-    @property
-    def needs_test_cameras(self) -> bool:
-        return TEST_CAMERAS in placeholders_in([*self.words, *self.environment.values()])
 
     @property
     def program(self) -> str:

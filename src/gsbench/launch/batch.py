@@ -15,7 +15,6 @@ from gsbench.launch.jobs import Outcome, outcome_of_results, run_local, run_seri
 from gsbench.launch.record import asked_metrics, record
 from gsbench.launch.slurm import run_slurm
 from gsbench.runs.code import PERMISSIONS
-from gsbench.runs.freshness import Change
 from gsbench.runs.keys import STAGES, VIEWS
 from gsbench.runs.layout import STORE
 from gsbench.runs.store import Store
@@ -57,9 +56,13 @@ def begin(trials: Sequence[Trial], asks: bool = True) -> list[Trial]:
     Raises InputError for trials that are known to fail.
     """
     asked_metrics(trials)  # raises for two metrics in one experiment, before anything is written
-    runs = checked_runs_folder(trials[0].values["runs"])
+    runs = trials[0].files.runs
     by_folder = {trial.folder: trial for trial in trials}
-    unfinished = [trial for trial in by_folder.values() if _why_not_done(trial)]
+    unfinished = [
+        trial
+        for trial in by_folder.values()
+        if trial.files.why_not_done(trial.values, unavailable_now)
+    ]
     # A node of a cluster may have folders and devices that this machine lacks.
     here = trials[0].values["launch"]["name"] != "slurm"
     if here and (missing := missing_folders(unfinished)):
@@ -77,10 +80,6 @@ def begin(trials: Sequence[Trial], asks: bool = True) -> list[Trial]:
         Store(runs / STORE).sweep((*STAGES, VIEWS))
         record(trials, asks)
     return unfinished
-
-
-def _why_not_done(trial: Trial) -> Change | None:
-    return trial.files.why_not_done(trial.values, unavailable_now)
 
 
 # ---- checks before any trial starts: wrong options of components, missing folders and devices

@@ -1,6 +1,4 @@
-"""Estimates of time: the listing of a dry run, and the progress of a sweep. Loads no torch."""
-
-from __future__ import annotations
+"""The listing of a dry run, with an estimate of its time. Loads no torch."""
 
 import json
 from collections import defaultdict
@@ -10,37 +8,22 @@ from functools import cache
 from itertools import islice
 from pathlib import Path
 from statistics import fmean
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from gsbench.analysis.results import TrialResult, read_experiment
 from gsbench.config.compose import Trial
 from gsbench.errors import InputError
-from gsbench.launch.states import (
-    STATES,
-    TrialState,
-    arm_names,
-    ask_queue,
-    labels_of,
-    state_in_queue,
-    states_of_experiment,
-    summary_of,
-)
+from gsbench.launch.states import ask_queue, labels_of, state_in_queue, summary_of
 from gsbench.parsing import DamagedError
 from gsbench.runs.configuration import Values, sha256_of
-from gsbench.runs.experiments import experiment_home
-from gsbench.runs.layout import CURVES, RESULTS, TRIAL_GLOB
+from gsbench.runs.layout import RESULTS, TRIAL_GLOB
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.runs.trial_record import read_rows
 from gsbench.scene.images import image_size
 from gsbench.scene.names import IMAGE_SUFFIXES
 from gsbench.scene.options import downscaled_size
 from gsbench.system.resources import available_threads, installed_gpus
 from gsbench.words import counted, readable_time
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 
 class FinishedTrials:
@@ -225,76 +208,3 @@ def _first_size(path: str, images: str) -> tuple[int, int] | None:
                 with suppress(InputError):
                     return image_size(file)
     return None
-
-
-# ---- how far a sweep is: the trials of each arm by state, speed and time left
-
-SPEED = "iterations_per_second"
-Name = tuple[str, str]  # arm, scene
-
-
-def progress_frame(runs: Path, experiment: str) -> pd.DataFrame:
-    """A row for each arm of an experiment, as ``gsbench status --watch`` shows it.
-
-    Its columns are done, running, failed, waiting (numbers of trials) and iterations_per_second (of
-    running trainings). ``attrs`` has seconds_left, which is None as long as no trial is done.
-    Raises InputError for an unknown experiment.
-    """
-    import pandas as pd
-
-    home = experiment_home(runs, experiment)
-    # A superseded trial will never be done, so with it no sweep would end.
-    found = read_experiment(home)
-    states = [one for one in states_of_experiment(home, found) if one.state != "superseded"]
-    names = {path: (arm, path.parents[1].name) for path, arm in arm_names(states).items()}
-    columns: dict[str, float] = {"done": 0, "running": 0, "failed": 0, "waiting": 0, SPEED: 0.0}
-    rows = {arm: columns.copy() for arm in sorted({arm for arm, _ in names.values()})}
-    for state in states:
-        row = rows[names[state.folder][0]]
-        row[STATES[state.state].column] += 1
-        if state.state == "running":
-            row[SPEED] += _speed(TrialFolder(state.folder))
-    frame = pd.DataFrame.from_dict(rows, orient="index", columns=[*columns])
-    done = [trial for trial in found.trials if trial.path in names]
-    frame.attrs["seconds_left"] = _seconds_left(states, names, done)
-    return frame
-
-
-def _speed(files: TrialFolder) -> float:
-    """The iterations per second of the present training; 0 without one."""
-    building = files.building()
-    file = Path(building.folder, CURVES) if building.folder else None
-    rows = read_rows(file) if file is not None and file.exists() else []
-    seconds = float(rows[-1].get("seconds", 0.0)) if rows else 0.0
-    return float(rows[-1]["step"]) / seconds if seconds > 0 else 0.0
-
-
-def _kinds(name: Name) -> tuple[Name, ...]:
-    """The keys of trials that tell how long one takes: its arm and scene, its arm, all."""
-    return name, (name[0], ""), ("", "")
-
-
-def _seconds_left(
-    states: Sequence[TrialState], names: Mapping[Path, Name], done: Sequence[TrialResult]
-) -> float | None:
-    """The seconds until all trials have ended, if as many run at once as now.
-
-    A trial takes as long as the finished ones of its arm and scene, else of its arm, else of all.
-    """
-    known: dict[Name, list[float]] = defaultdict(list)
-    for trial in done:
-        for kind in _kinds(names[trial.path]):
-            known[kind].append(sum(trial.record.seconds.values()))
-    if not known:
-        return None
-    total = 0.0
-    for state in states:
-        if state.state in ("done", "failed"):
-            continue
-        similar = next(known[kind] for kind in _kinds(names[state.folder]) if kind in known)
-        share, files = 0.0, TrialFolder(state.folder)
-        if state.state == "running":
-            with suppress(InputError, KeyError, TypeError):
-                share = files.share_done(files.configuration()["train"]["iterations"])
-        total += fmean(similar) * (1 - share)
-    return total / max(1, sum(state.state == "running" for state in states))

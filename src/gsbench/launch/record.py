@@ -23,10 +23,10 @@ from gsbench.analysis.questions import (
 )
 from gsbench.analysis.results import group_by, read_experiment
 from gsbench.analysis.trial_result import Planned
+from gsbench.config.build import facts_for
 from gsbench.config.compose import Trial
 from gsbench.errors import InputError
 from gsbench.files import require_no_links
-from gsbench.pipeline.metric_facts import facts_for
 from gsbench.runs.commands import (
     Command,
     History,

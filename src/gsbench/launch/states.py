@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 import psutil
 from pydantic import Field
 
-from gsbench.analysis.results import Experiment, group_by, newest_code, read_experiment
+from gsbench.analysis.results import group_by, newest_code, read_experiment
 from gsbench.errors import InputError
 from gsbench.files import write_json
 from gsbench.parsing import Record, read_if_sound
 from gsbench.runs.commands import PlannedTrial
 from gsbench.runs.configuration import determining_settings
-from gsbench.runs.experiments import trial_folders
+from gsbench.runs.experiments import experiment_home, trial_folders
 from gsbench.runs.layout import CONFIG, FAILED, LOCK, RESULTS, SEED, SUBMITTED
 from gsbench.runs.trial_folder import State, TrialFolder
 from gsbench.system.locks import read_holder
@@ -28,13 +28,18 @@ from gsbench.system.programs import answer_of
 from gsbench.words import as_line, counted
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from gsbench.config.compose import Trial
+
+
+COLUMNS = ("done", "running", "failed", "waiting")  # of `progress_frame`
 
 
 class Kind(NamedTuple):
     """The meaning of a state for the verbs that show and repeat trials."""
 
-    column: str = "waiting"  # of `gsbench.launch.estimates.progress_frame`
+    column: str = "waiting"
     retried: bool = False  # `gsbench retry` runs it again
     freed: bool = False  # `gsbench clean NAME` lets its results go
     lasts: bool = False  # it began, and goes on
@@ -81,12 +86,9 @@ class TrialState:
         return self.planned.words if self.planned else ()
 
 
-def states_of_experiment(home: Path, experiment: Experiment | None = None) -> list[TrialState]:
-    """The states of all trials of the experiment in ``home``, planned or with a folder.
-
-    ``experiment`` has its results (default: they are read).
-    """
-    experiment = experiment or read_experiment(home)
+def states_of_experiment(home: Path) -> list[TrialState]:
+    """The states of all trials of the experiment in ``home``, planned or with a folder."""
+    experiment = read_experiment(home)
     plan = experiment.history.planned
     begun = {
         path
@@ -313,3 +315,21 @@ def _settings_of(overrides: Iterable[str]) -> set[str]:
     """The settings in a command by their last names, without a trial's place."""
     given = (as_line(word).lstrip("+~").partition("=") for word in overrides)
     return {f"{key.rpartition('.')[2]}={value}" for key, _, value in given if key not in OF_A_PLACE}
+
+
+def progress_frame(runs: Path, experiment: str) -> pd.DataFrame:
+    """A row for each arm of an experiment, as ``gsbench status --watch`` shows it.
+
+    It has the numbers of trials that are done, running, failed and waiting. Raises InputError for
+    an unknown experiment.
+    """
+    import pandas as pd
+
+    states = states_of_experiment(experiment_home(runs, experiment))
+    # A superseded trial will never be done, so with it no sweep would end.
+    states = [one for one in states if one.state != "superseded"]
+    names = arm_names(states)
+    counts = Counter((names[one.folder], STATES[one.state].column) for one in states)
+    arms = sorted({*names.values()})
+    rows = {arm: [counts[arm, column] for column in COLUMNS] for arm in arms}
+    return pd.DataFrame.from_dict(rows, orient="index", columns=[*COLUMNS])

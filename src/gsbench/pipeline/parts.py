@@ -9,12 +9,11 @@ from typing import Any
 
 import torch
 
-from gsbench.config.build import build
+from gsbench.config.build import build, build_metrics
 from gsbench.config.trust import check_permissions
 from gsbench.densify import Densifier
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator
-from gsbench.eval.facts import facts_of
 from gsbench.eval.metric import Metric
 from gsbench.eval.options import EvalConfig
 from gsbench.eval.protocol import get_protocol
@@ -24,7 +23,6 @@ from gsbench.raster import EXECUTORS, Rasterizer
 from gsbench.raster.executors import AUTO, lacks, resolve
 from gsbench.runs.code import UserCode, user_modules
 from gsbench.runs.configuration import GSBENCH, TARGET, targets_in
-from gsbench.runs.experiments import AT, metric_and_question
 from gsbench.scene.options import SceneConfig
 from gsbench.scene.record import SceneReader
 from gsbench.system.resources import available_threads, select_device
@@ -200,24 +198,6 @@ def build_own_rasterizer(values: dict[str, Any], allow_targets: list[str]) -> Ra
             f"show and that no other rasterizer has; it has {name!r}"
         )
     return rasterizer
-
-
-def build_metrics(values: dict[str, Any], allow_targets: list[str]) -> dict[str, Metric]:
-    """The user's own metrics that the settings ``eval`` name.
-
-    Raises InputError for an unusable one.
-    """
-    metrics: dict[str, Metric] = {}
-    for name, options in values.get("extra", {}).items():
-        metrics[name] = build(f"eval.extra.{name}", options, allow_targets)
-        primary = values.get("primary") or ""
-        asked = metric_and_question(primary)[0].partition(AT)[0]
-        if facts_of(name, metrics[name]).direction == 0 and asked == name:
-            raise InputError(
-                f"eval.primary={primary}: {options['_target_']} does not say whether more or less "
-                "is better (direction), so no verdict can be about it"
-            )
-    return metrics
 
 
 def make_evaluator(

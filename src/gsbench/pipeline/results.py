@@ -15,9 +15,7 @@ from gsbench.runs.configuration import arm_hash, flatten, sha256_of
 from gsbench.runs.store import StoredResult, read_manifest
 from gsbench.runs.trial_record import (
     FROM_MODEL,
-    FROM_RENDERS,
     MADE_ELSEWHERE,
-    RENDERS_ALONE,
     Budget,
     Code,
     Evaluation,
@@ -71,7 +69,6 @@ def results_of(
     evaluation = read_typed(evaluated.path / layout.METRICS, Evaluation)
     manifest = read_manifest(evaluated.path)
     init_report = read_json(init.path / REPORT_FILE)
-    only_renders = training.evaluated_from == FROM_RENDERS
     views = [*scene.train, *scene.test]
     copied = {name: getattr(training, name) for name in OF_TRAINING}
     copied |= {name: getattr(evaluation, name) for name in OF_EVALUATION}
@@ -80,7 +77,7 @@ def results_of(
         experiment=values["name"],
         **{group: values[group]["name"] for group in ("scene", "init", "densify")},
         seed=values["seed"],
-        raster="unknown" if only_renders else raster.rasterizer.name,
+        raster=raster.rasterizer.name,
         raster_proof=raster.proof,
         raster_passed_over=[*raster.passed_over],
         protocol=manifest.inputs["protocol"],
@@ -158,8 +155,6 @@ def _seconds(init: StoredResult, training: Training, evaluated: StoredResult) ->
 def _unknown_costs(training: Training) -> dict[str, str]:
     """The costs that were not measured, each with the reason, if gsbench did not train."""
     unknown = {}
-    if training.evaluated_from == FROM_RENDERS:
-        unknown["gaussians"] = RENDERS_ALONE
     if training.peak_memory_mb is None:
         unknown["peak_memory_mb"] = "another program's memory of a GPU is not measured"
     if training.was_given:

@@ -3,13 +3,13 @@
 import argparse
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from gsbench.analysis.results import read_experiment
+from gsbench.config.build import build_metrics
 from gsbench.config.command_words import typed_permissions
 from gsbench.config.compose import compose_one
 from gsbench.errors import InputError
@@ -19,15 +19,15 @@ from gsbench.eval.options import EvalConfig
 from gsbench.eval.pictures import PicturePair, check_pairs, measure
 from gsbench.files import storage_errors
 from gsbench.logs import progress
-from gsbench.pipeline.parts import build_metrics, make_evaluator
+from gsbench.pipeline.parts import make_evaluator
 from gsbench.renders.imported import Measured, check_destination, find_destination, import_trial
 from gsbench.renders.sources import (
     ReferenceImages,
     find_reference_images,
-    find_renders,
     picture_names,
     pictures_in,
     reference_images_of,
+    require_folder,
 )
 from gsbench.runs.code import PERMISSIONS
 from gsbench.scene.names import Matching, match_by_order, match_pictures
@@ -64,17 +64,12 @@ def measure_folders(
 
 def measure_renders(options: argparse.Namespace, runs: Path) -> None:
     """Measure the renders that the ``options`` of the verb name, and print the values."""
-    renders, photographs = find_renders(Path(options.renders).expanduser())
+    renders = Path(options.renders).expanduser()
+    require_folder(renders)
     primary = _asked_metric(options)
-    if options.truth is not None:
-        truth = _reference_images(options, runs)
-    elif photographs is not None:
-        truth = pictures_in(photographs, options.settings)
-        truth = replace(truth, what=f"the photographs in {options.renders}")
-    else:
-        raise InputError(
-            "--truth PLACE is needed: only predictions of nerfbaselines bring their photographs"
-        )
+    if options.truth is None:
+        raise InputError("--truth PLACE is needed: the photographs of the renders")
+    truth = _reference_images(options, runs)
     destination = None
     if options.place is not None:
         destination = find_destination(options.place, options.scene, options.seed, truth, runs)
@@ -86,7 +81,7 @@ def measure_renders(options: argparse.Namespace, runs: Path) -> None:
     with progress("evaluate") as report:
         per_view = measure(pairs, evaluator, report)
     source = {
-        "folder": str(Path(options.renders).expanduser().resolve()),
+        "folder": str(renders.resolve()),
         "names matched": matching.rule or "as they are",
     } | ({"notes": "; ".join(found.line for found in odd)} if odd else {})
     measured = Measured(truth, pairs, per_view, evaluator, source)

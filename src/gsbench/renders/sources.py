@@ -1,9 +1,4 @@
-"""The sources of pictures: renders and their photographs.
-
-Predictions of nerfbaselines have renders in ``color/`` and photographs in ``gt-color/``, each as
-``<name of the photograph>.png`` (`save_predictions` of nerfbaselines 1.2). A published result has
-both in ``predictions/``.
-"""
+"""The sources of pictures: renders and their photographs."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -148,7 +143,6 @@ def pictures_in(folder: Path, settings: Sequence[str]) -> ReferenceImages:
     )
 
 
-RENDERED, PHOTOGRAPHS = "color", "gt-color"
 MODEL = "a model: gsbench scene=SCENE init=ply init.path=FILE train=none densify=none measures it"
 PICTURE, PACKED = "one picture: give its folder", "packed: unpack it and give the folder"
 # By the first bytes of a file that is no folder: what it is, and what to do.
@@ -156,16 +150,10 @@ OTHERS = {GIT_LFS: LFS_REMEDY, b"ply": MODEL, b"\x89PNG": PICTURE, b"\xff\xd8": 
 OTHERS |= {b"PK": PACKED, b"\x1f\x8b": PACKED}
 
 
-def find_renders(place: Path) -> tuple[Path, Path | None]:
-    """The folders of renders and, of predictions by nerfbaselines, of photographs.
-
-    Raises InputError if ``place`` is no folder.
-    """
-    for home in (place, place / "predictions"):
-        if all((home / folder).is_dir() for folder in (RENDERED, PHOTOGRAPHS)):
-            return home / RENDERED, home / PHOTOGRAPHS
+def require_folder(place: Path) -> None:
+    """Raise InputError that says what to do if ``place`` is no folder of renders."""
     if place.is_dir():
-        return place, None
+        return
     if place.exists():
         require_regular(place)
         with place.open("rb") as file:

@@ -4,7 +4,6 @@ import importlib.util
 import json
 import os
 import re
-import subprocess
 from functools import cache
 from importlib.metadata import PackageNotFoundError, distribution, version
 from pathlib import Path
@@ -13,7 +12,7 @@ from urllib.parse import urlsplit
 from urllib.request import url2pathname
 
 from gsbench.errors import InputError
-from gsbench.system.programs import NEUTRAL, safe_environment
+from gsbench.system.programs import answer_of, safe_environment
 
 DISTRIBUTION = "gsbench-3dgs"  # the name on the package index, where "gsbench" is another project
 
@@ -131,17 +130,8 @@ def _git(folder: Path, *words: str) -> str | None:
         key: value for key, value in safe_environment().items() if key not in REPOSITORY_VARIABLES
     }
     settings = (word for setting in SAFE_SETTINGS for word in ("-c", setting))
-    try:
-        return subprocess.run(
-            ["git", *settings, "-C", os.path.abspath(folder), *words],
-            cwd=NEUTRAL,
-            # read only: no locks, no network
-            env=environment | {"GIT_OPTIONAL_LOCKS": "0", "GIT_NO_LAZY_FETCH": "1"},
-            capture_output=True,
-            encoding="utf-8",
-            errors="replace",  # names of files may have any encoding
-            timeout=SECONDS_FOR_GIT,
-            check=True,
-        ).stdout.strip()
-    except (OSError, subprocess.TimeoutExpired, subprocess.CalledProcessError):
-        return None
+    # read only: no locks, no network
+    environment |= {"GIT_OPTIONAL_LOCKS": "0", "GIT_NO_LAZY_FETCH": "1"}
+    command = ["git", *settings, "-C", os.path.abspath(folder), *words]
+    answer = answer_of(command, SECONDS_FOR_GIT, environment)
+    return None if answer is None else answer.strip()

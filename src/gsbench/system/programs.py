@@ -48,15 +48,21 @@ def safe_environment() -> dict[str, str]:
     return os.environ | {"PATH": os.pathsep.join(filter(os.path.isabs, entries))}
 
 
-def answer_of(command: Sequence[str], seconds: float) -> str | None:
-    """The output of a program that needs no files; None if it fails or takes too long."""
+def answer_of(
+    command: Sequence[str], seconds: float, environment: Mapping[str, str] | None = None
+) -> str | None:
+    """The output of a program that needs no files; None if it fails or takes too long.
+
+    It gets the ``environment`` (default: `safe_environment`).
+    """
     try:
         return subprocess.run(
             command,
             cwd=NEUTRAL,
-            env=safe_environment(),
+            env=environment or safe_environment(),
             capture_output=True,
-            text=True,
+            encoding="utf-8",
+            errors="replace",  # names of files may have any encoding
             timeout=seconds,
             check=True,
         ).stdout

@@ -36,7 +36,6 @@ log = logging.getLogger(__name__)
 
 SECONDS_TO_STOP = 3.0  # patience after a signal that asks to end
 SECONDS_BETWEEN_LOOKS = 5.0  # at the trials' files
-SECONDS_BETWEEN_STARTS = 300.0  # of a process that crashes
 
 
 class Mirror:
@@ -65,18 +64,11 @@ class Mirror:
         self._told = json.dumps(told)
 
     def __enter__(self) -> None:
-        self._ended = threading.Event()
-        self._keeper = threading.Thread(target=self._keep, daemon=True)
         if self._trials:
-            self._start()
-            self._keeper.start()
-
-    def _keep(self) -> None:
-        while not self._ended.wait(SECONDS_BETWEEN_STARTS):
             self._start()
 
     def _start(self) -> None:
-        """Start the process, or replace a crashed one."""
+        """Start the process; at the end of the block, replace one that crashed."""
         if self._process and self._process.poll() is None:
             return
         try:
@@ -100,8 +92,6 @@ class Mirror:
     def __exit__(self, kind: type[BaseException] | None, error: object, trace: object) -> None:
         if not self._trials:
             return
-        self._ended.set()
-        self._keeper.join()
         is_stopped = kind is not None and not issubclass(kind, Exception)
         if not is_stopped:
             self._start()

@@ -31,7 +31,7 @@ from gsbench.analysis.table_formats import to_markdown
 from gsbench.analysis.tables import build_table
 from gsbench.analysis.trial_result import seeds_text
 from gsbench.errors import InputError
-from gsbench.tracking.mlflow_sink import DESCRIPTION, LOCK, MAX_TAG, connect, ensure_experiment
+from gsbench.tracking.mlflow_sink import LOCK, MAX_TAG, connect, ensure_experiment
 from gsbench.tracking.trial import EVAL, numbers_of
 from gsbench.words import counted, markdown_code, markdown_text
 
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 
 IDEA = "gsbench.idea"  # the tag of a parent run
 PARENT = "mlflow.parentRunId"  # MLflow's tag of a nested run
+DESCRIPTION = "mlflow.note.content"  # and of what its page says
 SUPERSEDED = "superseded"  # the tag of a trial that later code repeated
 DEVIATION = "deviation"  # MLflow shows the charts of such a prefix together
 OWN_NOTE = "`gsbench report"  # in a description that gsbench wrote

@@ -22,7 +22,7 @@ from gsbench.files import atomic, require_no_links
 from gsbench.parsing import read_tail
 from gsbench.runs.layout import ARTIFACTS, DATABASE
 from gsbench.tracking.sinks import Run
-from gsbench.tracking.trial import NOTE, TrackedTrial, Update
+from gsbench.tracking.trial import TrackedTrial, Update
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -190,7 +190,6 @@ def _create_sqlite(uri: str) -> None:
 
 TOKEN_TAG = "gsbench.token"
 ERROR_TAG = "error"
-DESCRIPTION = "mlflow.note.content"
 MAX_TAG = 5000  # characters of a tag (MLflow's limit)
 MAX_VALUE = 500  # characters of a parameter, which every server of MLflow 2 and later takes
 
@@ -221,10 +220,10 @@ class MLflow:
         return self._id
 
     def send(self, update: Update) -> None:
-        """Show what is new: the note is the run's description, a failure's reason a tag."""
+        """Show what is new; a failure's reason is a tag."""
         from mlflow.entities import Metric, Param, RunTag
 
-        named = {DESCRIPTION if key == NOTE else key: text for key, text in update.tags.items()}
+        named = dict(update.tags)
         if update.reason is not None:
             named[ERROR_TAG] = update.reason
         self._client.log_batch(

@@ -11,7 +11,7 @@ from gsbench.files import require_no_links
 from gsbench.parsing import Count, Record
 from gsbench.runs import layout
 from gsbench.system.install import require_package
-from gsbench.tracking.trial import NOTE, TrackedTrial, Update
+from gsbench.tracking.trial import TrackedTrial, Update
 
 
 class Run(Record):
@@ -147,9 +147,7 @@ class WandB:
     def send(self, update: Update) -> None:
         import wandb
 
-        shown = {**update.params, **update.tags}
-        self._run.notes = shown.pop(NOTE, self._run.notes)
-        self._run.config.update(shown, allow_val_change=True)
+        self._run.config.update({**update.params, **update.tags}, allow_val_change=True)
         by_step: dict[int, dict[str, float]] = {}
         for scalar in update.scalars:
             by_step.setdefault(scalar.step, {})[scalar.key] = scalar.value

@@ -17,9 +17,8 @@ from gsbench.runs.keys import TRAIN
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import TrialRecord, read_rows
 from gsbench.scene.images import read_image
-from gsbench.words import command, markdown_code, markdown_text
+from gsbench.words import command
 
-NOTE = "note"  # the tag that describes a finished trial, in Markdown
 # characters that MLflow refuses in a picture's name
 NOT_IN_A_KEY = re.compile(r"[^a-zA-Z0-9_\-. ]")
 Array = NDArray[np.uint8]
@@ -100,8 +99,8 @@ class Picture:
 class Update:
     """The part of a trial that a tracker is to show from now on, beside what it shows.
 
-    Settings and tags are texts by their names; the tag `NOTE` describes the trial in Markdown.
-    ``status`` says that the trial has ended, ``reason`` why it failed.
+    Settings and tags are texts by their names. ``status`` says that the trial has ended, ``reason``
+    why it failed.
     """
 
     params: Mapping[str, str] = field(default_factory=dict)
@@ -206,8 +205,9 @@ class TrackedTrial:
             "protocol": results.protocol,
             "raster": results.raster,
             "commit": results.code.commit or "unknown",
-            NOTE: self._note(results),
         }
+        if planned := read_history(self.folder.home).planned.get(self.folder.path):
+            tags["command"] = command(*planned.words)  # that repeats it
         tags |= {f"hash_{key}": value for key, value in results.hashes.items()}
         names = (*FILES, layout.POINT_CLOUD) if with_model else FILES
         files = self.files(names)
@@ -220,21 +220,6 @@ class TrackedTrial:
         """The files among ``names`` that the trial's folder has."""
         paths = {name: self.folder.path / name for name in names}
         return {name: path for name, path in paths.items() if path.exists()}
-
-    def _note(self, results: TrialRecord) -> str:
-        """The results in one line, the folder, and the command that repeats it, in Markdown."""
-        shown = [(find_metric(key), key, value) for key, value in results.metrics.items()]
-        texts = [f"{facts.name if facts else key} {value:.4g}" for facts, key, value in shown]
-        if results.num_gaussians is not None:
-            texts.append(f"{results.num_gaussians:,} Gaussians")
-        lines = [
-            markdown_text(f"{', '.join(texts)} after {results.iterations:,} iterations."),
-            f"Folder: {markdown_code(self.path)}",
-        ]
-        planned = read_history(self.folder.home).planned.get(self.folder.path)
-        if planned is not None:
-            lines.append(f"Again: {markdown_code(command(*planned.words))}")
-        return "\n\n".join(lines)
 
     def _pictures(self, count: int) -> dict[str, Array]:
         """Render, photograph and absolute error of ``count`` test views, by `picture_key`."""

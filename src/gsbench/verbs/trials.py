@@ -22,12 +22,13 @@ from gsbench.config.compose import Trial, compose_one
 from gsbench.config.overrides import changed_words, key_of
 from gsbench.errors import InputError
 from gsbench.files import make_runs_folder
-from gsbench.launch.estimates import SPEED, describe_plan, progress_frame
+from gsbench.launch.estimates import describe_plan
 from gsbench.launch.record import check_looks, check_questions, planned_rows, record, remove
 from gsbench.launch.states import (
     STATES,
     TrialState,
     labels_of,
+    progress_frame,
     states_of_experiment,
     summary_of,
 )
@@ -99,10 +100,7 @@ def _watch(runs: Path, experiment: str) -> None:
     with suppress(KeyboardInterrupt), Live(auto_refresh=False) as live:
         while True:
             frame = progress_frame(runs, experiment)
-            shown = frame.rename(columns={SPEED: "it/s"}).to_string(float_format="{:.3g}".format)
-            left = frame.attrs["seconds_left"]
-            after = f"about {readable_time(left)} left\n" if left else ""
-            live.update(Text(f"{experiment}\n{shown}\n{after}", no_wrap=True), refresh=True)
+            live.update(Text(f"{experiment}\n{frame.to_string()}\n", no_wrap=True), refresh=True)
             if not frame[["running", "waiting"]].to_numpy().any():
                 break
             time.sleep(SECONDS_BETWEEN_LOOKS)

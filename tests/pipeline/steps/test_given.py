@@ -41,10 +41,9 @@ from tests.train.conftest import orbit_camera
 CLOUD_STEP = Step(INIT, {}, lambda folder: None)
 PROGRAM = """
 import json, os, shutil, sys
-data, output, cameras, model, *rest = sys.argv[1:]
+data, output, model, *rest = sys.argv[1:]
 there = sorted(os.path.relpath(os.path.join(at, name), data) for at, _, names in os.walk(data) for name in names)
-frames = json.load(open(cameras + "/transforms.json"))["frames"] if os.path.isdir(cameras) else []
-print(json.dumps({"there": there, "rest": rest, "frames": [frame["file_path"] for frame in frames],
+print(json.dumps({"there": there, "rest": rest,
                   "own": [name for name in os.environ if name.startswith("GSBENCH_")], "set": os.environ.get("SET")}))
 if model != "none":
     shutil.copy(model, output + "/result.ply")
@@ -84,9 +83,9 @@ def parts_of(seed=5):
     )
 
 
-def trainer(tmp_path, model, cameras=True, **settings):
+def trainer(tmp_path, model, **settings):
     (tmp_path / "program.py").write_text(PROGRAM)
-    words = ["{data}", "{output}", "{test_cameras}" if cameras else "none", model]
+    words = ["{data}", "{output}", model]
     rest = ["{iterations}", "{seed}", "{device}", "{threads}", "{kind}"]
     command = [sys.executable, str(tmp_path / "program.py"), *words, *rest]
     return External(
@@ -99,11 +98,10 @@ def trainer(tmp_path, model, cameras=True, **settings):
     )
 
 
-@pytest.mark.parametrize("cameras", [True, False])
-def test_a_program_gets_the_training_views_and_the_settings(views, tmp_path, monkeypatch, cameras):
+def test_a_program_gets_the_training_views_and_the_settings(views, tmp_path, monkeypatch):
     monkeypatch.setenv("GSBENCH_RUNS", "here")
     write_ply(random_gaussians(9, dtype=torch.float32), tmp_path / "model.ply")
-    program = trainer(tmp_path, str(tmp_path / "model.ply"), cameras)
+    program = trainer(tmp_path, str(tmp_path / "model.ply"))
     step = external_step(views, program, parts_of())
     folder = tmp_path / "built"
     folder.mkdir()
@@ -114,7 +112,6 @@ def test_a_program_gets_the_training_views_and_the_settings(views, tmp_path, mon
     ]
     assert "sparse/0/points3D.bin" in said["there"]
     assert said["rest"] == ["900", "5", "cpu", "3", "a b"]
-    assert said["frames"] == (["0.png", "1.png"] if cameras else [])
     assert (said["own"], said["set"]) == ([], "5")
     summary = read_json(folder / "training.json")
     assert (summary["num_gaussians"], summary["num_init_points"], summary["iterations"]) == (
@@ -247,22 +244,6 @@ def test_a_training_writes_its_model_lineage_and_summary(views, tmp_path, monkey
     assert told[-1][:3] == ("iteration", 2, 2)
     parts.measured_earlier = []
     assert "snapshots" not in train_step(views, parts).inputs
-
-
-def test_renders_of_a_program_are_collected_for_the_test_views(views, tmp_path, monkeypatch):
-    def run(command, log, output, *rest):
-        for view in views.scene.test:
-            Image.fromarray(255 - view.image).save(output / view.name)
-        return SimpleNamespace(seconds=1.0, peak_memory_mb=1.0)
-
-    monkeypatch.setattr(external_steps, "run_program", run)
-    external_step(views, replace(trainer(tmp_path, "none"), result="*.png"), parts_of()).build(
-        tmp_path
-    )
-    for view in views.scene.test:
-        assert (np.asarray(Image.open(tmp_path / f"renders/{view.name}")) == 255 - view.image).all()
-    summary = read_json(tmp_path / "training.json")
-    assert (summary["evaluated_from"], summary["num_gaussians"]) == ("renders", None)
 
 
 def test_training_starts_from_the_gaussians_of_the_initialiser_if_there_are_any(views):

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import csv
-import shutil
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -34,7 +32,7 @@ from gsbench.runs.layout import (
     RENDERS,
 )
 from gsbench.runs.trial_record import Earlier, Evaluation
-from gsbench.scene.images import png_name, read_image
+from gsbench.scene.images import png_name
 from gsbench.scene.types import COUNTED, Scene, nearest_training_cameras
 from gsbench.system.resources import available_threads
 from gsbench.train.trainer import snapshot_file
@@ -46,15 +44,14 @@ EXTRA = "eval.extra"  # the setting that names the user's own metrics
 
 
 def evaluate_step(views: Views, trained: Step, parts: Parts) -> Step:
-    """The step that renders and measures the model of ``trained`` and its earlier snapshots.
-
-    If another program left renders instead of a model, the step measures those.
-    """
+    """The step that renders and measures the model of ``trained`` and its earlier snapshots."""
     evaluator, user = parts.evaluator, parts.user_code
     inputs: dict[str, Any] = {
         "protocol": evaluator.protocol.id,
         # part of the key: weights that arrive later give a new result
         "unavailable": sorted(evaluator.unavailable),
+        "train": trained.key,
+        "maps": False,  # a setting of earlier versions
     }
     own = {
         name: options_of("eval", metric, user, f"{EXTRA}.{name}")
@@ -65,24 +62,18 @@ def evaluate_step(views: Views, trained: Step, parts: Parts) -> Step:
         "regions": regions,
         "extra": own,
         "more": list(evaluator.more),
+        "earlier": parts.measured_earlier,
     }
-    if parts.program is not None and not parts.program.leaves_model:
-        inputs["renders"] = trained.key
-        measure = _measure_renders
-    else:
-        inputs |= {"train": trained.key, "maps": False}  # a setting of earlier versions
-        further["earlier"] = parts.measured_earlier
-        # the key of `trained` covers the rendering only if gsbench trained
-        if parts.program is not None:
-            inputs["raster"] = rasterizer_inputs(parts.rasterizer, user)
-            inputs["background"] = list(parts.train.background)
-        measure = _measure_model
+    # the key of `trained` covers the rendering only if gsbench trained
+    if parts.program is not None:
+        inputs["raster"] = rasterizer_inputs(parts.rasterizer, user)
+        inputs["background"] = list(parts.train.background)
     # Metrics that are off are left out, so that a new one changes no key of others.
     inputs |= {name: value for name, value in further.items() if value}
-    return step_of(EVALUATE, inputs, partial(measure, views, trained, parts), user)
+    return step_of(EVALUATE, inputs, partial(_measure, views, trained, parts), user)
 
 
-def _measure_model(views: Views, trained: Step, parts: Parts, folder: Path) -> None:
+def _measure(views: Views, trained: Step, parts: Parts, folder: Path) -> None:
     """Render the model of ``trained`` and its earlier snapshots, and measure the renders."""
     rasterizer, evaluator, device = parts.rasterizer, parts.evaluator, parts.device
     training, scene = views.store.path(trained), views.scene
@@ -121,23 +112,7 @@ def _measure_model(views: Views, trained: Step, parts: Parts, folder: Path) -> N
             model = read_ply(snapshot, device)
             means = summarize(measure(model, f"iteration {step}", None), evaluator.unavailable)
             at[str(step)] = Earlier(metrics=means, num_gaussians=len(model))
-    _write_metrics(folder, evaluator, per_view, scene, at=at)
-
-
-def _measure_renders(views: Views, trained: Step, parts: Parts, folder: Path) -> None:
-    """Measure the renders that another program left in ``trained``."""
-    evaluator = parts.evaluator
-    scene, per_view = views.scene, {}
-    regions = regions_of(views, parts)
-    shutil.copytree(views.store.path(trained) / RENDERS, folder / RENDERS)
-    with progress("evaluate") as report:
-        for done, view in enumerate(scene.test, 1):
-            image = read_image(folder / RENDERS / png_name(view.name))
-            per_view[view.name] = evaluator.evaluate_view(
-                image, view.image, view.mask, regions.get(view.name, {})
-            )
-            report("views", done, len(scene.test))
-    _write_metrics(folder, evaluator, per_view, scene)
+    _write_metrics(folder, evaluator, per_view, scene, at)
 
 
 def _write_metrics(
@@ -145,7 +120,7 @@ def _write_metrics(
     evaluator: Evaluator,
     per_view: Mapping[str, Mapping[str, float]],
     scene: Scene,
-    at: Mapping[str, Earlier] = MappingProxyType({}),
+    at: dict[str, Earlier],
 ) -> None:
     """Write the metrics of each view and their means.
 
@@ -161,11 +136,8 @@ def _write_metrics(
         counted = {COUNTED: view.counted} if masked else {}
         rows[view.name] |= distances | counted
     write_per_view(folder / PER_VIEW, rows)
-    summary = replace(
-        summary_of(evaluator, per_view),
-        at=dict(at),
-        one_color_psnr=one_color_psnr(scene, evaluator.protocol),
-    )
+    plain = one_color_psnr(scene, evaluator.protocol)
+    summary = replace(summary_of(evaluator, per_view), at=at, one_color_psnr=plain)
     write_json(folder / METRICS, summary.to_json())
 
 

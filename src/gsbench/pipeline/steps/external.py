@@ -1,4 +1,4 @@
-"""Training by another program: it gets the training views, and leaves a model or renders."""
+"""Training by another program: it gets the training views, and leaves a model."""
 
 from __future__ import annotations
 
@@ -14,18 +14,12 @@ from typing import TYPE_CHECKING, Any
 
 from gsbench.densify import Lineage
 from gsbench.errors import InputError, TrainingError
-from gsbench.external.exchange import (
-    collect_model,
-    collect_renders,
-    write_test_cameras,
-    write_training_views,
-)
+from gsbench.external.exchange import collect_model, write_training_views
 from gsbench.external.run import ProgramResult, run_program
 from gsbench.external.settings import (
     DATA,
     FOLDERS,
     OUTPUT,
-    TEST_CAMERAS,
     External,
     fill_placeholders,
     split_command,
@@ -35,8 +29,8 @@ from gsbench.init.base import MODEL_FOLDER, PointCloud
 from gsbench.pipeline.steps.scene import Views
 from gsbench.pipeline.steps.train import check_points, write_training
 from gsbench.runs.keys import TRAIN, Step, options_of, step_of
-from gsbench.runs.layout import EVENTS, POINT_CLOUD, RENDERS, TRAINER_LOG
-from gsbench.runs.trial_record import FROM_MODEL, FROM_RENDERS
+from gsbench.runs.layout import EVENTS, POINT_CLOUD, TRAINER_LOG
+from gsbench.runs.trial_record import FROM_MODEL
 from gsbench.system.programs import SAFE_PATH
 from gsbench.words import readable_time
 
@@ -79,13 +73,13 @@ def external_step(views: Views, trainer: External, parts: Parts) -> Step:
         values = {name: str((folder / WORK / name).resolve()) for name in FOLDERS}
         values |= trainer.options | repetition | here
         ended, said = _run(trainer, values, views, cloud, folder / TRAINER_LOG)
-        count = collect_result(trainer, views, Path(values[OUTPUT]), values, folder)
+        count = _collect(trainer, views, values, folder)
         shutil.rmtree(folder / WORK)
         (folder / EVENTS).write_text("")
         # The record has placeholders instead of the folders in the command, which are deleted.
         nameless = values | {name: f"{{{name}}}" for name in FOLDERS}
         summary = {
-            "evaluated_from": FROM_MODEL if trainer.leaves_model else FROM_RENDERS,
+            "evaluated_from": FROM_MODEL,
             "num_gaussians": count,
             "iterations": iterations,
             "num_init_points": len(cloud),
@@ -100,8 +94,7 @@ def external_step(views: Views, trainer: External, parts: Parts) -> Step:
             },
         }
         # without causes: which rule of the program made a Gaussian is unknown here
-        lineage = None if count is None else Lineage(count)
-        write_training(folder, summary, lineage, views, device, start)
+        write_training(folder, summary, Lineage(count), views, device, start)
 
     # The stage has its own version, because changes of gsbench's trainer do not affect it. It is
     # not resumable, because a stopped program starts from the beginning.
@@ -118,20 +111,16 @@ def _run(
     """
     executable, environment = trainer.executable(), environment_of(trainer, values)
     said = check_version(trainer, values, environment)
-    data, cameras, output = (Path(values[name]) for name in (DATA, TEST_CAMERAS, OUTPUT))
+    data, output = Path(values[DATA]), Path(values[OUTPUT])
     output.mkdir(parents=True)
-    normalization = views.capture.normalization
-    write_training_views(data, views.scene.train, cloud, normalization)
-    if trainer.needs_test_cameras:
-        write_test_cameras(cameras, views.scene.test, normalization)
+    write_training_views(data, views.scene.train, cloud, views.capture.normalization)
     command = [executable, *filled_command(trainer, values)[1:]]
     limit = None if trainer.time_limit_minutes is None else 60 * trainer.time_limit_minutes
     log.info("train: %s runs; its output: %s", trainer.program, log_file)
     try:
         ended = run_program(command, log_file, output, environment, limit)
     finally:
-        for place in (data, cameras):
-            shutil.rmtree(place, ignore_errors=True)
+        shutil.rmtree(data, ignore_errors=True)
     log.info("train: %s ended after %s", trainer.program, readable_time(ended.seconds))
     return ended, said
 
@@ -141,21 +130,15 @@ def filled_command(trainer: External, values: Mapping[str, object]) -> list[str]
     return [fill_placeholders(word, values, "densify.command") for word in trainer.words]
 
 
-def collect_result(
-    trainer: External, views: Views, output: Path, values: Mapping[str, object], folder: Path
-) -> int | None:
-    """Move the model or the renders from ``output`` to ``folder``.
+def _collect(trainer: External, views: Views, values: Mapping[str, Any], folder: Path) -> int:
+    """Move the model from the output to ``folder``; returns the number of its Gaussians.
 
-    Returns the number of Gaussians of a model, and None for renders. Raises TrainingError, with the
-    log's path, if the program left something else.
+    Raises TrainingError, with the log's path, if the program left something else.
     """
-    pattern = fill_placeholders(trainer.result, values, "densify.result")
+    pattern, output = fill_placeholders(trainer.result, values, "densify.result"), values[OUTPUT]
+    normalization = views.capture.normalization
     try:
-        if trainer.leaves_model:
-            normalization = views.capture.normalization
-            return len(collect_model(output, pattern, folder / POINT_CLOUD, normalization))
-        collect_renders(output, pattern, trainer.by_order, views.scene.test, folder / RENDERS)
-        return None
+        return len(collect_model(Path(output), pattern, folder / POINT_CLOUD, normalization))
     except TrainingError as error:
         raise TrainingError(
             f"{Path(trainer.program).name} ended well, but {error}; log: {folder / TRAINER_LOG}"
