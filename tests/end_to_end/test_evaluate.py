@@ -77,7 +77,7 @@ def test_entered_renders_are_in_the_table_and_get_a_verdict(said, refused, runs,
     for seed in (0, 1):
         folder = better_renders(runs, tmp_path / f"theirs{seed}", seed)
         done = said(f"evaluate {folder} --truth courtyard --as {FINISHED}:theirs --seed {seed}")
-        assert "names matched apart from folders, what all names begin" in done
+        assert "names matched apart from what all names begin" in done
     entered = trial(runs, "random-theirs", 1)
     found = results(entered)
     assert found["evaluated_from"] == "renders"

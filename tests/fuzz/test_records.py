@@ -78,7 +78,6 @@ READS_ITSELF = {
     "system/install.py",  # files that pip wrote about the package
     "claims/archive.py",  # archives, which anybody may have made
     "config/schema.py",  # of the package
-    "launch/record.py",  # text of this process
     "parsing.py",
 }
 LOADERS = {"json.loads", "json.load", "yaml.load", "yaml.safe_load", "yaml.full_load"}

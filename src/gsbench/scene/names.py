@@ -137,10 +137,11 @@ def match_pictures(photographs: Sequence[str], pictures: Sequence[str]) -> Match
     for rule, steps in PICTURE_RULES.items():
         keys = _keys(photographs, steps)
         by_key = grouped(pictures, _keys(pictures, steps).__getitem__)
-        lacking = [name for name in photographs if keys[name] not in by_key]
-        missing = min(missing, lacking, key=len)
-        if lacking or len({*keys.values()}) < len(photographs):
-            continue  # it gives a photograph no picture, or two one key
+        if len({*keys.values()}) < len(photographs):
+            continue
+        if lacking := [name for name in photographs if keys[name] not in by_key]:
+            missing = min(missing, lacking, key=len)
+            continue
         for photograph, key in keys.items():
             if len(by_key[key]) > 1:
                 raise InputError(
@@ -229,6 +230,12 @@ PICTURE_RULES: Mapping[str, Sequence[Step]] = {
     "": (),
     "apart from the extension": (_flat,),  # a/b.png may be written a__b.png
     "apart from case": (_flat, _folded),
+    "apart from what all names begin or end with, and leading zeros": (
+        _flat,
+        _folded,
+        _stripped,
+        _unpadded,
+    ),
     "apart from folders": (_base, _folded),
     "apart from folders, what all names begin or end with, and leading zeros": (
         _base,
