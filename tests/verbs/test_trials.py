@@ -207,6 +207,10 @@ def test_retry_of_a_trial_without_a_plan_uses_its_configuration(folders, runs):
     assert allowed_modules()["mine"] == "theirs"
     with refusal("is in no plan, so no setting of it can be changed"):
         trials.recompose(folders[1], None, runs, ["launch=local"], "theirs")
+    again.values["scene"]["downscale"] = 2  # a setting of an earlier version
+    write(folders[1] / "config.yaml", again.values)
+    with refusal("seed1: scene.downscale is not a setting.*: run it by its own command"):
+        trials.recompose(folders[1], None, runs, [], "theirs")
 
 
 def test_a_trial_from_renders_is_entered_by_its_own_command(folders, runs):

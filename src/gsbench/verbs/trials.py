@@ -20,6 +20,7 @@ from rich.text import Text
 from gsbench.config.command_words import makes_other_trials, parse, typed_permissions
 from gsbench.config.compose import Trial, compose_one
 from gsbench.config.overrides import changed_words, key_of
+from gsbench.config.schema import check
 from gsbench.errors import InputError
 from gsbench.files import make_runs_folder
 from gsbench.launch.estimates import describe_plan
@@ -205,7 +206,10 @@ def recompose(
         raise InputError(
             f"{files.label} was entered from renders: give the command of `gsbench evaluate` again"
         )
-    return Trial(values, ())
+    try:
+        return Trial(check(values), ())
+    except InputError as error:  # of an earlier version's setting, for one
+        raise InputError(f"{files.label}: {error}: run it by its own command") from error
 
 
 def declare(argv: Sequence[str], runs: Path) -> int:
