@@ -5,8 +5,6 @@ from PIL import Image
 from plyfile import PlyData, PlyElement
 from scipy.ndimage import gaussian_filter
 
-from tests.helpers import write_lines
-
 PICTURE_SIZE = (120, 160)  # rows, columns
 TEXTURED = slice(80, 160)  # columns of the ground truth that hold grass; the others are smooth
 
@@ -37,16 +35,10 @@ def write_pictures(path, densify, seed, views):
 
 
 def write_point_cloud(path, densify, seed):
-    """Write a PLY with log-normal scales, smaller for "volumetric", and logged histograms."""
+    """Write a PLY with log-normal scales, smaller for "volumetric"."""
     rng = np.random.default_rng(seed)
     fields = ["x", "y", "z", "opacity", *(f"scale_{k}" for k in range(3))]
     vertices = np.zeros(2000, dtype=[(name, "f4") for name in fields])
     for axis in range(3):
         vertices[f"scale_{axis}"] = rng.normal(-4.0 if densify == "adc" else -4.5, 1.0, 2000)
     PlyData([PlyElement.describe(vertices, "vertex")]).write(path / "point_cloud.ply")
-    edges = np.linspace(-18, 3, 85)
-    histograms = []
-    for step, center in ((600, -4.0), (1200, -5.0)):
-        counts, _ = np.histogram(rng.normal(center, 2, 2000), edges)
-        histograms.append({"step": step, "log10_edges": edges.tolist(), "counts": counts.tolist()})
-    write_lines(path / "volume_histograms.jsonl", histograms)

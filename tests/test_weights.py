@@ -207,10 +207,15 @@ def test_tensors_are_read_from_both_formats(tmp_path, name):
     assert_close(state["a.weight"], STATE["a.weight"])
 
 
-def test_a_file_that_holds_more_than_tensors_is_refused(tmp_path):
+def test_tensors_are_read_from_an_entry_of_a_checkpoint(tmp_path):
     torch.save({"epoch": 3, "extractor": STATE}, tmp_path / "net.pth")
+    assert load_state(tmp_path / "net.pth", entry="extractor").keys() == STATE.keys()
+    with pytest.raises(MissingWeightsError, match="no entry 'model'"):
+        load_state(tmp_path / "net.pth", entry="model")
     with pytest.raises(MissingWeightsError, match="something other than tensors"):
         load_state(tmp_path / "net.pth")
+    with pytest.raises(MissingWeightsError, match="no entry 'epoch'"):
+        load_state(tmp_path / "net.pth", entry="epoch")
     torch.save([1], tmp_path / "net.pth")
     with pytest.raises(MissingWeightsError, match="it holds a list, not tensors by name"):
         load_state(tmp_path / "net.pth")

@@ -254,7 +254,8 @@ def _named(place: tuple[Any, ...]) -> str:
 def _fault_of_leaf(item: Any) -> str:
     kind = type(item)
     if kind is str:
-        return "a text with a lone surrogate (half a character)" if SURROGATE.search(item) else ""
+        is_whole = item.isascii() or not SURROGATE.search(item)  # fast if ASCII
+        return "" if is_whole else "a text with a lone surrogate (half a character)"
     if kind is float:
         return "" if math.isfinite(item) else f"{item}, which is not a finite number"
     if kind is int:

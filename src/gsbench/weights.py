@@ -136,12 +136,12 @@ def _find_local(spec: WeightsFile, folders: Sequence[Path]) -> Path | None:
     return None
 
 
-def load_state(path: Path) -> dict[str, Tensor]:
+def load_state(path: Path, entry: str | None = None) -> dict[str, Tensor]:
     """The tensors in ``path``, on the CPU, by name.
 
-    ``path`` is a .safetensors file, or one of PyTorch, read with ``weights_only``. Raises
-    ``MissingWeightsError`` if the file is truncated, is not a weights file, or holds anything but
-    tensors.
+    ``path`` is a .safetensors file, or one of PyTorch, read with ``weights_only``. ``entry`` is the
+    key of the tensors in a PyTorch file that holds more. Raises ``MissingWeightsError`` if the file
+    is truncated, is not a weights file, or holds anything but tensors.
     """
     import torch
 
@@ -160,6 +160,10 @@ def load_state(path: Path) -> dict[str, Tensor]:
         raise _unreadable(path, str(error).partition("\n")[0] or type(error).__name__) from error
     if not isinstance(state, Mapping):
         raise _unreadable(path, f"it holds a {type(state).__name__}, not tensors by name")
+    if entry is not None:
+        if not isinstance(state.get(entry), Mapping):
+            raise _unreadable(path, f"it has no entry {entry!r}")
+        state = state[entry]
     if not all(isinstance(value, torch.Tensor) for value in state.values()):
         raise _unreadable(path, "it holds something other than tensors")
     return dict(state)

@@ -6,7 +6,7 @@ import shutil
 
 import pytest
 
-from gsbench.analysis.comparison import compare, joined
+from gsbench.analysis.comparison import compare
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.tables import build_table
 from tests.analysis.helpers import loaded, page_of
@@ -151,18 +151,15 @@ def test_after_an_edit_rows_that_were_not_trained_again_are_folded_as_earlier_co
     assert all(one.sentence.endswith(" (earlier code)") for one in earlier)
 
 
-@pytest.mark.parametrize("metric, named", [("psnr", True), ("ssim", False)])
-def test_another_experiment_that_asked_about_the_same_trials_is_named(tmp_path, metric, named):
-    """Its trainings were started there, so nobody asked beforehand here."""
+def test_what_another_experiment_asked_about_the_same_trials_is_not_asked_here(tmp_path):
     write_runs(tmp_path, **CLEAR)
-    ask_about(tmp_path, metric=metric)
+    ask_about(tmp_path)
     copy = shutil.copytree(tmp_path / "exp", tmp_path / "copy")
     (copy / "commands.jsonl").unlink()
     for path in copy.glob("*/*/*/results.json"):
         change_json(path, questions=[], experiment="copy")
     (answer,) = compare(load_experiment(tmp_path, "copy")).answers
     assert answer.badge == "NOT ASKED"
-    assert ("here, but in experiment exp: gsbench tables exp" in answer.sentence) == named
     (there,) = answers(tmp_path)
     assert there.badge == "BETTER"
 
@@ -176,22 +173,15 @@ def test_the_page_of_an_idea_waits_for_the_trials_of_its_baseline(tmp_path):
     assert "nothing to compare" not in page
 
 
-def test_two_experiments_are_told_apart_and_one_setting_stands_for_a_schedule(tmp_path):
-    """Their baselines have the same bits, which is no effect of a setting."""
-    for name, length in (("long", 30_000), ("short", 7000)):
+def test_one_setting_stands_for_a_schedule(tmp_path):
+    for length in (30_000, 7000):
         steps = {f"train.{key}": length // part for part, key in enumerate(SCHEDULE, 2)}
         for densify, seed in itertools.product(("adc", "mine"), (0, 1)):
-            own = {"experiment": name, "densify": densify, "_iterations": length}
-            write_trial(tmp_path, seed, f"{length:08x}", steps, **own, psnr=20.0 + seed)
-        ask_about(tmp_path, experiment=name)
-    both = joined([compare(load_experiment(tmp_path, name)) for name in ("long", "short")])
-    table = build_table(both.experiment, comparison=both)
-    assert table.row_headings == ("scene", "init", "densify", "experiment", "train.iterations")
+            own = {"densify": densify, "_iterations": length, "psnr": 20.0 + seed}
+            write_trial(tmp_path, seed, f"{length:08x}", steps, **own)
+    table = build_table(loaded(tmp_path))
+    assert table.row_headings == ("scene", "init", "densify", "train.iterations")
     assert "train.iterations stands for train.densify_stop, train.mcmc_stop, " in table.notes[1]
-    starts = [line.partition(" against ")[0] for line in table.verdicts]
-    names = "sfm-mine[experiment=long]", "sfm-mine[experiment=short]"
-    assert starts[:2] == [f"UNDECIDED: {name}" for name in names]
-    assert not any(note.kind == "same bits" and "short" in str(note) for note in both.remarks)
 
 
 def test_a_trial_of_no_question_is_named(tmp_path):

@@ -12,7 +12,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from PIL import Image
-from plyfile import PlyData
 
 from gsbench.analysis.images import choose_views, jpeg_uri, read_compared, texture_energy
 from gsbench.analysis.pairs import Pairs, pair_trials
@@ -26,18 +25,13 @@ from gsbench.analysis.report.charts import (
     short_number,
 )
 from gsbench.analysis.report.curves import (
-    _logged_histograms,
-    _threshold,
     event_table,
-    histogram,
-    log10_volumes,
     mean_by_step,
 )
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.statistics import Interval
-from gsbench.runs.trial_record import Histogram
 from tests.analysis.helpers import ADC, VOLUMETRIC, loaded, page_of, rows_of, trials_of
-from tests.helpers import refusal, write
+from tests.helpers import write
 from tests.markup import Page
 from tests.trials import ask_about, search_record, write_arms, write_runs, write_trial
 
@@ -203,54 +197,7 @@ def test_ignored_pixels_are_shown_as_stripes_of_four_pixels(tmp_path):
 def test_missing_or_damaged_pictures_are_named(tmp_path):
     paths = write_runs(tmp_path, views=2, pictures=True)
     (paths[0] / "renders/view001.png").write_bytes(b"\x89PNG\r\n\x1a\nhalf")
-    (paths[1] / "point_cloud.ply").write_bytes(b"ply\nformat ascii 1.0\n")
-    text = page_of(tmp_path)
-    assert "view001.png: not a readable image" in text
-    assert "is not a readable 3DGS PLY" in text
-
-
-def test_volumes_are_those_of_the_ellipsoids(experiment):
-    path = experiment.trials[0].path / "point_cloud.ply"
-    vertices = PlyData.read(path)["vertex"]
-    scales = np.exp(np.stack([vertices[f"scale_{axis}"] for axis in range(3)]).astype(np.float64))
-    volumes = 4 / 3 * np.pi * scales.prod(axis=0)
-    found = log10_volumes(path)
-    assert found == pytest.approx(np.log10(volumes), abs=1e-6)
-    assert log10_volumes(path, 10.0) == pytest.approx(found + 3)
-    shares = histogram(np.append(found, -np.inf))
-    assert sum(share for _, share in shares) == pytest.approx(1)
-    assert sum(share for volume, share in shares if volume > 1e-4) == pytest.approx(
-        np.mean(found >= -4)
-    )
-
-
-def test_logged_histograms_are_shares_of_all_trials_together():
-    """Ten Gaussians of one trial and thirty of another; only the second has an iteration 8."""
-    edges = [-4.0, -3.0, -1.0, 0.0]
-    rows = [
-        [Histogram(step=4, log10_edges=edges, counts=[4, 0, 6])],
-        [
-            Histogram(step=4, log10_edges=edges, counts=[6, 0, 24]),
-            Histogram(step=8, log10_edges=edges, counts=[0, 5, 0]),
-        ],
-    ]
-    trials = [
-        SimpleNamespace(folder=SimpleNamespace(curves=lambda name, kind, own=own: own))
-        for own in rows
-    ]
-    found = _logged_histograms(trials)
-    assert list(found) == [4, 8]
-    assert np.array(found[4]) == pytest.approx(np.array([[10**-3.5, 0.25], [10**-0.5, 0.75]]))
-    assert np.array(found[8]) == pytest.approx(np.array([[10**-2.0, 1.0]]))
-
-
-def test_the_share_of_volumes_above_the_threshold_is_stated(experiment, page):
-    found = [
-        10 ** log10_volumes(t.path / "point_cloud.ply")
-        for t in experiment.trials
-        if t.densify == "adc"
-    ]
-    assert f"sfm-adc: {np.mean(np.concatenate(found) > 0.03):.2%} of volumes exceed 0.03." in page
+    assert "view001.png: not a readable image" in page_of(tmp_path)
 
 
 def test_growth_and_pruning_by_cause_are_shown_in_a_table(page):
@@ -275,13 +222,6 @@ def test_a_cause_that_an_arm_did_not_log_counts_as_zero_and_one_that_none_logged
     assert event_table(trials[:1], [ADC]) is None
 
 
-def test_a_truncated_point_cloud_is_refused(tmp_path, experiment):
-    content = (experiment.trials[0].path / "point_cloud.ply").read_bytes()
-    (tmp_path / "half.ply").write_bytes(content[: len(content) // 2])
-    with refusal(r"half\.ply is not a readable 3DGS PLY .*early end-of-file"):
-        log10_volumes(tmp_path / "half.ply")
-
-
 def test_mean_curves_use_common_steps():
     assert mean_by_step([[(1, 2.0), (2, 4.0), (3, 9.0)], [(2, 6.0), (1, 0.0)], []]) == [
         (1, 1.0),
@@ -296,9 +236,9 @@ def row_of(label, mean, interval=None):
 
 CHARTS = {
     "lines": lambda title: line_chart(
-        title, [("a", [(1, 1), (10, 5)]), ("b", [(2, 3)])], "x", "y", log=True
+        title, [("a", [(1, 1), (10, 5)]), ("b", [(2, 3)])], "x", "y", log_x=True
     ),
-    "flat": lambda title: line_chart(title, [("a", [(5, 1), (5, 1)])], "x", "y", marker=5),
+    "flat": lambda title: line_chart(title, [("a", [(5, 1), (5, 1)])], "x", "y", level=(5, "z")),
     "forest": lambda title: forest_plot(
         title, [row_of("s", 0.1, Interval(-0.1, 0.3)), row_of("t", 0.2)], "d", 1
     ),
@@ -417,34 +357,9 @@ def test_a_forest_plot_of_a_verdict_has_its_scenes_and_from_two_on_their_mean(ke
     assert "a 0.5; b −0.25; mean of scenes 0.125." in two
 
 
-@pytest.mark.parametrize(
-    "settings, expected",
-    [
-        ({"volume_threshold": 0.03}, 0.03),
-        ({"volume_threshold": 0.03, "threshold_mode": "absolute"}, 0.03),
-        ({"volume_threshold": 0.03, "threshold_mode": "extent_relative"}, None),
-        ({"volume_threshold": "auto"}, None),
-        ({}, None),
-    ],
-)
-def test_the_threshold_of_a_chart_is_the_one_that_all_arms_have_in_scene_units(
-    tmp_path, settings, expected
-):
-    own = 0.05 if expected is None and "auto" not in settings.values() else None
-    others = ("adc", {}, expected), ("mcmc", {"volume_threshold": 0.05}, own)
-    for name, other, threshold in others:
-        write_arms(tmp_path / name, {name: other, "volumetric": settings}, seeds=(0,))
-        assert _threshold(trials_of(tmp_path / name)) == threshold
-
-
 def test_a_chart_with_nothing_to_draw_is_an_empty_string():
     assert line_chart("t", [("a", [])], "x", "y") == ""
-    assert line_chart("t", [("a", [(0, 1), (1, 0)])], "x", "y", log=True) == ""
     assert forest_plot("t", [], "x", 1) == ""
-    points = [(0.5, 0.25), (0, 1), (1, 0), (2, 0.5)]  # a logarithmic axis has no 0
-    assert "a from 0.25 at 0.5 to 0.5 at 2." in line_chart("t", [("a", points)], "x", "y", log=True)
-    dropped = line_chart("t", [("a", points[1:3] + points[:1])], "x", "y", log=True)
-    assert "a from 0.25 at 0.5 to 0.25 at 0.5." in dropped
 
 
 def test_one_trial_of_each_arm_gives_no_verdict(tmp_path):
@@ -487,7 +402,6 @@ def test_a_single_arm_and_bare_results_still_make_a_report(tmp_path):
             (path / name).unlink()
     text = page_of(tmp_path)
     assert "Only one arm was run" in text
-    assert "No trained model was found" in text
 
 
 def test_arms_that_never_differ_are_called_equal_and_not_undecided(tmp_path):

@@ -323,7 +323,7 @@ def search(trial, shown):
 HERE = {
     "`results.json`": results,
     "`config.yaml`, `per_view.csv`, `point_cloud.ply`, `lineage.npz` of a trial": files_of_a_trial,
-    "`metrics.jsonl`, `events.jsonl`, `volume_histograms.jsonl`": curves,
+    "`metrics.jsonl`, `events.jsonl`": curves,
     "pictures of a trial": pictures,
     "`store/`: results of stages and prepared views": store,
     "`commands.jsonl`": commands,

@@ -22,7 +22,7 @@ from random import Random
 from gsbench.analysis.cells import to_frame
 from gsbench.analysis.fairness import tuning_notes
 from gsbench.analysis.report.build import search_summary
-from gsbench.analysis.report.curves import event_charts, training_charts, volume_charts
+from gsbench.analysis.report.curves import event_charts, training_charts
 from gsbench.analysis.results import load_experiment, read_views
 from gsbench.analysis.table_formats import to_html_page
 from gsbench.analysis.tables import build_table
@@ -48,7 +48,6 @@ NAMES = (
     "commands.jsonl",
     "metrics.jsonl",
     "events.jsonl",
-    "volume_histograms.jsonl",
     "per_view.csv",
     "failed.json",
     "building.json",
@@ -119,9 +118,7 @@ def write_trial(runs, densify, seed, threshold=0.03):
         {"step": k, "cloned": 2, "split_volume": 1, "opacity_reset": False, "strictness": 1.0}
         for k in steps
     ]
-    edges = [-18 + k for k in range(22)]
-    histograms = [{"step": 50, "log10_edges": edges, "counts": [k % 5 for k in range(21)]}]
-    for name, lines in (("metrics", rows), ("events", events), ("volume_histograms", histograms)):
+    for name, lines in (("metrics", rows), ("events", events)):
         write_lines(folder / f"{name}.jsonl", lines)
     psnr = 26.5 + seed
     (folder / "per_view.csv").write_text(f"view,psnr\na,{psnr - 1}\nb,{psnr + 1}\n")
@@ -262,7 +259,6 @@ def look(runs, places):
         attempt(lambda: to_frame(experiment).to_csv())
         attempt(lambda: training_charts(experiment.trials, arms))
         attempt(lambda: event_charts(experiment.trials, arms))
-        attempt(lambda: volume_charts(experiment.trials, arms))
         for first, second in itertools.pairwise(arms):
             attempt(lambda pair=(first, second): tuning_notes(experiment.trials, pair))
         for trial in experiment.trials:

@@ -169,6 +169,22 @@ def test_no_network_is_downloaded_by_the_libraries(untrained_weights, monkeypatc
     )
 
 
+def test_disk_is_loaded_from_its_published_layout(tmp_path):
+    from kornia.feature import DISK
+
+    torch.manual_seed(0)
+    content = {"extractor": DISK().state_dict(), "optimizer": {"lr": 1.0}}
+    torch.save(content, tmp_path / "depth-save.pth")
+    settings = Dim(extractor="disk", matcher="mutual_nearest", max_keypoints=50).extraction
+    extract = EXTRACTORS["disk"](settings, tmp_path / "depth-save.pth", CPU)
+    with torch.inference_mode():
+        keypoints, descriptors, scores = extract(torch.rand(1, 3, 75, 101))
+    assert len(keypoints) == len(scores) <= 50
+    assert descriptors.shape == (len(keypoints), 128)
+    assert (keypoints >= 0).all()
+    assert (keypoints < torch.tensor([101, 75])).all()
+
+
 @pytest.mark.parametrize("extractor, threshold, radius", TABLES["detection by extractor"])
 def test_detection_settings_are_the_extractors_own_unless_given(extractor, threshold, radius):
     """The defaults are those of deep-image-matching and the authors."""
@@ -234,9 +250,12 @@ def test_an_unknown_device_is_refused(courtyard, untrained_weights, tmp_path):
 
 @pytest.mark.shared
 @pytest.mark.slow
-def test_lightglue_with_real_weights_finds_points_on_the_surfaces(few, trained_weights, tmp_path):
+@pytest.mark.parametrize("extractor", ["aliked", "disk"])
+def test_lightglue_with_real_weights_finds_points_on_the_surfaces(
+    few, trained_weights, tmp_path, extractor
+):
     own = {"max_keypoints": 500, "threads": 1, "pairs": "sequential", "overlap": 2}
-    init = Dim(extractor="aliked", weights=trained_weights, download=False, **own)
+    init = Dim(extractor=extractor, weights=trained_weights, download=False, **own)
     report = init.run(few, tmp_path)
     assert len(report.settings["weights_sha256"]) == 2
     assert report.versions["kornia"]

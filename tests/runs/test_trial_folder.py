@@ -189,7 +189,6 @@ def test_equal_results_keep_their_time_and_others_do_not(trial):
         "per_view.csv",
         "metrics.jsonl",
         "events.jsonl",
-        "volume_histograms.jsonl",
     }
     assert set(made_of.digests) == set(made_of.published)
 

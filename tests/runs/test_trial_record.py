@@ -8,7 +8,6 @@ import pytest
 from gsbench.parsing import DamagedError, parse_typed
 from gsbench.runs.trial_record import (
     Failure,
-    Histogram,
     MetricRecord,
     UnfinishedError,
     read_rows,
@@ -88,16 +87,6 @@ def test_a_row_has_an_iteration_and_numbers(row, sound, tmp_path):
     path = tmp_path / "metrics.jsonl"
     path.write_text(json.dumps({"step": 1}) + "\n" + json.dumps(row) + "\n")
     assert read_rows(path) == [{"step": 1}, row][: 1 + sound]
-
-
-@pytest.mark.parametrize(
-    "edges, counts, sound",
-    table(__file__, "a_histogram_has_one_edge_more_than_counts"),
-)
-def test_a_histogram_has_one_edge_more_than_counts(edges, counts, sound, tmp_path):
-    path = tmp_path / "volume_histograms.jsonl"
-    path.write_text(json.dumps({"step": 3, "log10_edges": edges, "counts": counts}) + "\n")
-    assert len(read_rows(path, Histogram)) == sound
 
 
 def test_whole_lines_end_before_the_first_torn_one(tmp_path):

@@ -128,6 +128,24 @@ def test_the_applied_transform_is_undone_for_cameras_and_points(tmp_path):
 IDENTITY = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
 
 
+@pytest.mark.parametrize(
+    "change, said",
+    TABLES["files with other points"],
+)
+def test_two_files_must_name_the_same_points_under_one_transform(tmp_path, change, said):
+    folder = in_blenders_files(write(tmp_path, ply_file_path="a.ply"))
+    for name in ("a.ply", "b.ply"):
+        (folder / name).write_text("ply")
+    assert read_transforms(folder).points.path == folder / "a.ply"
+    # the other file has no transform, which means the identity
+    test = folder / "transforms_test.json"
+    change_json(test, ply_file_path="a.ply", applied_transform=IDENTITY)
+    assert read_transforms(folder).points.path == folder / "a.ply"
+    change_json(test, **change)
+    with refusal(said):
+        read_transforms(folder)
+
+
 def in_blenders_files(folder):
     """The same folder with a file of training views, and one of test views without a transform."""
     document = read_json(folder / "transforms.json")

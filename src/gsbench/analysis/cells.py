@@ -6,7 +6,6 @@ Only repetitions of a trial are averaged: `check_averageable` refuses all others
 from __future__ import annotations
 
 import statistics
-from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -32,7 +31,6 @@ C = TypeVar("C", Planned, TrialResult)
 IDENTITY = ("experiment", "scene", "init", "densify", "seed")
 CONDITIONS = ("protocol", "raster", "iterations")
 TRIAL_FIELDS = (*IDENTITY, *CONDITIONS)
-OF_VIEWS = ("protocol", "resolution", "data", "split")  # conditions of the measured views
 MEASUREMENTS = (
     "num_init_points",
     "num_gaussians",
@@ -105,28 +103,6 @@ def select_trials(trials: Iterable[TrialResult], where: Mapping[str, str]) -> li
         asked = ", ".join(f"{key}={value}" for key, value in where.items())
         raise InputError(f"no trial has {asked}")
     return kept
-
-
-def side_by_side(first: Experiment, second: Experiment) -> tuple[Experiment, Experiment]:
-    """Two experiments, each with its trials on the scenes that both measured alike.
-
-    Raises ``InputError`` if there is no such scene.
-    """
-    sides = [
-        {(trial.scene, *map(trial.conditions.get, OF_VIEWS)) for trial in one.trials}
-        for one in (first, second)
-    ]
-    kinds = Counter(scene for scene, *_ in sides[0] | sides[1])
-    alike = {scene for scene, *_ in sides[0] & sides[1] if kinds[scene] == 1}
-    if not alike:
-        raise InputError(
-            f"{first.name} and {second.name} have no scene with the same views and protocol"
-        )
-    one, two = (
-        replace(own, trials=tuple(trial for trial in own.trials if trial.scene in alike))
-        for own in (first, second)
-    )
-    return one, two
 
 
 def where_words(where: Mapping[str, str]) -> str:

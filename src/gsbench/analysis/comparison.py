@@ -19,7 +19,7 @@ from gsbench.analysis.questions import Asked, choose_pairs
 from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by
 from gsbench.analysis.sentences import asked_words, badge, headline, risk, sentence
 from gsbench.analysis.verdicts import State, Verdict, interval_of, judge
-from gsbench.runs.commands import Question, code_in, questions_elsewhere
+from gsbench.runs.commands import Question, code_in
 from gsbench.runs.experiments import DEFAULT_METRIC
 from gsbench.runs.layout import DECLARED, LEDGER, TUNING
 
@@ -179,8 +179,6 @@ def compare(experiment: Experiment, baseline: str | None = None) -> Comparison:
         if (experiment.folder / name).exists():
             state, why = "not tested", f"{words} ({name})"
     intervals = [interval_of(trials, *pair, DEFAULT_METRIC, state, why) for pair in unasked]
-    if any(verdict.state == "not asked beforehand" for verdict in intervals):
-        intervals = _with_askers(experiment, intervals)
     answers = [*asked, *(_with_metrics(verdict, trials) for verdict in intervals)]
     return Comparison(experiment, trials, tuple(answers))
 
@@ -214,26 +212,6 @@ def _code_of(question: Question) -> set[str]:
     return {code_in(second) for _, second in question.digests.values()}
 
 
-def _with_askers(experiment: Experiment, verdicts: Sequence[Verdict]) -> list[Verdict]:
-    """The verdicts; one that nobody asked here names another experiment that asked it.
-
-    That experiment has a question about all of its trials.
-    """
-    elsewhere = questions_elsewhere(experiment.folder)
-
-    def asker(verdict: Verdict) -> str:
-        trials = verdict.pairs.trials
-        for name, asked in elsewhere.items():
-            for question in asked if trials else ():
-                if question.metric == verdict.quantity.key and all(
-                    question.has(trial.digest, trial.scene, trial.seed) for trial in trials
-                ):
-                    return name
-        return ""
-
-    return [replace(verdict, asker=asker(verdict)) for verdict in verdicts]
-
-
 def _with_metrics(
     verdict: Verdict, trials: Sequence[TrialResult], others: tuple[Verdict, ...] = ()
 ) -> Answer:
@@ -246,49 +224,6 @@ def _with_metrics(
         if quantity.direction and not quantity.cost and quantity.key != verdict.quantity.key
     )
     return Answer(verdict, others, tuple(one for one in metrics if one.pairs.rows))
-
-
-def joined(comparisons: Sequence[Comparison]) -> Comparison:
-    """The answers of several experiments as those of one, called ``A and B``.
-
-    The experiment becomes a part of an arm's name: ``sfm-adc[experiment=A]``.
-    """
-    if len(comparisons) == 1:
-        return comparisons[0]
-    experiments = [one.experiment for one in comparisons]
-    parts: dict[str, Any] = {
-        part: tuple(itertools.chain(*(getattr(one, part) for one in experiments)))
-        for part in ("trials", "faults", "older", "versions")
-    }
-    name = " and ".join(one.name for one in experiments)
-    both = replace(experiments[0], name=name, **parts)
-    trials, answers = zip(*map(_with_experiment, comparisons), strict=True)
-    return Comparison(both, tuple(itertools.chain(*trials)), tuple(itertools.chain(*answers)))
-
-
-def _with_experiment(comparison: Comparison) -> tuple[list[TrialResult], list[Answer]]:
-    """The trials and the answers, with the experiment as a part of their arms' names."""
-    place = ("experiment", comparison.experiment.name)
-
-    def named(verdict: Verdict) -> Verdict:
-        question = verdict.question
-        baseline, idea = (
-            replace(arm, variant=(place, *arm.variant))
-            for arm in (question.baseline, question.idea)
-        )
-        return replace(verdict, question=replace(question, baseline=baseline, idea=idea))
-
-    trials = [replace(trial, variant=(place, *trial.variant)) for trial in comparison.trials]
-    answers = [
-        replace(
-            answer,
-            verdict=named(answer.verdict),
-            others=tuple(map(named, answer.others)),
-            metrics=tuple(map(named, answer.metrics)),
-        )
-        for answer in comparison.answers
-    ]
-    return trials, answers
 
 
 def chosen(comparison: Comparison, trials: Sequence[TrialResult], where: str) -> Comparison:

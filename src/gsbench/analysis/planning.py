@@ -11,6 +11,7 @@ noise that the pilot's scenes have, and decided by the thresholds of the judge.
 """
 
 import math
+from bisect import bisect_left
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
@@ -165,14 +166,11 @@ def fewest_seeds(
     """
     chosen: list[Design] = []
     for count in scenes:
-        low, high = 2, chosen[-1].seeds - 1 if chosen else most
-        if high < low or power(Design(count, high)) < POWER:
-            continue
-        while low < high:
-            middle = (low + high) // 2
-            enough = power(Design(count, middle)) >= POWER
-            low, high = (low, middle) if enough else (middle + 1, high)
-        chosen.append(Design(count, high))
+        designs = [Design(count, seeds) for seeds in range(2, most + 1)]
+        weaker = bisect_left(designs, POWER, key=power)  # how many have less power
+        if weaker < len(designs):
+            chosen.append(designs[weaker])
+            most = chosen[-1].seeds - 1
     return sorted(chosen, key=lambda design: (design.trials, design.scenes))
 
 

@@ -23,6 +23,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from gsbench.analysis.addresses import ArmName
+from gsbench.analysis.results import group_by
 from gsbench.analysis.statistics import ALPHA, MIN_SCENES, sign_test_needs
 from gsbench.analysis.trial_result import Trained, seeds_text, settings_text
 from gsbench.errors import InputError
@@ -229,9 +230,7 @@ def choose_pairs(
 
     A baseline that it does not train is an earlier one, or is awaited.
     """
-    by_arm: dict[Arm, dict[str, str]] = {}
-    for row in planned:
-        by_arm.setdefault(row.arm, _texts(row.config))
+    by_arm = {arm: _texts(own[0].config) for arm, own in group_by(planned, "arm").items()}
     known = dict(by_arm)
     for row in measured:
         if row.densify in (asked.baseline, *asked.controls.values()):

@@ -224,7 +224,8 @@ def newest_code(experiment: Experiment) -> Experiment:
         earlier = replaced.setdefault((change.name, change.now), {})
         earlier.setdefault(change.made, []).extend(made)
 
-    asked = _asked_code(experiment)
+    asked, by_key = _asked_code(experiment), group_by(experiment.trials, "key")
+    texts = {key: settings_text(own[0].config) for key, own in by_key.items()}
     for name, own in group_by(experiment.trials, lambda t: f"{t.init}-{t.densify}").items():
         by_code = group_by(own, lambda trial: code_in(trial.digest))
         questions = asked.get(name, [])
@@ -243,7 +244,7 @@ def newest_code(experiment: Experiment) -> Experiment:
                 newest.append(made[0])
                 current += made
         # an update of gsbench: the trials of a scene and settings that it repeated
-        same = group_by(current, lambda t: (t.scene, settings_text(t.config)))
+        same = group_by(current, lambda trial: (trial.scene, texts[trial.key]))
         for repeated in same.values():
             stages = group_by(repeated, lambda trial: frozenset(trial.code.items()))
             last, *earlier = _newest_first(stages)

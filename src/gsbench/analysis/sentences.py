@@ -93,10 +93,7 @@ def reason(verdict: Verdict) -> str:
         why = verdict.question.untested
         return why if why == verdict.state else f"not tested, since {why}"
     if verdict.state == "not asked beforehand":
-        if not verdict.asker:
-            return "not asked beforehand"
-        shown = command("tables", verdict.asker)
-        return f"not asked beforehand here, but in experiment {verdict.asker}: {shown}"
+        return verdict.state
     if verdict.is_open:
         return _waits(verdict)
     if verdict.outcome != "undecided":

@@ -25,7 +25,7 @@ of noise (findings/simulations.md, "Thresholds"); it is tabulated in ``threshold
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache
 from pathlib import Path
 from typing import Literal
 
@@ -60,25 +60,6 @@ def table() -> Mapping[str, Array]:
         return {name: file[name].astype(np.float64) for name in file.files}
 
 
-@cache
-def _curves(scenes: int, seeds: int) -> Array:
-    """f at the levels and knots [L, Y], interpolated between numbers of scenes and seeds.
-
-    Beyond the table its last row or column holds.
-    """
-    known = table()
-    f = known["f"]
-    for number, own in ((np.log(scenes), np.log(known["scenes"])), (seeds, known["seeds"])):
-        f = _between(f, float(np.interp(number, own, np.arange(len(own)))))
-    return f
-
-
-def _between(values: Array, place: float) -> Array:
-    """The values at a place between two rows."""
-    low = min(int(place), len(values) - 2)
-    return np.asarray(values[low] + (place - low) * (values[low + 1] - values[low]))
-
-
 @dataclass(frozen=True, eq=False)
 class Region:
     """The thresholds of D means over ``scenes``, each with ``seeds`` pairs.
@@ -90,18 +71,21 @@ class Region:
     seeds: int
     even: Array
 
-    @cached_property
-    def _f(self) -> Array:
-        """f at the levels of the table [L, D]."""
-        curves = _curves(self.scenes, self.seeds) * (self.scenes > 1)
-        return np.stack([np.interp(self.even, table()["knots"], curve) for curve in curves])
-
     def limits(self, level: Array | float) -> Array:
-        """The thresholds [D] at a level, or at one for each mean."""
-        row, part = _place(level)
-        which = np.arange(len(self.even))
-        f = self._f[row, which] + part * (self._f[row + 1, which] - self._f[row, which])
-        f = np.where(np.less(level, LEAST_LEVEL), 0.0, f)
+        """The thresholds [D] at a level, or at one for each mean.
+
+        f is interpolated linearly; beyond the table its last value holds.
+        """
+        known = table()
+        axes = (
+            (np.log(self.scenes), np.log(known["scenes"])),
+            (self.seeds, known["seeds"]),
+            (-np.log(level), -np.log(known["levels"])),
+            (self.even, known["knots"]),
+        )
+        places = [np.interp(value, axis, np.arange(len(axis))) for value, axis in axes]
+        f = scipy.ndimage.map_coordinates(known["f"], np.broadcast_arrays(*places), order=1)
+        f = np.where(np.less(level, LEAST_LEVEL) | (self.scenes == 1), 0.0, f)
         return np.asarray(self._student(level) * np.exp(f * self._ratio(level)))
 
     def p_values(self, sizes: Array) -> Array:
@@ -120,15 +104,6 @@ class Region:
         """log(normal / Student's threshold); below the lowest level of the table, that of it."""
         own = np.clip(level, table()["levels"][-1], MOST_P)
         return np.asarray(np.log(-scipy.special.ndtri(own / 2) / self._student(own)))
-
-
-def _place(level: Array | float) -> tuple[NDArray[np.int64], Array]:
-    """Between which two levels of the table a level is: the first one's row, and how far."""
-    levels = table()["levels"]
-    rows = np.arange(len(levels), dtype=np.float64)
-    place = np.interp(-np.log(level), -np.log(levels), rows)
-    low = np.minimum(place.astype(np.int64), len(levels) - 2)
-    return low, place - low
 
 
 def evenness(variances: Array) -> Array:

@@ -63,9 +63,8 @@ def build_table(
         # another split is another question about the same arms, so it gets a column
         if not columns:
             columns = tuple(key for key in SIDE_BY_SIDE if key in folded)
-        several = len({trial.experiment for trial in trials}) > 1
         swept = [key for key in folded if key not in columns]
-        rows = (*DEFAULT_ROWS, *["experiment"][:several], *swept)
+        rows = (*DEFAULT_ROWS, *swept)
     quantities = choose_quantities(trials, metrics)
     fields = (*rows, *columns)
     check_fields(trials, fields)

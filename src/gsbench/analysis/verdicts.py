@@ -61,8 +61,7 @@ class Verdict:
     ``untestable`` says why such trials can never answer it. ``final`` is False while trials to come
     may decide. ``lacking`` are trials of one arm without a result where the other arm has one; if
     the outcome favoured that arm, the verdict ``favours_lacking`` and is undecided. ``outlying``
-    trials lie far outside the others of their scene and arm; they change nothing. ``asker`` is
-    another experiment that asked about the trials, if nobody did so beforehand in this one.
+    trials lie far outside the others of their scene and arm; they change nothing.
     """
 
     question: Question
@@ -80,7 +79,6 @@ class Verdict:
     missing: tuple[Unfinished, ...] = ()  # planned trials that are not there yet
     lacking: tuple[Unfinished, ...] = ()
     favours_lacking: bool = False
-    asker: str = ""
 
     @property
     def is_tested(self) -> bool:

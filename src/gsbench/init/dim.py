@@ -41,16 +41,16 @@ EXTRACTOR_WEIGHTS, LIGHTGLUE_WEIGHTS = (
     TypeAdapter(dict[str, WeightsFile]).validate_python(rows)
     for rows in table_beside(__file__, "weights.yaml").values()
 )
-Extractor = Literal["superpoint", "aliked"]
+Extractor = Literal["superpoint", "aliked", "disk"]
 Matcher = Literal["lightglue", "mutual_nearest"]
 # Detection scores are not comparable between extractors. The thresholds and radii are
-# deep-image-matching's for superpoint, the authors' for aliked.
-DETECTION = {"superpoint": (0.0005, 3), "aliked": (0.2, 2)}  # radii in px
+# deep-image-matching's for superpoint, the authors' for the others.
+DETECTION = {"superpoint": (0.0005, 3), "aliked": (0.2, 2), "disk": (0.0, 2)}  # radii in px
 
 
 @dataclass(frozen=True, kw_only=True)
 class Dim(Reconstruction):
-    """Deep image matching: SuperPoint or ALIKED; LightGlue or mutual nearest neighbours.
+    """Deep image matching: SuperPoint, ALIKED or DISK; LightGlue or mutual nearest neighbours.
 
     ``max_image_size`` is in px of the longest side. Features and matches are stored in the
     ``work_dir`` of `run`, by image and by pair, so an interrupted run continues there.
@@ -66,7 +66,8 @@ class Dim(Reconstruction):
     max_image_size: ImageSize = 1600
     # mutual_nearest: distance to the best over the second-best match, tested in both directions
     max_ratio: MatchRatio = 0.95
-    # least detection score; null: the extractor's (superpoint 0.0005, aliked 0.2); 0: no threshold
+    # least detection score; null: the extractor's (superpoint 0.0005, aliked 0.2, disk 0); 0: no
+    # threshold
     keypoint_threshold: NonNegativeFloat | None = None
     filter_threshold: Fraction = 0.1  # lightglue: least score of a match
     # folder with the weights files; null: $GSBENCH_WEIGHTS, then the torch hub cache

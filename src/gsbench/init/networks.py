@@ -220,6 +220,25 @@ def _aliked(settings: Settings, weights: Path, device: torch.device) -> Extracto
     return extract
 
 
+def _disk(settings: Settings, weights: Path, device: torch.device) -> Extractor:
+    from kornia.feature import DISK
+
+    network = DISK()
+    load_into(network, load_state(weights, entry="extractor"), weights).to(device)
+
+    def extract(image: Tensor) -> Found:
+        features = network(
+            image,
+            n=settings["max_keypoints"],
+            window_size=2 * settings["nms_radius"] + 1,
+            score_threshold=settings["keypoint_threshold"],
+            pad_if_not_divisible=True,
+        )[0]
+        return features.keypoints, features.descriptors, features.detection_scores
+
+    return extract
+
+
 def _gray(image: Tensor) -> Tensor:
     """The luma of ITU-R BT.601 in three equal channels [1, 3, H, W]."""
     weights = image.new_tensor([0.299, 0.587, 0.114])[None, :, None, None]
@@ -231,6 +250,7 @@ def _gray(image: Tensor) -> Tensor:
 EXTRACTORS: dict[str, Callable[[Settings, Path, torch.device], Extractor]] = {
     "superpoint": _superpoint,
     "aliked": _aliked,
+    "disk": _disk,
 }
 
 

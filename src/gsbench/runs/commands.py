@@ -35,7 +35,7 @@ from gsbench.parsing import (
 )
 from gsbench.runs.code import config_hash, edited, states_of, user_modules
 from gsbench.runs.configuration import SHOWN, Values, sha256_of
-from gsbench.runs.experiments import Arm, list_experiments, make_home
+from gsbench.runs.experiments import Arm, make_home
 from gsbench.runs.keys import CODE_OF_STAGE
 from gsbench.runs.layout import COMMANDS, SEED
 from gsbench.runs.trial_record import FROM_RENDERS
@@ -331,12 +331,6 @@ class History:
     def covering(self, digest: Digest, scene: str, seed: int) -> list[Question]:
         """The questions about a trial."""
         return [one for one in self.questions if one.has(digest, scene, seed)]
-
-
-def questions_elsewhere(home: Path) -> dict[str, tuple[Question, ...]]:
-    """The questions of the other experiments of the runs folder, by their names."""
-    others = [name for name in list_experiments(home.parent) if name != home.name]
-    return {name: read_history(home.parent / name).questions for name in others}
 
 
 def read_history(home: Path) -> History:

@@ -140,7 +140,7 @@ def code_changes(made: Mapping[Part, str], now: Callable[[Part], str | None]) ->
 # ---- a trial and its files
 
 # files that tables and reports read
-READ_LATER = (layout.PER_VIEW, layout.CURVES, layout.EVENTS, layout.HISTOGRAMS)
+READ_LATER = (layout.PER_VIEW, layout.CURVES, layout.EVENTS)
 # files by which a trial is judged, exported or run again: after an edit it counts nowhere
 JUDGED = (layout.PER_VIEW, layout.CONFIG, layout.POINT_CLOUD, layout.LINEAGE)
 RECORDED = {*READ_LATER, *JUDGED}

@@ -51,7 +51,6 @@ from gsbench.runs.trial_record import (
     Building,
     Configuration,
     Failure,
-    Row,
     TrialRecord,
     UnfinishedError,
     read_rows,
@@ -321,13 +320,13 @@ class TrialFolder:
 
     # ---- files beside the results
 
-    def curves(self, name: str = layout.CURVES, kind: Any = Row) -> list[Any]:
+    def curves(self, name: str = layout.CURVES) -> list[Any]:
         """The rows of a file of JSON lines that a training wrote; [] without the file.
 
         With a warning, a finished trial's file that was changed after it was written is left out,
         and so are all rows from a damaged one on.
         """
-        return read_rows(self.path / name, kind, lambda path: self._unchanged(path.name))
+        return read_rows(self.path / name, lambda path: self._unchanged(path.name))
 
     def views(self) -> dict[str, dict[str, float]]:
         """The metrics of every test view, ``{view: {metric: value}}``, from ``per_view.csv``.

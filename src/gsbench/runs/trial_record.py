@@ -391,7 +391,6 @@ class AskedBefore(Record):
 # ---- the JSON lines of a training
 
 STEP = "step"  # the key of the iteration in every row
-Exponent = Annotated[float, Field(ge=-300, le=300)]  # ten to this power is a finite number above 0
 
 
 def _with_step(row: dict[str, bool | int | float]) -> dict[str, bool | int | float]:
@@ -412,19 +411,8 @@ class RowWithStep(Record):
     step: Count
 
 
-class Histogram(RowWithStep):
-    """A row of ``volume_histograms.jsonl``: counts between edges, which are log10 of volumes."""
-
-    log10_edges: list[Exponent]
-    counts: list[Amount]
-
-    def __post_init__(self) -> None:
-        if len(self.log10_edges) != len(self.counts) + 1:
-            raise ValueError("the edges are not one more than the counts")
-
-
-def read_rows(path: Path, kind: Any = Row, read: Callable[[Path], bytes] = read_bytes) -> list[Any]:
-    """The rows of a file, each of type ``kind``; [] if there is no such file.
+def read_rows(path: Path, read: Callable[[Path], bytes] = read_bytes) -> list[Any]:
+    """The rows of a file; [] if there is no such file.
 
     ``read`` reads the content. With a warning, a file that cannot be read is left out, and so are
     all rows from a damaged one on.
@@ -436,7 +424,7 @@ def read_rows(path: Path, kind: Any = Row, read: Callable[[Path], bytes] = read_
     except DamagedError as error:
         log.warning("left out: %s", error)
         return []
-    return [row for _, row in iterate_rows(content, kind, path)]
+    return [row for _, row in iterate_rows(content, Row, path)]
 
 
 def whole_lines(path: Path) -> list[tuple[str, int]]:

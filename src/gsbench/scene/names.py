@@ -127,14 +127,11 @@ class Matching:
     left_out: tuple[str, ...]
 
 
-def match_pictures(
-    photographs: Sequence[str], pictures: Sequence[str], by_order: str = "--by-order"
-) -> Matching:
+def match_pictures(photographs: Sequence[str], pictures: Sequence[str]) -> Matching:
     """Match names (relative paths) by the first rule under which every photograph has a picture.
 
     The rules are `PICTURE_RULES`, from strict to loose. Raises `InputError` if that rule gives a
-    photograph several pictures, or if no rule gives each a picture. ``by_order`` is the option that
-    error messages suggest for `match_by_order`.
+    photograph several pictures, or if no rule gives each a picture.
     """
     missing = photographs  # by the rule that leaves the fewest
     for rule, steps in PICTURE_RULES.items():
@@ -154,7 +151,7 @@ def match_pictures(
         return Matching(pairs, rule, tuple(sorted(set(pictures) - set(pairs.values()))))
     called = some_of(sorted(pictures)) or "there are none"
     is_paired = len(pictures) == len(photographs)
-    hint = f"; {by_order} takes them as they are sorted" if is_paired else ""
+    hint = "; --by-order takes them as they are sorted" if is_paired else ""
     raise InputError(
         f"{len(missing)} of {counted(len(photographs), 'photograph')} have no picture of their "
         f"name ({some_of(missing)}); the pictures are {called}: rename them{hint}"

@@ -88,6 +88,9 @@ class AppliedTransform:
         original: Array = (saved / self.scale - self.matrix[:, 3]) @ self.matrix[:, :3]
         return original
 
+    def equals(self, other: AppliedTransform) -> bool:
+        return self.scale == other.scale and np.array_equal(self.matrix, other.matrix)
+
 
 @dataclass(frozen=True)
 class PointsFile:

@@ -155,9 +155,15 @@ def _points(
     path: Path, record: TransformsRecord, applied: AppliedTransform, known: PointsFile | None
 ) -> PointsFile | None:
     """The points that the file ``path`` names, or those ``known`` from an earlier one."""
-    if known is not None or record.ply_file_path is None:
+    if record.ply_file_path is None:
         return known
     found = PointsFile(path.parent / _relative_path(path, record.ply_file_path), applied)
+    # Points lie in one place, so only one of two transforms can be theirs.
+    if known is not None and not (known.path == found.path and known.applied.equals(applied)):
+        raise InputError(
+            f"{path} names other points than another file, or the same points with another "
+            "applied_transform or applied_scale: keep ply_file_path in the file that they belong to"
+        )
     if not found.path.is_file():
         raise InputError(f"{path} names {record.ply_file_path}, which is not there")
     return found

@@ -5,7 +5,6 @@ import json
 import re
 import sys
 from collections.abc import Mapping, Sequence
-from itertools import chain
 from pathlib import Path
 
 from gsbench.analysis.addresses import CELL, trials_of_arm
@@ -13,12 +12,11 @@ from gsbench.analysis.cells import (
     check_averageable,
     make_cell,
     select_trials,
-    side_by_side,
     to_frame,
     where_words,
     with_variants,
 )
-from gsbench.analysis.comparison import Comparison, chosen, compare, joined
+from gsbench.analysis.comparison import Comparison, chosen, compare
 from gsbench.analysis.fairness import fairness_table
 from gsbench.analysis.paper import (
     layout_of,
@@ -58,14 +56,10 @@ def tables(argv: Sequence[str], runs: Path) -> int:
     if options.experiment == PAPER_NOTES and not (runs / PAPER_NOTES).exists():
         print("\n".join(f"- {line}" for line in load_published().contradictions))
         return 0
-    given = filter(None, (options.experiment, options.other))
-    experiments = [load_experiment(runs, name) for name in given]
-    if options.other is not None:
-        experiments = [*side_by_side(*experiments)]
-    for warning in chain.from_iterable(one.warnings for one in experiments):
+    experiment, where = load_experiment(runs, options.experiment), dict(options.where)
+    for warning in experiment.warnings:
         print(f"left out: {warning}", file=sys.stderr)
-    where = dict(options.where)
-    trials = select_trials([*chain.from_iterable(one.trials for one in experiments)], where)
+    trials = select_trials(experiment.trials, where)
     if options.format in (TRIALS, JSON):
         for name in ("rows", "columns", "metrics", "layout", "paper"):
             if getattr(options, name) is not None:
@@ -73,14 +67,14 @@ def tables(argv: Sequence[str], runs: Path) -> int:
     if options.format == TRIALS:
         texts = {"-trials.csv": csv_of(to_frame(trials))}
     else:
-        comparison = joined([compare(experiment) for experiment in experiments])
+        comparison = compare(experiment)
         if where:
             comparison = chosen(comparison, trials, where_words(where))
         if options.format == JSON:
             texts = {f".{JSON}": json.dumps(comparison.to_json(), indent=1) + "\n"}
         else:
             texts = _tables(comparison, trials, options)
-    _write(texts, options.out, experiments[0].name)
+    _write(texts, options.out, experiment.name)
     return 0
 
 

@@ -26,7 +26,6 @@ from gsbench.analysis.report.curves import (
     quality_charts,
     sweep_charts,
     training_charts,
-    volume_charts,
 )
 from gsbench.analysis.report.where import region_maps
 from gsbench.analysis.results import Experiment, TrialResult, group_by, trials_of
@@ -65,7 +64,6 @@ def build_report(
         tables = [build_table(experiment, trials, comparison=comparison)]
     else:
         tables = paper_tables(experiment, paper_table, trials, comparison=comparison)
-    volumes, volume_notes = volume_charts(trials, arms)
     maps = region_maps(trials, comparison.answers)
     return fill(
         "report.html.j2",
@@ -99,8 +97,6 @@ def build_report(
         ],
         event_table=event_table(trials, arms),
         events=event_charts(trials, arms),
-        volumes=volumes,
-        volume_notes=volume_notes,
         provenance=provenance(trials),
     )
 

@@ -33,34 +33,22 @@ def line_chart(
     series: Sequence[tuple[str, Points]],
     x_label: str,
     y_label: str,
-    log: bool = False,
-    marker: float | None = None,
     log_x: bool = False,
     bars: Mapping[float, Interval] = MappingProxyType({}),
     level: tuple[float, str] | None = None,
 ) -> str:
-    """Named lines over common axes, linear or logarithmic (``log``); "" without points.
+    """Named lines over common axes, of which that of x may be logarithmic; "" without points.
 
-    ``marker`` is the x of a vertical line, ``level`` the y of a named horizontal one, ``bars`` are
-    intervals of y by x. Points that a logarithmic axis cannot show are dropped.
+    ``level`` is the y of a named horizontal line, ``bars`` are intervals of y by x.
     """
-    shown = [
-        (name, [(x, y) for x, y in points if not log or (x > 0 and y > 0)])
-        for name, points in series
-    ]
-    shown = [(name, points) for name, points in shown if points]
+    shown = [(name, points) for name, points in series if points]
     if not shown:
         return ""
     all_points = [point for _, points in shown for point in points]
-    x = Axis(
-        [x for x, _ in all_points] + ([] if marker is None else [marker]),
-        log or log_x,
-        LEFT,
-        WIDTH - RIGHT,
-    )
+    x = Axis([x for x, _ in all_points], log_x, LEFT, WIDTH - RIGHT)
     heights = [y for _, y in all_points] + ([] if level is None else [level[0]])
     heights += [end for bar in bars.values() for end in (bar.low, bar.high)]
-    y = Axis(heights, log, HEIGHT - BOTTOM, TOP)
+    y = Axis(heights, False, HEIGHT - BOTTOM, TOP)
     lines = [
         {
             "name": name,
@@ -76,7 +64,6 @@ def line_chart(
         f"{title}. {y_label} against {x_label}: "
         f"{'; '.join(f'{name} {_ends(points)}' for name, points in shown)}."
     )
-    marked = None if marker is None else (x.to_px(marker), f"V_th {marker:g}")
     return fill(
         "line_chart.html.j2",
         title=title,
@@ -86,7 +73,6 @@ def line_chart(
         y=y,
         x_label=x_label,
         y_label=y_label,
-        marker=marked,
         bars=[(x.to_px(at), y.to_px(bar.low), y.to_px(bar.high)) for at, bar in bars.items()],
         level=None if level is None else (y.to_px(level[0]), level[1]),
         width=WIDTH,
