@@ -207,10 +207,14 @@ def test_retry_of_a_trial_without_a_plan_uses_its_configuration(folders, runs):
     assert allowed_modules()["mine"] == "theirs"
     with refusal("is in no plan, so no setting of it can be changed"):
         trials.recompose(folders[1], None, runs, ["launch=local"], "theirs")
-    again.values["scene"]["downscale"] = 2  # a setting of an earlier version
-    write(folders[1] / "config.yaml", again.values)
-    with refusal("seed1: scene.downscale is not a setting.*: run it by its own command"):
-        trials.recompose(folders[1], None, runs, [], "theirs")
+
+
+def test_a_setting_of_an_earlier_version_is_refused(folders, runs):
+    values = compose_one(split("name=x densify=adc seed=1")).values
+    values["scene"]["downscale"] = 4
+    write(folders[1] / "config.yaml", values)
+    with refusal("scene.downscale is not a setting"):
+        trials.recompose(folders[1], None, runs, [], str(runs.parent))
 
 
 def test_a_trial_from_renders_is_entered_by_its_own_command(folders, runs):
