@@ -35,6 +35,7 @@ from gsbench.analysis.table_formats import (
 from gsbench.analysis.tables import build_table
 from gsbench.words import printable
 from tests.analysis.helpers import loaded, page_of, rows_of, table_of, trials_of
+from tests.analysis.tables import TABLES
 from tests.helpers import refusal
 from tests.markup import Page
 from tests.processes import completed
@@ -141,14 +142,7 @@ def test_the_lpips_of_the_protocol_has_a_column_even_when_it_is_missing(tmp_path
 
 @pytest.mark.parametrize(
     "key, values",
-    [
-        ("iterations", (7000, 30000)),
-        ("raster", ("cpu", "cuda")),
-        ("protocol", ("paper-1", "standard-1")),
-        ("resolution", ([400, 300], [800, 600])),
-        ("budget", ({"max_gaussians": 1, "cap": "soft"}, {"max_gaussians": 2, "cap": "soft"})),
-        ("hashes", ({"data": "a"}, {"data": "b"})),
-    ],
+    TABLES["conditions"],
 )
 def test_a_cell_never_mixes_conditions(tmp_path, key, values):
     for seed, value in enumerate(values):
@@ -388,13 +382,7 @@ def test_latex_compiles(make_experiment, tmp_path):
 
 @pytest.mark.parametrize(
     "counts, heading, cells",
-    [
-        ((512, 640), "Gaussians ↓", ["512", "640"]),
-        ((999, 28_012), "Gaussians ↓", ["999", "28,012"]),
-        ((1000, 28_012), "Gaussians (k) ↓", ["1.0", "28.0"]),
-        ((4000, 3_410_000), "Gaussians (k) ↓", ["4.0", "3,410.0"]),
-        ((100_000, 3_410_000), "Gaussians (M) ↓", ["0.10", "3.41"]),
-    ],
+    TABLES["small counts"],
 )
 def test_a_small_count_keeps_its_digits_on_every_surface(tmp_path, counts, heading, cells):
     for densify, count in zip(("adc", "volumetric"), counts, strict=True):
@@ -409,11 +397,7 @@ def test_a_small_count_keeps_its_digits_on_every_surface(tmp_path, counts, headi
 
 @pytest.mark.parametrize(
     "gaussians, seconds, headings",
-    [
-        (999_999, 599.9, ["Gaussians (k)", "train (s)", "initial points (k)", "total (min)"]),
-        (1_000_000, 600.0, ["Gaussians (M)", "train (min)", "initial points (k)", "total (min)"]),
-        (900, 2.0, ["Gaussians", "train (s)", "initial points (k)", "total (s)"]),
-    ],
+    TABLES["units"],
 )
 def test_counts_from_a_thousand_and_times_from_ten_minutes_have_the_larger_unit(
     tmp_path, gaussians, seconds, headings
