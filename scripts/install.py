@@ -57,7 +57,9 @@ def main(words: list[str]) -> int:
     print(f"installing {what} by pip, some minutes", flush=True)
     install = ["install", "--quiet", "--no-compile"]
     # 25.1 is the first version with --group
-    subprocess.run([*pip, *install, "pip>=25.1"], check=False)
+    newer = subprocess.run([*pip, *install, "pip>=25.1"], check=False)
+    if newer.returncode and pip != OWN_PIP:  # as without an index of packages
+        make_pip()
     return subprocess.run([*OWN_PIP, *install, *CONSTRAINTS, *words], check=False).returncode
 
 
@@ -70,8 +72,13 @@ def find_pip() -> list[str]:
         return OWN_PIP
     if subprocess.run([*BASE_PIP, "--version"], capture_output=True, check=False).returncode == 0:
         return BASE_PIP
-    subprocess.run([sys.executable, "-m", "ensurepip"], stdout=subprocess.DEVNULL, check=False)
+    make_pip()
     return OWN_PIP
+
+
+def make_pip() -> None:
+    """Give this environment the pip that Python brings along."""
+    subprocess.run([sys.executable, "-m", "ensurepip"], stdout=subprocess.DEVNULL, check=False)
 
 
 def find_uv(pip: list[str]) -> str | None:

@@ -54,3 +54,20 @@ def test_an_environment_without_pip_uses_that_of_its_base_else_makes_one(
     monkeypatch.setattr(install.subprocess, "run", run)
     assert install.find_pip() == getattr(install, used)
     assert ("ensurepip" in ran[-1]) == bool(base_fails)
+
+
+@pytest.mark.parametrize("newer, made", [(0, False), (1, True)])
+def test_an_environment_without_pip_gets_pythons_own_if_no_newer_one_is_found(
+    install, monkeypatch, newer, made
+):
+    ran = []
+
+    def run(command, **_):
+        ran.append(command)
+        return subprocess.CompletedProcess(command, newer if "pip>=25.1" in command else 0)
+
+    monkeypatch.setattr(install, "find_uv", lambda pip: None)
+    monkeypatch.setattr(install, "find_pip", lambda: install.BASE_PIP)
+    monkeypatch.setattr(install.subprocess, "run", run)
+    assert install.main(["-e", "."]) == 0
+    assert any("ensurepip" in command for command in ran[:-1]) == made

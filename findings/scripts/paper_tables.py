@@ -8,8 +8,8 @@
 the experiment is there. It then trains scene by scene and seed by seed what has no result yet: all
 arms of a scene and seed by one command. It can be killed and started again at any time, and two
 processes can train different scenes. ``save`` writes the archive, with all trials so far, and
-beside it ``EXPERIMENT.csv`` with what archives lack and a machine that is gone cannot tell: the
-share of volumes below V_th, and the CPU time of a seed's trainings.
+beside it ``EXPERIMENT.csv`` with what archives lack: the share of volumes below V_th. (The CPU time
+is that of trainings one by one, by an earlier form of ``train``.)
 """
 
 from __future__ import annotations
@@ -18,11 +18,9 @@ import csv
 import json
 import os
 import re
-import resource
 import subprocess
 import sys
 import tempfile
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -33,9 +31,9 @@ from gsbench.claims.archive import unpack_archive
 FINDINGS = Path(__file__).resolve().parents[1]
 LINE = re.compile(r"^(\w+) +(?P<scene>\S+?)/\S+ seed (?P<seed>\d+) \(\w+\)")
 THRESHOLD = 0.03  # V_th of the paper
+GIVEN = "dataset-"  # in the names of arms that start from the scene's own cloud
 PAGE = FINDINGS / "paper_tables.md"
 STATE, END = "<!-- state {} -->", "<!-- end -->"  # around the table of an experiment
-MEASURED = "measured_here.csv"  # in the experiment's folder: CPU time of each training
 FIELDS = ("trial", "cpu_seconds", "gaussians", "share_below_threshold")
 
 
@@ -71,14 +69,10 @@ def train(clone: Path, experiment: str, *scenes: str) -> None:
         python = clone / ".venv/bin/python"
         subprocess.run([python, "-c", code, archive, home.parent], check=True)
     while todo := missing(clone, experiment, list(scenes)):
-        (scene, seed), before = todo[0], resource.getrusage(resource.RUSAGE_CHILDREN)
+        scene, seed = todo[0]
         print(f"{len(todo)} seeds to go: {scene}, seed {seed}", flush=True)
         one = [f"scene.path={os.environ['GSBENCH_DATA']}/{scene}", f"seed={seed}"]
         done = gsbench(clone, *words_of(clone, experiment), *one)
-        after = resource.getrusage(resource.RUSAGE_CHILDREN)
-        spent = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-        with (home / MEASURED).open("a") as stream:
-            stream.write(f"{scene}-{seed},{spent:.0f}\n")
         print(done.stdout[-2000:], flush=True)
         if done.returncode:
             sys.exit(done.returncode)
@@ -110,18 +104,13 @@ def save(clone: Path, experiment: str) -> None:
     if table.exists():
         with table.open() as stream:
             rows = {row["trial"]: row for row in csv.DictReader(stream)}
-    spent = Counter[str]()  # a training that was killed and continued has several lines
-    if (home / MEASURED).exists():
-        for line in (home / MEASURED).read_text().split():
-            trial, seconds = line.split(",")
-            spent[trial] += int(seconds)
     for results in sorted(home.glob("*/*/*-seed*/results.json")):
         scene, arm, trial = results.relative_to(home).parts[:3]
-        name = f"{scene}-{arm.partition('-')[2]}-{trial.partition('-seed')[2]}"
+        name = f"{scene}-{arm.removeprefix(GIVEN)}-{trial.partition('-seed')[2]}"
         model = results.parent / "point_cloud.ply"
         if model.exists():  # else it was trained elsewhere, and is in the files already
             count, share = share_below(model)
-            values = (name, str(spent.get(name, "")), str(count), f"{share:.6f}")
+            values = (name, "", str(count), f"{share:.6f}")
             rows[name] = dict(zip(FIELDS, values, strict=True))
     with table.open("w", newline="") as stream:
         writer = csv.DictWriter(stream, FIELDS, lineterminator="\n")
@@ -146,19 +135,24 @@ def state_table(experiment: str) -> str:
     table = ["| trial | PSNR | SSIM | LPIPS VGG raw | Gaussians | volumes ≤ V_th | CPU-s |"]
     table += ["|---|--:|--:|--:|--:|--:|--:|"]
     for trial in sorted(results_in(archives / f"{experiment}.zip"), key=_order):
-        own = beside[f"{trial['scene']}-{trial['densify']}-{trial['seed']}"]
+        own = beside[f"{trial['scene']}-{arm_of(trial)}-{trial['seed']}"]
         psnr, ssim, lpips = (trial["metrics"][key] for key in ("psnr", "ssim", "lpips_vgg_raw"))
         share = 100 * float(own["share_below_threshold"])
         table.append(
-            f"| {trial['scene']}, {trial['densify']}, seed {trial['seed']} | {psnr:.2f} | "
+            f"| {trial['scene']}, {arm_of(trial)}, seed {trial['seed']} | {psnr:.2f} | "
             f"{ssim:.3f} | {lpips:.4f} | {trial['num_gaussians']:,} | {share:.2f} % | "
             f"{own['cpu_seconds'] or '–'} |"
         )
     return "\n".join(table) + "\n"
 
 
+def arm_of(trial: dict[str, Any]) -> str:
+    """The arm of a result, such as sfm-adc; without the initialiser if that is ``dataset``."""
+    return f"{trial['init']}-{trial['densify']}".removeprefix(GIVEN)
+
+
 def _order(trial: dict[str, Any]) -> tuple[str, int, str]:
-    return trial["scene"], trial["seed"], trial["densify"]
+    return trial["scene"], trial["seed"], arm_of(trial)
 
 
 def with_state(page: str, experiment: str) -> str:

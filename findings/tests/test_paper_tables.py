@@ -42,7 +42,7 @@ def test_regions_light_up_in_at_most_five_of_a_hundred_reports_of_one_arm():
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_what_lies_beside_the_archive_has_its_trials(experiment):
     results = {
-        f"{each['scene']}-{each['densify']}-{each['seed']}": each
+        f"{each['scene']}-{paper_tables.arm_of(each)}-{each['seed']}": each
         for each in paper_tables.results_in(ARCHIVES / f"{experiment}.zip")
     }
     with (ARCHIVES / f"{experiment}.csv").open() as stream:

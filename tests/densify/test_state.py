@@ -1,6 +1,6 @@
 """The state of every densifier: statistics that follow edits, lineage, saving, and causes."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ from gsbench.densify import (
     Volumetric,
 )
 from gsbench.densify.scores import standard_normal
-from tests.densify.helpers import generator, trained
+from tests.densify.helpers import generator, rendered, trained
 from tests.gaussians.helpers import random_gaussians
 
 
@@ -87,6 +87,20 @@ def test_a_subclass_adds_to_the_statistics_of_its_base():
 
     assert list(Own.STATISTICS) == [*ADC.STATISTICS, "hits"]
     assert Volumetric.STATISTICS == ADC.STATISTICS
+
+
+def test_a_subclass_may_have_its_own_length_of_gradients():
+    class Doubled(ADC):
+        def screen_gradient(self, render):
+            return 2 * super().screen_gradient(render)
+
+    points = torch.zeros(2, 2, requires_grad=True)
+    points.grad = torch.tensor([[3.0, 4.0], [1.0, 0.0]])
+    for make, factor in (ADC, 1), (Doubled, 2):
+        densifier = make()
+        densifier.begin(random_gaussians(2).map(torch.Tensor.float), DensifyContext(1.0))
+        densifier.observe(1, replace(rendered(points.grad, [1, 0]), screen_points=points))
+        assert densifier.statistics["gradient_sum"].tolist() == [5 * factor, 0]
 
 
 def test_an_event_balances_only_if_its_counts_add_up():

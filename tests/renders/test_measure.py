@@ -136,6 +136,13 @@ def test_settings_without_effect_on_renders_are_refused(trial, runs, refused, wo
     assert said in refused("evaluate", trial / "renders", "--truth", trial, word)
 
 
+def test_the_photographs_may_be_those_of_a_trial_by_an_earlier_version(trial, said):
+    config = read_json(trial / "config.yaml")
+    config["eval"] |= {"fps": None, "more": ["psnr_cc"], "primary": "psnr_cc"}  # gone since
+    write(trial / "config.yaml", config)
+    assert "protocol paper-1" in said("evaluate", trial / "renders", "--truth", "exp:garden:adc")
+
+
 def test_photographs_are_found_by_trial_folder_and_address(trial, runs, tmp_path, refused, said):
     other = trial.with_name("deadbeef-seed0")  # the same arm with another setting
     shutil.copytree(trial, other)

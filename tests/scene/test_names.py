@@ -46,6 +46,7 @@ def test_matching_by_order_sorts_numbers_by_value():
         match_by_order(["a1.png", "a2.png", "a10.png"], ["0.png", "1.png", "2.png"])
     with refusal("2 pictures for 3 photographs"):
         match_by_order(["a", "b", "c"], ["1", "2"])
+    assert match_by_order(["m1²2.png"], ["a.png"]).pairs  # ² is a digit that int() refuses
 
 
 @given(

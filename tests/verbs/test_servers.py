@@ -17,7 +17,7 @@ import pytest
 import torch
 
 from gsbench.runs.experiments import make_home
-from gsbench.tracking import connect
+from gsbench.tracking import connect, sync
 from gsbench.verbs import servers
 from tests.helpers import write
 from tests.tracking.helpers import ended_trial
@@ -121,6 +121,21 @@ def test_the_dashboard_gets_first_what_it_lacks(runs, said, monkeypatch):
     found = client.get_experiment_by_name("mine")
     kinds = {run.data.tags["kind"] for run in client.search_runs([found.experiment_id])}
     assert kinds == {"trial", "idea"}
+
+
+def test_a_trial_that_cannot_be_sent_leaves_the_dashboard(runs, served, said, monkeypatch):
+    """Nothing can be noted in the runs folder of somebody else."""
+    ended_trial(runs, name="mine", enabled=False)
+
+    def refuse(*_):
+        raise PermissionError("not yours")
+
+    monkeypatch.setattr(sync, "write_json", refuse)
+    lines = said("ui").splitlines()
+    assert lines[0].startswith("ideas")
+    assert lines[2].startswith("left out: a_scene/")
+    assert "not yours" in lines[2]
+    assert len(served) == 1
 
 
 def test_no_second_server_is_started(runs, served, said, monkeypatch):

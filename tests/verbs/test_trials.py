@@ -201,6 +201,14 @@ def test_retry_of_a_trial_without_a_plan_uses_its_configuration(folders, runs):
         trials.recompose(folders[1], None, runs, ["launch=local"], "theirs")
 
 
+def test_a_setting_of_an_earlier_version_is_refused(folders, runs):
+    values = compose_one(split("name=x densify=adc seed=1")).values
+    values["scene"]["downscale"] = 4
+    write(folders[1] / "config.yaml", values)
+    with refusal("scene.downscale is not a setting"):
+        trials.recompose(folders[1], None, runs, [], str(runs.parent))
+
+
 def test_a_trial_from_renders_is_entered_by_its_own_command(folders, runs):
     values = compose_one(split("name=x densify=adc seed=1")).values
     values["densify"]["evaluated_from"] = "renders"

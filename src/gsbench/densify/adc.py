@@ -99,14 +99,15 @@ class ADC(Budgeted):
         """Gather the statistics of an iteration within the window."""
         gradient, statistics = self.gradient_of(render), self.statistics
         names = "gradient_sum", "visible_count", "max_radii"
-        if (gradient.device.type, gradient.dtype) == ("cpu", torch.float32):
+        is_own = type(self).screen_gradient is not ADC.screen_gradient  # of a user's subclass
+        if not is_own and (gradient.device.type, gradient.dtype) == ("cpu", torch.float32):
             from gsbench.raster.cpu.statistics import add_view
 
             tensors = render.radii, gradient, *(statistics[name] for name in names)
             add_view(*(tensor.numpy() for tensor in tensors))
             return
         visible = render.visible
-        statistics["gradient_sum"] += torch.where(visible, gradient.norm(dim=-1), 0.0)
+        statistics["gradient_sum"] += torch.where(visible, self.screen_gradient(render), 0.0)
         statistics["visible_count"] += visible
         statistics["max_radii"] = torch.maximum(statistics["max_radii"], render.radii)
 

@@ -3,6 +3,7 @@
 import argparse
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from gsbench.config.command_words import typed_permissions
 from gsbench.config.compose import compose_one
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator, summarize
-from gsbench.eval.facts import METRICS
+from gsbench.eval.facts import METRICS, further_keys
 from gsbench.eval.options import EvalConfig
 from gsbench.eval.pictures import PicturePair, check_pairs, measure
 from gsbench.files import storage_errors
@@ -106,6 +107,7 @@ def _pair_up(
     ], matching
 
 
+SETTINGS = [entry.name for entry in fields(EvalConfig)]
 # settings of an evaluation that renders of another program do not use
 WITHOUT_EFFECT = ("eval.at", "eval.controls", "eval.regions")
 
@@ -153,8 +155,12 @@ def _evaluator(truth: ReferenceImages, protocol: str | None, settings: Sequence[
     if any(word.startswith("eval") for word in settings):
         of_evaluation = [word for word in settings if word.startswith(("eval", f"{PERMISSIONS}="))]
         config = compose_one(of_evaluation).values
-    chosen = dict(config["eval"]) | ({} if protocol is None else {"protocol": protocol})
+    # A trial of an earlier version may have settings and metrics that are gone.
+    chosen = {key: config["eval"][key] for key in SETTINGS if key in config["eval"]}
+    chosen["more"] = [key for key in chosen.get("more", []) if key in further_keys()]
+    chosen |= {} if protocol is None else {"protocol": protocol}
     own = build_metrics(chosen, list(allowed))
+    chosen["primary"] = None  # nothing is judged here
     return make_evaluator(EvalConfig(**chosen), select_device(config.get("device", "auto")), own)
 
 

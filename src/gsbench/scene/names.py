@@ -214,7 +214,7 @@ def _unpadded(words: Sequence[str]) -> list[str]:
 
 def _by_value(name: str) -> list[tuple[int, int, str]]:
     parts = re.split(r"(\d+)", _flat([name])[0])
-    return [(1, int(part), part) if part.isdigit() else (0, 0, part) for part in parts]
+    return [(1, int(part), part) if part.isdecimal() else (0, 0, part) for part in parts]
 
 
 def _keys(names: Sequence[str], steps: Sequence[Step]) -> dict[str, str]:

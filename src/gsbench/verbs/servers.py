@@ -87,8 +87,11 @@ def ui(argv: Sequence[str], runs: Path) -> int:
     server = uri if is_served else f"http://127.0.0.1:{options.port}"
     pages, sent = {"dashboard": server}, list[str]()
     if home is not None:
+        try:  # a runs folder may be another's, and a trial's tracker another one
+            sent.extend(send_missing(_trials_in(home), options.uri))
+        except (MirrorError, OSError) as error:
+            sent.append(f"left out: {error}")
         try:
-            sent = list(send_missing(_trials_in(home), options.uri))
             pages = addresses(server, show_ideas(home, uri))
         except Exception as error:  # any error of the tracker's client
             raise InputError(

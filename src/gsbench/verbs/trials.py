@@ -20,6 +20,7 @@ from rich.text import Text
 from gsbench.config.command_words import makes_other_trials, parse, typed_permissions
 from gsbench.config.compose import Trial, compose_one
 from gsbench.config.overrides import changed_words, key_of
+from gsbench.config.schema import check
 from gsbench.errors import InputError
 from gsbench.files import make_runs_folder
 from gsbench.launch.estimates import describe_plan
@@ -205,7 +206,7 @@ def recompose(
         raise InputError(
             f"{files.label} was entered from renders: give the command of `gsbench evaluate` again"
         )
-    return Trial(values, ())
+    return Trial(check(values), ())  # an earlier version had settings that are gone
 
 
 def declare(argv: Sequence[str], runs: Path) -> int:
