@@ -126,6 +126,29 @@ def caplog(caplog):
 
 
 @pytest.fixture
+def logged(caplog):
+    """Catch gsbench's log lines from the level INFO on."""
+    caplog.set_level("INFO", "gsbench")
+    return caplog
+
+
+@pytest.fixture
+def no_weights(tmp_path, monkeypatch):
+    """An empty place for downloaded weights, and no other place that has some."""
+    monkeypatch.delenv("GSBENCH_WEIGHTS", raising=False)
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
+    return tmp_path / "torch/hub/checkpoints"
+
+
+@pytest.fixture
+def ran(monkeypatch):
+    """The trials that a verb would run."""
+    given = []
+    monkeypatch.setattr("gsbench.app.command.run_trials", lambda trials: given.extend(trials) or 0)
+    return given
+
+
+@pytest.fixture
 def small_disk(tmp_path):
     """A file system of three MiB; skips the test if this user may not mount one."""
     disk = tmp_path / "disk"

@@ -1,7 +1,6 @@
 """Downloads try again after failures that may pass, and say in one line why they gave up."""
 
 import hashlib
-import logging
 import time
 from types import SimpleNamespace
 
@@ -41,12 +40,11 @@ def refusal(status):
     return failures.HTTPError(f"{status} error", response=answer)
 
 
-def test_pauses_double_up_to_a_limit(pauses, caplog):
-    caplog.set_level(logging.INFO, "gsbench")
+def test_pauses_double_up_to_a_limit(pauses, logged):
     lost = [failures.ConnectionError("lost") for _ in range(7)]
     assert with_retries(failing(lost), URL, RetryPolicy(tries=8)) == "done"
     assert pauses == [1, 2, 4, 8, 16, 30, 30]
-    assert caplog.messages[:2] == ["lost: trying again in 1 s", "lost: trying again in 2 s"]
+    assert logged.messages[:2] == ["lost: trying again in 1 s", "lost: trying again in 2 s"]
 
 
 def test_the_last_try_ends_with_an_error_without_a_pause(pauses):

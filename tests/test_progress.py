@@ -1,28 +1,25 @@
 """Progress in a log: some lines, and always the last one."""
 
 import io
-import logging
 import sys
 
 from gsbench.logs import SECONDS_BETWEEN_LINES, no_progress, progress
 
 
-def test_a_log_gets_the_first_line_of_a_phase_and_the_last(caplog):
-    caplog.set_level(logging.INFO, "gsbench")
+def test_a_log_gets_the_first_line_of_a_phase_and_the_last(logged):
     with progress("train") as report:
         for done in range(1, 5):
             report("iteration", done, 4)
         report("iteration", 4, 4)  # logged already
         report("export", 1, 1)
-    assert [record.getMessage().rstrip() for record in caplog.records] == [
+    assert [record.getMessage().rstrip() for record in logged.records] == [
         "train: iteration 1/4",
         "train: iteration 4/4",
         "train: export 1/1",
     ]
 
 
-def test_a_log_gets_a_line_from_time_to_time(caplog, monkeypatch):
-    caplog.set_level(logging.INFO, "gsbench")
+def test_a_log_gets_a_line_from_time_to_time(logged, monkeypatch):
     now = 1000.0
     monkeypatch.setattr("time.monotonic", lambda: now)
     with progress("fetch") as report:
@@ -35,7 +32,7 @@ def test_a_log_gets_a_line_from_time_to_time(caplog, monkeypatch):
         ):
             report("a", done, None, f"note {done}")
         report("a", 0, 0)
-    assert [message.rstrip() for message in caplog.messages] == [
+    assert [message.rstrip() for message in logged.messages] == [
         "fetch: a 0/?",
         "fetch: a 2/? note 2",
         "fetch: a 4/? note 4",

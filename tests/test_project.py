@@ -12,6 +12,9 @@ from tests.conftest import ROOT, script
 from tests.helpers import table
 
 PUBLIC = {"pypi.org", "files.pythonhosted.org"}
+PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+MAKEFILE = (ROOT / "Makefile").read_text()
+LOCK = (ROOT / "uv.lock").read_text()
 WORKFLOWS = sorted((ROOT / ".github/workflows").glob("*.yml"))
 
 
@@ -26,7 +29,7 @@ def constraints():
 
 
 def locked():
-    return tomllib.loads((ROOT / "uv.lock").read_text())["package"]
+    return tomllib.loads(LOCK)["package"]
 
 
 def names(requirements):
@@ -54,8 +57,7 @@ def test_the_lock_has_the_versions_of_the_constraints():
 
 def test_the_lock_has_the_requirements_of_the_project_file():
     (own,) = (package for package in locked() if "editable" in package["source"])
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    groups = tomllib.loads((ROOT / "pyproject.toml").read_text())["dependency-groups"]
+    project, groups = PYPROJECT["project"], PYPROJECT["dependency-groups"]
     asked = [
         *project["dependencies"],
         *(line for extra in project["optional-dependencies"].values() for line in extra),
@@ -68,16 +70,12 @@ def test_the_lock_has_the_requirements_of_the_project_file():
         assert {entry["name"] for entry in own["metadata"]["requires-dev"][group]} == names(
             lines
         ), "make lock"
-    assert (
-        tomllib.loads((ROOT / "uv.lock").read_text())["requires-python"]
-        == project["requires-python"]
-    ), "make lock"
+    assert tomllib.loads(LOCK)["requires-python"] == project["requires-python"], "make lock"
 
 
 def test_the_lock_names_public_addresses_only():
-    text = (ROOT / "uv.lock").read_text()
     assert {
-        urlsplit(address).hostname for address in re.findall(r'"([a-z+]+://[^"]*)"', text)
+        urlsplit(address).hostname for address in re.findall(r'"([a-z+]+://[^"]*)"', LOCK)
     } == PUBLIC
     sources = [package["source"] for package in locked()]
     assert {*map(tuple, sources)} == {("registry",), ("editable",)}
@@ -99,7 +97,7 @@ def test_the_pre_commit_hook_uses_the_pinned_ruff():
 
 @pytest.mark.parametrize("workflow", WORKFLOWS, ids=lambda path: path.stem)
 def test_workflows_call_existing_targets_and_files(workflow):
-    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    targets = set(re.findall(r"^([a-z-]+):", MAKEFILE, re.MULTILINE))
     called = {
         name
         for step in steps(workflow)
@@ -113,17 +111,14 @@ def test_workflows_call_existing_targets_and_files(workflow):
 
 def test_the_scripts_that_make_calls_exist():
     assert [
-        name
-        for name in re.findall(r"scripts/\S+", (ROOT / "Makefile").read_text())
-        if not (ROOT / name).is_file()
+        name for name in re.findall(r"scripts/\S+", MAKEFILE) if not (ROOT / name).is_file()
     ] == []
 
 
 def test_every_target_for_tests_is_called_by_a_workflow_and_by_ci():
-    makefile = (ROOT / "Makefile").read_text()
     wanted = {
         name
-        for name in re.findall(r"^([a-z-]+):.*##", makefile, re.MULTILINE)
+        for name in re.findall(r"^([a-z-]+):.*##", MAKEFILE, re.MULTILINE)
         if name.startswith("test")
     }
     wanted |= {"lint", "docs"}
@@ -136,8 +131,7 @@ def test_every_target_for_tests_is_called_by_a_workflow_and_by_ci():
 def test_linux_is_tested_from_the_oldest_supported_python():
     (tests,) = (path for path in WORKFLOWS if path.stem == "tests")
     tested = yaml.safe_load(tests.read_text())["jobs"]["linux"]["strategy"]["matrix"]["python"]
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert project["requires-python"] == f">={tested[0]}"
+    assert PYPROJECT["project"]["requires-python"] == f">={tested[0]}"
     assert tested == sorted(tested, key=lambda version: int(version.split(".")[1]))
 
 

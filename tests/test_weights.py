@@ -1,7 +1,6 @@
 """Weights files: search, download, and refusal of wrong files."""
 
 import hashlib
-import logging
 import pickle
 from pathlib import Path
 
@@ -22,6 +21,7 @@ from gsbench.weights import (
 from tests.datasets.server import Manners, serve
 from tests.helpers import refusal, write
 
+pytestmark = pytest.mark.usefixtures("no_weights")
 STATE = {"a.weight": torch.arange(6.0).reshape(2, 3), "a.bias": torch.zeros(2)}
 
 
@@ -30,18 +30,11 @@ def spec(content=None, url=None, digits=64, name="net.pth"):
     return WeightsFile((name, f"other/{name}"), url, sha256, "" if url else "example.org")
 
 
-@pytest.fixture(autouse=True)
-def empty_caches(tmp_path, monkeypatch):
-    monkeypatch.delenv("GSBENCH_WEIGHTS", raising=False)
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
-    return tmp_path / "torch/hub/checkpoints"
-
-
-def test_search_order_is_argument_environment_cache(tmp_path, empty_caches, monkeypatch):
+def test_search_order_is_argument_environment_cache(tmp_path, no_weights, monkeypatch):
     places = [
         tmp_path / "argument/deep/below",
         tmp_path / "environment/other",
-        empty_caches,
+        no_weights,
     ]
     for place in places:
         write(place / "net.pth", b"x")
@@ -77,11 +70,11 @@ def test_a_copy_has_a_name_and_a_checksum_of_its_own(tmp_path):
         find_weights(named, tmp_path)
 
 
-def test_only_the_cache_is_not_searched_below(empty_caches, monkeypatch):
-    write(empty_caches / "deep/net.pth", b"x")
+def test_only_the_cache_is_not_searched_below(no_weights, monkeypatch):
+    write(no_weights / "deep/net.pth", b"x")
     with pytest.raises(MissingWeightsError, match="it has no address to download from"):
         find_weights(spec())
-    monkeypatch.setenv("GSBENCH_WEIGHTS", str(empty_caches.parent))
+    monkeypatch.setenv("GSBENCH_WEIGHTS", str(no_weights.parent))
     assert find_weights(spec()).parent.name == "deep"
     monkeypatch.delenv("TORCH_HOME")
     monkeypatch.setenv("XDG_CACHE_HOME", "/x")
@@ -107,9 +100,9 @@ def test_after_a_failed_download_no_other_is_tried(monkeypatch):
     assert asked == [("http://a", downloads.RetryPolicy(timeout=10.0, tries=1))]
 
 
-def test_users_files_without_a_published_checksum_are_known_by_their_digest(tmp_path, empty_caches):
+def test_users_files_without_a_published_checksum_are_known_by_their_digest(tmp_path, no_weights):
     """Such a file may be any, so that it belongs into the keys of results; a download may not."""
-    write(empty_caches / "net.pth", b"downloaded")
+    write(no_weights / "net.pth", b"downloaded")
     assert digests_of_unpinned([spec()]) == []
     (tmp_path / "net.pth").write_bytes(b"mine")
     digest = hashlib.sha256(b"mine").hexdigest()
@@ -118,7 +111,7 @@ def test_users_files_without_a_published_checksum_are_known_by_their_digest(tmp_
 
 @pytest.mark.parametrize("digits", [16, 64])
 def test_a_file_with_a_wrong_checksum_is_refused_unless_a_right_copy_is_found(
-    tmp_path, empty_caches, digits
+    tmp_path, no_weights, digits
 ):
     folder = tmp_path / "mine"
     write(folder / "net.pth", b"truncat")
@@ -126,8 +119,8 @@ def test_a_file_with_a_wrong_checksum_is_refused_unless_a_right_copy_is_found(
         MissingWeightsError, match=r"net.pth has sha256 .* wrong or truncated; replace it"
     ):
         find_weights(spec(b"truncated", digits=digits), folder)
-    write(empty_caches / "net.pth", b"truncated")
-    assert find_weights(spec(b"truncated", digits=digits), folder).parent == empty_caches
+    write(no_weights / "net.pth", b"truncated")
+    assert find_weights(spec(b"truncated", digits=digits), folder).parent == no_weights
 
 
 def test_missing_files_are_named_together_with_places_and_sources(tmp_path):
@@ -159,17 +152,16 @@ def served(server, content):
     return f"{server.url}/served.bin"
 
 
-def test_a_download_logs_its_progress_and_is_kept(server, empty_caches, caplog):
-    caplog.set_level(logging.INFO, "gsbench")
+def test_a_download_logs_its_progress_and_is_kept(server, no_weights, logged):
     content = b"g" * 2_500_000
     url = served(server, content)
     for _ in range(2):
-        assert find_weights(spec(content, url)) == empty_caches / "net.pth"
-    assert (empty_caches / "net.pth").read_bytes() == content
+        assert find_weights(spec(content, url)) == no_weights / "net.pth"
+    assert (no_weights / "net.pth").read_bytes() == content
     assert len(server.requests) == 1
-    lines = [record.getMessage() for record in caplog.records if record.name.startswith("gsbench")]
+    lines = [record.getMessage() for record in logged.records if record.name.startswith("gsbench")]
     assert lines == [
-        f"downloading net.pth (2.5 MB) from {url} to {empty_caches}",  # before anything has come
+        f"downloading net.pth (2.5 MB) from {url} to {no_weights}",  # before anything has come
         "weights: net.pth 1048576/2500000 1.05 MB of 2.5 MB",
         "weights: net.pth 2500000/2500000 2.5 MB of 2.5 MB",
     ]
@@ -187,12 +179,12 @@ def test_a_download_logs_its_progress_and_is_kept(server, empty_caches, caplog):
     ],
 )
 def test_download_that_ends_early_or_is_damaged_leaves_nothing(
-    server, empty_caches, content, manners, said
+    server, no_weights, content, manners, said
 ):
     server.manners = manners
     with pytest.raises(MissingWeightsError, match=said):
         find_weights(spec(b"good", served(server, content)))
-    assert list(empty_caches.iterdir()) == []
+    assert list(no_weights.iterdir()) == []
 
 
 @pytest.mark.parametrize("name", ["net.pth", "net.safetensors", "net-pth"])

@@ -17,6 +17,7 @@ from gsbench.runs.trial_record import (
 )
 from gsbench.verbs.results import explain_cell
 from tests.analysis.helpers import ADC, VOLUMETRIC, loaded, page_of, table_of
+from tests.analysis.tables import TABLES
 from tests.helpers import read_json, write
 from tests.trials import with_record, write_runs, write_trial
 
@@ -30,16 +31,7 @@ def trials_of(tmp_path, **plan):
 
 @pytest.mark.parametrize(
     "counts, said",
-    [
-        ({"garden": (100, 128)}, "28 % more"),
-        ({"garden": (100, 60)}, "40 % fewer"),
-        ({"garden": (100, 200), "stump": (300, 200)}, ""),  # equal totals
-        ({"garden": (100, 100), "stump": (300, 400)}, "25 % more"),
-        # over the scenes where all counts are known
-        ({"garden": (100, 150), "stump": (0, 400)}, "50 % more"),
-        ({"garden": (1000, 1010)}, ""),
-        ({"garden": (1000, 979)}, "2 % fewer"),
-    ],
+    TABLES["unequal counts"],
 )
 def test_unequal_counts_are_stated_over_the_scenes_that_both_arms_have(tmp_path, counts, said):
     made = trials_of(tmp_path, scenes=list(counts))

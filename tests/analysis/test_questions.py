@@ -21,6 +21,7 @@ from gsbench.analysis.questions import (
 from gsbench.analysis.trial_result import Planned
 from gsbench.runs.commands import Command, History
 from gsbench.runs.experiments import Arm
+from tests.analysis.tables import TABLES
 from tests.helpers import refusal
 
 PSNR = Asked(metric="psnr", least=0.1)
@@ -61,7 +62,7 @@ def test_all_levels_of_one_idea_sum_to_twice_the_rate_and_half_of_each_is_for_be
 
 @pytest.mark.parametrize(
     "looks, shares",
-    [(1, (1,)), (2, (0.4, 0.6)), (3, (0.2, 0.2, 0.6)), (5, (0.05, 0.05, 0.1, 0.2, 0.6))],
+    TABLES["shares of looks"],
 )
 def test_the_last_look_has_sixty_percent_and_each_earlier_one_half_of_the_rest(looks, shares):
     assert look_shares(looks) == pytest.approx(shares)

@@ -31,6 +31,7 @@ from gsbench.analysis.report.curves import (
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.statistics import Interval
 from tests.analysis.helpers import ADC, VOLUMETRIC, loaded, page_of, rows_of, trials_of
+from tests.analysis.tables import TABLES
 from tests.helpers import write
 from tests.markup import Page
 from tests.trials import ask_about, search_record, write_arms, write_runs, write_trial
@@ -312,19 +313,7 @@ def test_ticks_are_at_round_values_with_matching_labels(values, log, ticks, labe
 
 @pytest.mark.parametrize(
     "value, text",
-    [
-        (0, "0"),
-        (1e-4, "0.0001"),
-        (9e-5, "9e−05"),
-        (-0.0234, "−0.0234"),
-        (999.4, "999"),
-        (1000, "1000"),
-        (9999, "9999"),
-        (1e4, "10k"),
-        (26_100, "26.1k"),
-        (1e6, "1M"),
-        (-2.5e6, "−2.5M"),
-    ],
+    TABLES["short numbers"],
 )
 def test_a_short_number_has_three_digits(value, text):
     assert short_number(value) == text

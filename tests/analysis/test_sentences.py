@@ -7,6 +7,7 @@ import pytest
 
 from gsbench.analysis.notes import SENTENCES, Note
 from gsbench.words import FORM
+from tests.analysis.tables import TABLES
 from tests.conftest import ROOT
 
 FIELD = re.compile(r"\{(\w+)(?::([^{}]*))?\}")
@@ -74,16 +75,7 @@ def test_the_facts_of_a_note_are_kept_and_compared():
 
 @pytest.mark.parametrize(
     "form, said",
-    [
-        ("{n:n trial}", "1 trial"),
-        ("{names:few}", "a, b, c and 1 more"),
-        ("{names:all}", "a, b, c and d"),
-        ("{names:list}", "a, b, c, d"),
-        ("{names:parts}", "a; b; c; d"),
-        ("{none:if: (%)}", ""),
-        ("{n:if: (%)}", " (1)"),
-        ("{share:.0%}", "50%"),
-    ],
+    TABLES["forms of facts"],
 )
 def test_facts_are_formatted(form, said):
     facts = {"n": 1, "names": tuple("abcd"), "none": "", "share": 0.5}

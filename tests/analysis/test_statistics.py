@@ -22,6 +22,7 @@ from gsbench.analysis.statistics import (
     outcome_of,
     t_test,
 )
+from tests.analysis.tables import TABLES
 from tests.conftest import script
 from tests.helpers import refusal
 
@@ -72,18 +73,7 @@ def test_without_spread_p_is_zero_or_for_no_difference_one():
 
 @pytest.mark.parametrize(
     "interval, sign, expected",
-    [
-        ((0.1, 2.0), 1, "supported"),
-        ((0.1, 2.0), -1, "refuted"),
-        ((-2.0, -0.1), -1, "supported"),
-        ((-2.0, -0.1), 1, "refuted"),
-        ((-0.4, 0.4), 1, "too small to matter"),
-        ((0.1, 0.4), 1, "too small to matter"),
-        ((-0.1, 0.6), 1, "undecided"),
-        ((-0.4, 0.4), 0, "supported"),
-        ((0.6, 2.0), 0, "refuted"),
-        ((0.1, 2.0), 0, "undecided"),
-    ],
+    TABLES["outcomes of intervals"],
 )
 def test_the_interval_alone_decides_the_outcome(interval, sign, expected):
     assert outcome_of(Interval(*interval), sign, 0.5) == expected

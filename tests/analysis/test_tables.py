@@ -35,6 +35,7 @@ from gsbench.analysis.table_formats import (
 from gsbench.analysis.tables import build_table
 from gsbench.words import printable
 from tests.analysis.helpers import loaded, page_of, rows_of, table_of, trials_of
+from tests.analysis.tables import TABLES
 from tests.helpers import refusal
 from tests.markup import Page
 from tests.processes import completed
@@ -141,14 +142,7 @@ def test_the_lpips_of_the_protocol_has_a_column_even_when_it_is_missing(tmp_path
 
 @pytest.mark.parametrize(
     "key, values",
-    [
-        ("iterations", (7000, 30000)),
-        ("raster", ("cpu", "cuda")),
-        ("protocol", ("paper-1", "standard-1")),
-        ("resolution", ([400, 300], [800, 600])),
-        ("budget", ({"max_gaussians": 1, "cap": "soft"}, {"max_gaussians": 2, "cap": "soft"})),
-        ("hashes", ({"data": "a"}, {"data": "b"})),
-    ],
+    TABLES["conditions"],
 )
 def test_a_cell_never_mixes_conditions(tmp_path, key, values):
     for seed, value in enumerate(values):
@@ -169,10 +163,14 @@ def test_a_cell_never_mixes_settings(tmp_path):
     assert [row.labels for row in table.rows] == [("garden", "0.03"), ("garden", "0.1")]
 
 
-def test_settings_that_only_say_where_a_trial_ran_do_not_matter(tmp_path):
+@pytest.mark.parametrize(
+    "settings",
+    [{"tracking.name": "off", "scene.path": "/elsewhere"}, {"eval.extra": None}],
+    ids=["where it ran", "null, as if missing"],
+)
+def test_some_settings_do_not_matter(tmp_path, settings):
     write_trial(tmp_path, 0, "aaaaaaaa", psnr=27.0)
-    elsewhere = {"tracking.name": "off", "scene.path": "/elsewhere"}
-    write_trial(tmp_path, 1, "bbbbbbbb", elsewhere, psnr=28.0)
+    write_trial(tmp_path, 1, "bbbbbbbb", settings, psnr=28.0)
     assert rows_of(table_of(tmp_path, "psnr"))["garden"] == ["27.50 ± 0.71"]
 
 
@@ -250,11 +248,8 @@ def test_metrics_of_earlier_iterations_have_columns_of_their_own(tmp_path):
     assert texts(table)[0][3:] == ["21.00 ± 1.41", "27.50 ± 0.71"]
     with refusal(r"measured at iteration '9000'; measured were \(eval\.at\) 7000"):
         table_of(tmp_path, "psnr@9000")
-
-
-def test_an_unknown_metric_is_refused(make_experiment):
     with refusal("unknown metric 'pnsr'"):
-        build_table(make_experiment(), metrics=["pnsr"])
+        table_of(tmp_path, "pnsr")
 
 
 def test_the_notes_say_how_to_read_the_table_and_what_is_left_out(tmp_path):
@@ -387,13 +382,7 @@ def test_latex_compiles(make_experiment, tmp_path):
 
 @pytest.mark.parametrize(
     "counts, heading, cells",
-    [
-        ((512, 640), "Gaussians ↓", ["512", "640"]),
-        ((999, 28_012), "Gaussians ↓", ["999", "28,012"]),
-        ((1000, 28_012), "Gaussians (k) ↓", ["1.0", "28.0"]),
-        ((4000, 3_410_000), "Gaussians (k) ↓", ["4.0", "3,410.0"]),
-        ((100_000, 3_410_000), "Gaussians (M) ↓", ["0.10", "3.41"]),
-    ],
+    TABLES["small counts"],
 )
 def test_a_small_count_keeps_its_digits_on_every_surface(tmp_path, counts, heading, cells):
     for densify, count in zip(("adc", "volumetric"), counts, strict=True):
@@ -408,11 +397,7 @@ def test_a_small_count_keeps_its_digits_on_every_surface(tmp_path, counts, headi
 
 @pytest.mark.parametrize(
     "gaussians, seconds, headings",
-    [
-        (999_999, 599.9, ["Gaussians (k)", "train (s)", "initial points (k)", "total (min)"]),
-        (1_000_000, 600.0, ["Gaussians (M)", "train (min)", "initial points (k)", "total (min)"]),
-        (900, 2.0, ["Gaussians", "train (s)", "initial points (k)", "total (s)"]),
-    ],
+    TABLES["units"],
 )
 def test_counts_from_a_thousand_and_times_from_ten_minutes_have_the_larger_unit(
     tmp_path, gaussians, seconds, headings
@@ -474,13 +459,6 @@ def test_tables_show_trials_with_and_without_the_metric(added):
     assert shown == {(arm, value) for arm in ("adc", "volumetric") for value in ("–", "mine.Mae")}
     assert len(select_trials(experiment.trials, {KEY: "mine.Mae"})) == 4
     assert len(select_trials(experiment.trials, {KEY: "None"})) == 4
-
-
-def test_a_null_setting_equals_a_missing_key(tmp_path):
-    write_trial(tmp_path, 0, "aaaaaaaa", psnr=27.0)
-    write_trial(tmp_path, 1, "bbbbbbbb", {"eval.extra": None}, psnr=28.0)
-    table = table_of(tmp_path, "psnr")
-    assert [row.entries[0].text for row in table.rows] == ["27.50 ± 0.71"]
 
 
 @pytest.mark.parametrize("name", ["eval.extra.mea._target_", "densify.volume_treshold", "nothing"])

@@ -7,6 +7,7 @@ from gsbench.analysis.fairness import caveats, fairness_table
 from gsbench.analysis.notes import texts
 from gsbench.runs.experiments import Arm
 from tests.analysis.helpers import page_of, rows_of, table_of, trials_of
+from tests.analysis.tables import TABLES
 from tests.helpers import refusal
 from tests.trials import write_trial
 
@@ -65,12 +66,7 @@ def test_what_is_swept_on_a_scene_or_belongs_to_the_scene_is_not_stated(tmp_path
 
 @pytest.mark.parametrize(
     "key, values",
-    [
-        ("protocol", ("paper-1", "standard-1")),
-        ("iterations", (2000, 7000)),
-        ("raster", ("cpu", "triton")),
-        ("split", ("every 8th", "sector 90 deg")),
-    ],
+    TABLES["unlike conditions"],
 )
 def test_no_mean_is_shown_over_scenes_under_different_conditions(tmp_path, key, values):
     for scene, value in zip(("park", "room"), values, strict=True):

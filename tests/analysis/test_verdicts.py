@@ -13,6 +13,7 @@ from gsbench.analysis.sentences import badge, in_words, reason, risk, sentence
 from gsbench.analysis.verdicts import find_outlying, interval_of, judge
 from gsbench.runs.trial_record import Budget
 from tests.analysis.helpers import ADC, VOLUMETRIC
+from tests.analysis.tables import TABLES
 from tests.trials import ask_about, with_record, write_runs
 
 BETTER = {"psnr": 3.0}
@@ -167,15 +168,7 @@ def test_a_question_that_left_something_out_shows_an_interval_alone(asked):
 
 @pytest.mark.parametrize(
     "effect, sign, least, expected",
-    [
-        (3.0, 1, 0.1, "BETTER"),
-        (-3.0, 1, 0.1, "WORSE"),
-        (0.02, 1, 5.0, "TOO SMALL"),
-        (0.0, 1, 0.001, "UNDECIDED"),
-        (3.0, -1, 0.1, "HIGHER"),
-        (0.02, 0, 5.0, "TOO SMALL"),
-        (3.0, 0, 0.1, "DIFFERENT"),
-    ],
+    TABLES["badges"],
 )
 def test_badges_say_the_outcome_in_the_direction_of_the_question(
     asked, effect, sign, least, expected

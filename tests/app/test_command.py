@@ -1,6 +1,5 @@
 """From a command line to trials and an exit code, with stand-ins for trials."""
 
-import logging
 from shlex import split
 
 import pytest
@@ -43,8 +42,7 @@ CHANGE = "change what the lines above name, then give the command again"
     "ends, code, advice",
     table(__file__, "ends"),
 )
-def test_the_end_of_a_command_tells_what_to_do_next(tmp_path, caplog, capsys, ends, code, advice):
-    caplog.set_level(logging.INFO, "gsbench")
+def test_the_end_of_a_command_tells_what_to_do_next(tmp_path, logged, capsys, ends, code, advice):
     status = {"d": "done", "q": "queued"}
     trials = [trial(tmp_path, seed) for seed in range(len(ends))]
     outcomes = [
@@ -59,7 +57,7 @@ def test_the_end_of_a_command_tells_what_to_do_next(tmp_path, caplog, capsys, en
     ]
     first = Trial(trials[0].values | {"name": "tuning"}, ())
     assert summarize(outcomes, [first, *trials]) == code
-    (said,) = [one.getMessage() for one in caplog.records if one.name == command.__name__]
+    (said,) = [one.getMessage() for one in logged.records if one.name == command.__name__]
     assert said == advice + (str(trials[0].folder) if len(ends) == 1 else "")
     said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("gsbench: ")]
     assert said == [

@@ -1,7 +1,6 @@
 """Hydra's path: real sweepers and launchers of Hydra's, with stand-ins for trainings."""
 
 import copy
-import logging
 import os
 import pickle
 from shlex import split
@@ -79,9 +78,8 @@ def test_any_sweeper_runs_all_jobs_by_any_launcher(ran, name):
 
 @pytest.mark.parametrize("launcher", ["gsbench", "basic"])
 def test_a_search_sees_validation_views_only_and_has_an_experiment_of_its_own(
-    ran, searching, launcher, caplog
+    ran, searching, launcher, logged
 ):
-    caplog.set_level(logging.INFO, "gsbench")
     words = [searching, f"hydra/launcher={launcher}", "densify=adc", "seed=1,3"]
     words += ["densify.interval=100,200", "eval.primary=psnr"]
     assert command.launch([*QUICK, *words]) == 0
@@ -92,7 +90,7 @@ def test_a_search_sees_validation_views_only_and_has_an_experiment_of_its_own(
         assert one.values["scene"]["validation"] is True
         assert one.values["eval"]["primary"] is None
     assert ran.asks == {False}  # no question is written
-    assert "gsbench tables x-tune" in caplog.text
+    assert "gsbench tables x-tune" in logged.text
 
 
 def test_a_failed_trial_ends_its_sweeper_or_is_named_at_the_end(ran, capsys):
@@ -141,13 +139,12 @@ def test_a_job_is_pickled_for_another_process():
     assert pickle.loads(pickle.dumps(job)) == job
 
 
-def test_a_single_trial_with_hydras_log_runs_where_the_command_was_given(ran, caplog):
-    caplog.set_level(logging.INFO, "gsbench")
+def test_a_single_trial_with_hydras_log_runs_where_the_command_was_given(ran, logged):
     here = os.getcwd()
     assert command.launch(split("seed=4 init=random hydra/job_logging=default")) == 0
     (one,) = ran
     assert os.getcwd() == here
-    assert f"the trial's folder is {one.folder}" in caplog.text
+    assert f"the trial's folder is {one.folder}" in logged.text
 
 
 # ---- searches
@@ -215,9 +212,8 @@ OF_JOBS = "hydra.run.dir=${runs}/.hydra hydra.sweep.subdir=${hydra.job.num}"
     table(__file__, "files"),
 )
 def test_hydra_writes_its_files_if_one_is_asked_for(
-    monkeypatch, caplog, changes, typed, multirun, launch, added
+    monkeypatch, logged, changes, typed, multirun, launch, added
 ):
-    caplog.set_level(logging.INFO, "gsbench")
     own = copy.deepcopy(OWN_FILES)
     monkeypatch.setattr(hydra_main, "installed_nodes", lambda words: own)
     runtime = {"choices": {"hydra/launcher": "gsbench"}}
@@ -225,7 +221,7 @@ def test_hydra_writes_its_files_if_one_is_asked_for(
         {"hydra": OWN_FILES | changes | {"runtime": runtime}, "launch": {"name": launch}}
     )
     assert words_for_files(config, typed, multirun) == added
-    assert ("writes no files of Hydra's" in caplog.text) == (launch == "local")
+    assert ("writes no files of Hydra's" in logged.text) == (launch == "local")
 
 
 def test_another_launchers_jobs_get_a_folder_that_nobody_could_prepare(tmp_path):

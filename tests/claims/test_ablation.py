@@ -20,7 +20,7 @@ from gsbench.verbs.planning import (
     off_settings,
     runs_to_train,
 )
-from tests.helpers import refusal
+from tests.helpers import refusal, table
 from tests.launch.test_record import TINY
 
 NESTED = {
@@ -147,21 +147,7 @@ def test_ablate_takes_switches_that_the_command_names(runs, said):
 
 @pytest.mark.parametrize(
     "words, message",
-    [
-        ("densify=none", "declares no switch"),
-        ("densify=adc,volumetric", "one densifier"),
-        ("densify=adc densify.split_shrink=1.5,2", "only scene and seed"),
-        ("densify=adc name=a,b", "only scene and seed"),
-        ("densify=adc --switches opacity_rest", "did you mean opacity_reset"),
-        ("densify=adc +densify.switches.a.off.split_shrnk=2", "split_shrnk"),
-        ("densify=adc --fast", "unrecognized arguments: --fast"),
-        ("+experiment=demo densify=adc", "plain KEY=VALUE"),
-        (
-            "densify=adc +densify.switches.a.off.split_size=.5 "
-            "+densify.switches.b.off.split_size=.5 --switches a,b",
-            "makes no other run",
-        ),
-    ],
+    table(__file__, "bad words"),
 )
 def test_bad_words_of_ablate_are_refused_in_one_line(runs, words, message, refused):
     assert message in refused(

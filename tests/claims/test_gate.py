@@ -26,7 +26,7 @@ from gsbench.verbs.gate import (
     result_of,
 )
 from tests.analysis.helpers import loaded
-from tests.helpers import refusal
+from tests.helpers import refusal, table
 from tests.trials import with_record, write_as, write_runs, write_trial
 
 VALUES = {"eval": {"extra": {}}}
@@ -158,19 +158,7 @@ def test_questions_that_cannot_be_judged_are_refused():
 
 @pytest.mark.parametrize(
     "words, message",
-    [
-        ("", "the following arguments are required: archive"),
-        ("nowhere.zip", "no such file"),
-        ("exp.zip seed=0,1", "seed follows from the other words"),
-        ("exp.zip densify=adc,volumetric", "only scene may list values"),
-        ("exp.zip scene=photos scene.path=/", "the archive has no trial on"),
-        ("exp.zip --seeds 9", "has 3 seeds of all scenes"),
-        ("exp.zip --seeds 1", "needs at least 2 seeds, and there is 1"),
-        ("exp.zip --metric psn", "psn"),
-        ("exp.zip densify=none", "several arms on courtyard"),
-        ("exp.zip --where densify=x", "no trial has densify=x"),
-        ("exp.zip launch.wait=false", "launch.wait"),
-    ],
+    table(__file__, "bad input"),
 )
 def test_bad_input_of_gate_is_refused(runs, tmp_path, refused, words, message):
     write_runs(tmp_path / "made", densifiers=("adc", "volumetric"))
@@ -233,16 +221,7 @@ def test_one_training_shows_that_the_sides_cannot_be_compared(gated, capsys):
 
 @pytest.mark.parametrize(
     "words, effect, code",
-    [
-        ("scene=courtyard --least .2", 1.0, 0),
-        ("scene=courtyard --least .2", -1.0, 1),
-        ("scene=courtyard --least 10", 0.0, 0),
-        ("scene=courtyard --least .002 --seeds 2", 0.0, 125),  # undecided
-        ("scene=courtyard --least .2", None, 125),  # it does not train
-        ("scene=courtyard --metric psn", 1.0, 128),
-        ("scene=elsewhere", 1.0, 128),
-        ("scene=courtyard --sees 3", 1.0, 128),
-    ],
+    table(__file__, "exit codes"),
 )
 def test_exit_codes_under_git_bisect_run(gated, words, effect, code):
     def write(trial):

@@ -14,7 +14,7 @@ from gsbench.claims.site import _unique_key
 from gsbench.cli import run
 from tests.analysis.helpers import loaded, trials_of
 from tests.claims.test_archive import rewrite
-from tests.helpers import refusal
+from tests.helpers import refusal, table
 from tests.markup import Page
 from tests.trials import ask_about, write_runs
 from tests.view.browser import Browser
@@ -68,12 +68,7 @@ def test_the_table_of_the_metric_that_was_asked_about_is_open(tmp_path):
 
 @pytest.mark.parametrize(
     "name, taken, key",
-    [
-        ("A b!", set(), "a-b"),
-        ("exp", {"exp"}, "exp-2"),
-        ("exp", {"exp", "exp-2"}, "exp-2-2"),
-        ("…", set(), "experiment"),
-    ],
+    table(__file__, "keys"),
 )
 def test_the_key_of_an_experiment_is_plain_and_not_taken(name, taken, key):
     assert _unique_key(name, taken) == key

@@ -36,6 +36,14 @@ pytestmark = pytest.mark.usefixtures("place")
 
 ADDRESS = "http://127.0.0.1:9"
 STRANGE = table(__file__, "strange")
+RETRIES = [["retry", "x", *more] for more in ([], ["--dry-run"], ["allow_targets=[other]"])]
+
+
+@pytest.fixture(autouse=True)
+def no_address(monkeypatch):
+    """No variable of the environment has the address of a tracker."""
+    for variable in ALLOWED["addresses"]:
+        monkeypatch.delenv(variable, raising=False)
 
 
 def strange_runs(settings):
@@ -64,7 +72,7 @@ def test_a_choice_that_leaves_its_groups_folder_is_refused(refused):
 def _plan(settings):
     (trial,) = compose_trials(["name=x"])
     record([Trial(trial.values, ("name=x", *_words(settings)))], asks=False)
-    return [["retry", "x"], ["retry", "x", "--dry-run"], ["retry", "x", "allow_targets=[other]"]]
+    return RETRIES
 
 
 def _ledger(settings):
@@ -82,7 +90,7 @@ def _ledger(settings):
 
 def _configuration(settings):
     strange_runs(settings)
-    return [["retry", "x"], ["retry", "x", "--dry-run"], ["retry", "x", "allow_targets=[other]"]]
+    return RETRIES
 
 
 def _experiment(settings):
@@ -121,8 +129,6 @@ KINDS += ("a class and its permission", "a folder to write", "a variable")
 def test_no_file_of_a_stranger_decides_what_runs_and_where_results_go(
     file, case, monkeypatch, refused
 ):
-    for variable in ALLOWED["addresses"]:
-        monkeypatch.delenv(variable, raising=False)
     settings, said = STRANGE[case]
     for function in ("verbs.ledger.run_trials", "app.command.run_batch"):
         monkeypatch.setattr(f"gsbench.{function}", no_trial)
@@ -163,15 +169,13 @@ def test_permissions_in_a_trials_configuration_are_dropped():
     assert TrialFolder(folder).configuration()["allow_targets"] == []
 
 
-def test_retry_runs_what_its_command_allows(monkeypatch):
+def test_retry_runs_what_its_command_allows(ran):
     strange_runs({"densify._target_": "mine.Mine"})
-    began = []
-    monkeypatch.setattr("gsbench.app.command.run_trials", lambda trials: began.extend(trials) or 0)
     assert cli.run(["retry", "x", "allow_targets=[mine]"]) == 0
-    assert [trial.values["allow_targets"] for trial in began] == [["mine"]]
+    assert [trial.values["allow_targets"] for trial in ran] == [["mine"]]
 
 
-def test_a_plan_gives_no_permission_and_no_folder_of_modules(place, monkeypatch, refused):
+def test_a_plan_gives_no_permission_and_no_folder_of_modules(place, ran, monkeypatch, refused):
     """A stranger's plan has a permission, and names a folder whose ``mine`` leaves a mark."""
     theirs = place / "theirs"
     theirs.mkdir()
@@ -183,12 +187,10 @@ def test_a_plan_gives_no_permission_and_no_folder_of_modules(place, monkeypatch,
     assert str(theirs) in strange
     assert "allow_targets=[mine]" in strange
     plan.write_text(strange)
-    began = []
-    monkeypatch.setattr("gsbench.app.command.run_trials", lambda trials: began.extend(trials) or 0)
     assert "add allow_targets=[mine] to the command" in refused("retry", "x")
     monkeypatch.chdir(place)
     assert cli.run(["retry", "x", "allow_targets=[mine]"]) == 0
-    values = began[0].values
+    values = ran[0].values
     assert (
         build("densify", values["densify"], values["allow_targets"]).__class__.__module__ == "mine"
     )
@@ -272,17 +274,13 @@ def test_a_version_command_cannot_use_values_that_are_known_later():
         compose_one([*PROGRAM, "densify.version_command=['{output}/x']", "allow_targets=[python]"])
 
 
-def test_an_address_counts_if_it_is_typed_or_in_the_environment(place, monkeypatch, refused):
+def test_an_address_counts_if_it_is_typed_or_in_the_environment(place, ran, monkeypatch, refused):
     """It counts as typed if a typed choice of a tracker has it, not if another file changes it."""
-    for variable in ALLOWED["addresses"]:
-        monkeypatch.delenv(variable, raising=False)
-    began = []
-    monkeypatch.setattr("gsbench.app.command.run_trials", lambda trials: began.extend(trials) or 0)
     strange_runs({"tracking.uri": ADDRESS})
     assert cli.run(["retry", "x", f"allow_targets=[{ADDRESS}]"]) == 0
     monkeypatch.setenv("MLFLOW_TRACKING_URI", ADDRESS)
     assert cli.run(["retry", "x"]) == 0
-    assert len(began) == 2
+    assert len(ran) == 2
     monkeypatch.delenv("MLFLOW_TRACKING_URI")
     assert compose_one([f"tracking.uri={ADDRESS}"]).values["allow_targets"] == [ADDRESS]
     words = experiment({"tracking.uri": ADDRESS})
@@ -296,9 +294,7 @@ def test_an_address_counts_if_it_is_typed_or_in_the_environment(place, monkeypat
     "tracking, allowed, found",
     table(__file__, "addresses"),
 )
-def test_addresses_of_any_tracker_are_found(tracking, allowed, found, monkeypatch):
-    for variable in ALLOWED["addresses"]:
-        monkeypatch.delenv(variable, raising=False)
+def test_addresses_of_any_tracker_are_found(tracking, allowed, found):
     assert foreign_address(tracking, allowed) == found
 
 

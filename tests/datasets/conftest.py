@@ -33,17 +33,20 @@ def write_archive(path, content, compression=zipfile.ZIP_DEFLATED):
             archive.writestr(name, data)
 
 
-@pytest.fixture(scope="session")
-def made_archives(tmp_path_factory):
-    """A folder with small files under the names of all archives in the catalogue."""
-    folder = tmp_path_factory.mktemp("archives")
+def write_archives(folder, photos=4):
+    """Write small files under the names of all archives in the catalogue; return the folder."""
     for dataset in read_catalog().values():
         for archive in dataset.archives:
             content = {}
             for place in archive.scenes.values():
-                content |= archive_content(place)
+                content |= archive_content(place, photos=photos)
             write_archive(folder / archive.name, content)
     return folder
+
+
+@pytest.fixture(scope="session")
+def made_archives(tmp_path_factory):
+    return write_archives(tmp_path_factory.mktemp("archives"))
 
 
 @pytest.fixture

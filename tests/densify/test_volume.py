@@ -12,6 +12,7 @@ from gsbench.densify.budget import admit
 from gsbench.densify.volumetric import log_condition, log_volume
 from tests.densify.helpers import at, generator, trained
 from tests.gaussians.helpers import random_gaussians
+from tests.helpers import table
 
 
 def scales(*rows):
@@ -127,17 +128,7 @@ def test_admit_chooses_the_best_scores_and_counts_the_refused():
 
 @pytest.mark.parametrize(
     "count, most, cap, allowed",
-    [
-        (5, 10, "hard", 5),
-        (12, 10, "hard", 0),
-        (12, 10, "curve", 0),
-        (12, 10, "soft", 0),
-        (10, 10, "soft", None),
-        (11, 10, "soft", 0),
-        (5, None, "hard", None),
-        (12, 10, "freeze", None),
-        (12, 10, "governor", None),
-    ],
+    table(__file__, "caps"),
 )
 def test_each_cap_allows_the_expected_number(count, most, cap, allowed):
     densifier = ADC(cap=cap)

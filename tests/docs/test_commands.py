@@ -26,6 +26,7 @@ from gsbench.train.options import TrainConfig
 from gsbench.verbs import VERBS, load_verb
 from gsbench.verbs.queries import QUERIES
 from tests.conftest import ROOT
+from tests.helpers import table
 
 DOCUMENTS = [
     *(ROOT / name for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md")),
@@ -170,23 +171,7 @@ def test_files_in_the_architecture_document_exist():
 
 @pytest.mark.parametrize(
     "text, fault",
-    [
-        ("    gsbench tabels x", "no verb tabels"),
-        ("say `gsbench tables x --formt csv`", "tables has no option --formt"),
-        ("    gsbench -m --dryrun seed=0,1", "a trial has no option --dryrun"),
-        ("    A=/x gsbench scene=gardn", "scene has no choice gardn"),
-        ("    gsbench -m densify=adc,volumetrik", "densify has no choice volumetrik"),
-        (
-            "    gsbench -m densify=adc \\\n        train.iteration=5",
-            "train has no setting iteration",
-        ),
-        ("`densify=adc|absgrd`", "densify has no choice absgrd"),
-        ("one `densify.volume_treshold=0.5`", "densify has no setting volume_treshold"),
-        ("one `points_form=train`", "no setting is called points_form"),
-        ("`launch.parralel=2`", "launch has no setting parralel"),
-        ("+ `+experiment=tabel1`", "experiment has no choice tabel1"),
-        ("in `tests/test_trust.py`", "no file tests/test_trust.py"),
-    ],
+    table(__file__, "wrong words"),
 )
 def test_a_wrong_word_is_found(text, fault):
     assert "\n" not in text or faults_of(text)[0].startswith("1: ")

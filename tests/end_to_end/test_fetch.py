@@ -4,8 +4,7 @@ import time
 
 import pytest
 
-from gsbench.datasets.catalog import read_catalog
-from tests.datasets.conftest import archive_content, write_archive
+from tests.datasets.conftest import archive_content, write_archives
 from tests.datasets.server import Manners, serve
 from tests.processes import wait_until
 
@@ -16,13 +15,7 @@ pytestmark = pytest.mark.slow
 def server(tmp_path):
     folder = tmp_path / "archives"
     folder.mkdir()
-    for dataset in read_catalog().values():
-        for archive in dataset.archives:
-            content = {}
-            for place in archive.scenes.values():
-                content |= archive_content(place, photos=2)
-            write_archive(folder / archive.name, content)
-    with serve(folder) as running:
+    with serve(write_archives(folder, photos=2)) as running:
         yield running
 
 

@@ -104,52 +104,27 @@ def pixels(path):
     return hashlib.sha256(np.asarray(Image.open(path)).tobytes()).hexdigest()
 
 
-def test_a_program_and_a_folder_of_renders_in_one_table(home, monkeypatch, capsys, tmp_path):
+def test_a_program_is_compared_with_an_arm_of_gsbench(home, monkeypatch, said):
     monkeypatch.setenv("GSBENCH_RUNS", str(home / "runs"))
     monkeypatch.chdir(home)
-    for seed in (0, 1):
-        folder = tmp_path / f"renders{seed}"
-        folder.mkdir()
-        for file in (trial(home, "adc", seed) / "renders").glob("*.png"):
-            truth = Image.open(trial(home, "adc") / f"ground_truth/{file.name}")
-            Image.blend(Image.open(file), truth, 0.5).save(folder / file.name)
-        words = split(f"--truth three:garden:adc --as three:folder --seed {seed}")
-        assert run(["evaluate", str(folder), *words]) == 0
-    capsys.readouterr()
-    assert run(["tables", "three"]) == 0
-    table = capsys.readouterr().out
-    rows = {
-        arm: next(line for line in table.splitlines() if f"| {arm} |" in line)
-        for arm in split("adc cloud folder")
-    }
-    assert "2.0" in rows["cloud"]  # thousand Gaussians: one for each point
-    assert run(["tables", "three", "--format", "html"]) == 0  # with all notes
-    table = html.unescape(capsys.readouterr().out)
-    # LPIPS; Gaussians of renders; their time
-    assert [row.count("n/a") for row in rows.values()] == [1, 1, 3]
+    table = said("tables three")
+    adc, cloud = (
+        next(line for line in table.splitlines() if f"| {arm} |" in line)
+        for arm in ("adc", "cloud")
+    )
+    assert "2.0" in cloud  # thousand Gaussians: one for each point
+    assert adc.count("n/a") == cloud.count("n/a") == 1  # LPIPS
     assert (
         "its model rendered by gsbench (its time is that of the whole program, and it sets its "
-        "own budget): "
-        "random-cloud (version 1.2.3)." in table
-    )
-    assert (
-        "Renders of another program, measured as they are (its conditions are not known): "
-        "random-folder." in table
-    )
-    assert run(["report", "three"]) == 0
+        "own budget): random-cloud (version 1.2.3)."
+    ) in html.unescape(said("tables three --format html"))  # with all notes
+    said("report three")
     report = (home / "runs/three/report.html").read_text()
-    # nobody asked about the folder of renders before it was measured
-    for arm, verdict in {
-        "cloud": "(better|worse)",
-        "folder": "not asked beforehand",
-    }.items():
-        assert re.search(f"random-{arm} against random-adc: {verdict}", report), arm
-    explain = "explain three:garden:psnr:"
-    for words in ("status three", f"{explain}cloud", "sync three"):
-        assert run(words.split()) == 0, words
-    said = capsys.readouterr().out
-    assert "4 done" in said or "6 done" in said
-    assert f"program   1.2.3: {sys.executable} {TRAINER}" in said
+    assert re.search("random-cloud against random-adc: (better|worse)", report)
+    assert "4 done" in said("status three")
+    explained = said("explain three:garden:psnr:cloud")
+    assert f"program   1.2.3: {sys.executable} {TRAINER}" in explained
+    said("sync three")
 
 
 def test_a_trial_of_another_program_has_a_full_record(home):

@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -13,16 +12,11 @@ import pytest
 import torch
 
 from gsbench.cli import run
-from gsbench.errors import InputError
-from gsbench.runs.store import read_manifest
-from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.jit import cache_base
 from gsbench.verbs import VERBS
-from gsbench.view.trials import find_trial, model_file
 from tests.end_to_end.conftest import FINISHED, SMALL
 from tests.end_to_end.test_hydra import TINY
 from tests.helpers import write
-from tests.trials import search_record
 
 PAGE = Path(__file__).parents[2] / "docs/security.md"
 pytestmark = pytest.mark.slow
@@ -33,6 +27,12 @@ def table(heading):
     section = PAGE.read_text(encoding="utf-8").partition(f"## {heading}\n")[2].partition("\n## ")[0]
     rows = [line.strip("| ").split(" | ") for line in section.splitlines() if line.startswith("|")]
     return rows[2:]
+
+
+def check_tests_are_there(*places):
+    for place in places:
+        file, _, name = place.partition("::")
+        assert f"def {name}(" in (PAGE.parents[1] / "tests" / file).read_text()
 
 
 RUNS = table("What each verb reads from others, and what it may run")
@@ -167,8 +167,7 @@ def seen_of(commands, place, environment):
 def test_a_verb_runs_and_writes_what_the_page_says(row, place, environment, tmp_path):
     commands, programs, elsewhere = VERB_ROWS[row]
     if elsewhere:
-        file, _, name = elsewhere.partition("::")
-        assert f"def {name}(" in (PAGE.parents[1] / "tests" / file).read_text()
+        check_tests_are_there(elsewhere)
     hook = write(tmp_path / "hook" / "sitecustomize.py", WATCH).parent
     own = environment | {
         "GSBENCH_RUNS": str(place),
@@ -203,138 +202,37 @@ def test_every_row_of_verbs_has_a_test():
     assert [row[0] for row in RUNS] == [*VERB_ROWS]
 
 
-# ---- edits
+# ---- edits, with the tests of each row
 
-
-@pytest.fixture
-def trial(place):
-    return min(path.parent for path in place.glob(f"{FINISHED}/*/*-adc/*/results.json"))
-
-
-@pytest.fixture
-def shown(place, capsys, caplog):
-    """What the verbs that read results say of the experiment, by verb."""
-
-    def look():
-        texts = {}
-        for verb, words in {
-            "tables": ["tables", FINISHED],
-            "report": ["report", FINISHED, "--out", "r.html"],
-            "status": ["status", FINISHED],
-            "export": ["export", "--results", FINISHED, "--out", "x.zip"],
-        }.items():
-            capsys.readouterr()
-            caplog.clear()
-            run(words)
-            texts[verb] = "".join(capsys.readouterr()) + caplog.text
-        return texts
-
-    return look
-
-
-def edit(file):
-    """Change the last byte of a file but its line break."""
-    content = file.read_bytes()
-    place = len(content.rstrip()) - 1
-    file.write_bytes(content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :])
-
-
-def edited_number(file, without_hashes=False):
-    values = json.loads(file.read_text())
-    values["metrics"]["psnr"] += 1
-    if without_hashes:
-        del values["made_of"]
-    file.write_text(json.dumps(values))
-
-
-def results(trial, shown):
-    edited_number(trial / "results.json")
-    texts = shown()
-    assert all("results.json was changed after it was written" in text for text in texts.values())
-    edited_number(trial / "results.json", without_hashes=True)
-    assert not any("was changed" in text for text in shown().values())
-
-
-def files_of_a_trial(trial, shown):
-    for name in ("config.yaml", "per_view.csv", "point_cloud.ply", "lineage.npz"):
-        kept = shutil.copy2(trial / name, trial.parents[4] / "kept")
-        edit(trial / name)
-        for verb, text in shown().items():
-            assert f"{name} was changed after results.json was written" in text, verb
-        with pytest.raises(InputError):
-            model_file(find_trial(str(trial), trial.parents[3]))
-        shutil.copy2(kept, trial / name)
-
-
-def curves(trial, shown):
-    for name in ("metrics.jsonl", "events.jsonl"):
-        with (trial / name).open("a") as file:
-            file.write('{"step": 300, "loss": 0.1}\n')
-    texts = shown()
-    for name in ("metrics.jsonl", "events.jsonl"):
-        assert f"{name} was changed after it was written" in texts["report"]
-    assert "volumetric" in texts["tables"]
-
-
-def pictures(trial, shown):
-    edit(next((trial / "renders").iterdir()))
-    assert not any("was changed" in text for text in shown().values())
-    files = TrialFolder(trial)
-    assert files.why_not_done(files.settings()) is not None
-
-
-def store(trial, shown):
-    """What is read before a use of the entry refuses it; for views, tests/scene/test_load.py."""
-    entry = min(
-        path.parent for path in (trial.parents[3] / "store").glob("ground_truth/*/manifest.json")
-    )
-    edit(next(entry.glob("*.png")))
-    assert not any("was changed" in text for text in shown().values())
-    with pytest.raises(ValueError, match="differs from what was written"):
-        read_manifest(entry, thorough=True)
-    assert run(["export", "init", str(trial), "--out", "whole"]) == 0
-    for cameras in (trial.parents[3] / "store").glob("init/*/sparse/0/cameras.*"):
-        edit(cameras)
-    assert run(["export", "init", str(trial), "--out", "edited"]) == 2
-    assert not list(Path().glob("edited*"))
-
-
-def commands(trial, shown):
-    """Each trial that ends adds a line, so there are at least two."""
-    file = trial.parents[2] / "commands.jsonl"
-    assert "commands.jsonl" not in "".join(shown().values())
-    first, *others = file.read_text().splitlines()
-    file.write_text("\n".join([first.replace("cwd", "CWD"), *others, ""]))
-    texts = shown()
-    assert all("commands.jsonl" in texts[verb] for verb in ("tables", "report")), texts
-
-
-def search(trial, shown):
-    home = trial.parents[2]
-    point = {"settings": {"densify.volume_threshold": 0.03}, "value": 20.0}
-    sweep = {"sweep": home.name, "ranges": {"densify.volume_threshold": "0.01,0.03"}}
-    file = write(home / "tuning.json", search_record([point]) | sweep)
-    before = shown()
-    file.write_text(file.read_text().replace("20.0", "21.0"))
-    assert shown().keys() == before.keys()
-    assert not any("tuning.json" in text for text in shown().values())
-
-
-HERE = {
-    "`results.json`": results,
-    "`config.yaml`, `per_view.csv`, `point_cloud.ply`, `lineage.npz` of a trial": files_of_a_trial,
-    "`metrics.jsonl`, `events.jsonl`": curves,
-    "pictures of a trial": pictures,
-    "`store/`: results of stages and prepared views": store,
-    "`commands.jsonl`": commands,
-    "`tuning.json`": search,
+EDIT_ROWS = {
+    "`results.json`": [
+        "runs/test_trial_folder.py::test_a_trial_with_changed_results_is_left_out_and_named",
+        "runs/test_trial_folder.py::test_results_without_made_of_are_accepted",
+    ],
+    "`config.yaml`, `per_view.csv`, `point_cloud.ply`, `lineage.npz` of a trial": [
+        "runs/test_trial_folder.py::test_a_trial_with_an_edited_file_counts_nowhere",
+        "verbs/test_trials.py::test_verify_finds_a_large_file_that_changed_and_kept_its_time",
+    ],
+    "`metrics.jsonl`, `events.jsonl`": [
+        "runs/test_trial_folder.py::test_changed_curves_are_not_used"
+    ],
+    "pictures of a trial": [
+        "runs/test_trial_folder.py::test_each_change_since_the_results_were_written_is_named"
+    ],
+    "`store/`: results of stages and prepared views": [
+        "runs/test_store.py::test_a_flipped_bit_is_found_before_a_result_becomes_an_input",
+        "scene/test_load.py::test_stored_views_that_were_changed_are_prepared_again",
+        "runs/test_strange_folder.py::test_a_stored_result_that_is_shown_is_as_it_was_written",
+    ],
+    "`commands.jsonl`": [
+        "analysis/test_answers.py::test_a_broken_link_among_the_commands_is_a_warning",
+        "verbs/test_ledger.py::test_trials_that_the_ledger_does_not_know_are_refused",
+    ],
+    "`tuning.json`": ["app/test_tuning.py::test_settings_added_to_a_record_are_ignored"],
 }
 
 
-def test_every_row_has_a_test():
-    assert [row[0] for row in EDITS] == [*HERE]
-
-
-@pytest.mark.parametrize("row", HERE)
-def test_an_edit_is_noticed_as_the_page_says(row, trial, shown):
-    HERE[row](trial, shown)
+def test_every_row_of_edits_has_tests():
+    assert [row[0] for row in EDITS] == [*EDIT_ROWS]
+    for places in EDIT_ROWS.values():
+        check_tests_are_there(*places)

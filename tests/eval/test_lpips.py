@@ -126,9 +126,7 @@ def test_alex_reproduces_the_authors_distances_of_their_pictures(shared, trained
     assert float(network(reference, second)) == pytest.approx(0.1376, abs=5e-5)
 
 
-def test_missing_weights_name_every_file_that_would_do_and_its_source(tmp_path, monkeypatch):
-    monkeypatch.delenv("GSBENCH_WEIGHTS", raising=False)
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+def test_missing_weights_name_every_file_that_would_do_and_its_source(tmp_path, no_weights):
     with pytest.raises(MissingWeightsError) as caught:
         load_lpips("vgg", tmp_path, download=False)
     for said in (

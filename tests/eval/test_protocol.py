@@ -16,13 +16,8 @@ from gsbench.eval.lpips import load_lpips
 from gsbench.eval.protocol import PAPER, STANDARD, get_protocol
 from tests.helpers import refusal
 
+pytestmark = pytest.mark.usefixtures("no_weights")
 VGG = ("lpips_vgg", "lpips_vgg_raw")
-
-
-@pytest.fixture(autouse=True)
-def no_weights_at_hand(tmp_path, monkeypatch):
-    monkeypatch.delenv("GSBENCH_WEIGHTS", raising=False)
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
 
 
 def test_identifiers_are_named_and_versioned():

@@ -8,7 +8,7 @@ from gsbench.eval.options import EvalConfig
 from gsbench.eval.protocol import STANDARD
 from gsbench.eval.regions import depths_of_points, regions_by_distance
 from gsbench.scene.types import Camera
-from tests.helpers import refusal
+from tests.helpers import refusal, table
 
 EVAL = {"name": "standard", "protocol": "standard"}
 
@@ -77,13 +77,7 @@ def test_the_metric_of_the_verdict_may_be_one_of_a_region(settings):
 
 @pytest.mark.parametrize(
     "settings,error",
-    [
-        ({"primary": "psnr@far"}, "after @ comes one of .* eval.regions=distance adds"),
-        ({"regions": {"sky": "a"}, "primary": "psnr@far"}, "one of sky, interpolation"),
-        ({"regions": "distance", "primary": "lpips_vgg@far"}, "LPIPS is not measured in regions"),
-        ({"regions": "distance", "primary": "psrn@far"}, "did you mean"),
-        ({"regions": "depth"}, "eval.regions"),
-    ],
+    table(__file__, "refused"),
 )
 def test_other_metrics_of_the_verdict_are_refused(settings, error):
     with refusal(error):

@@ -18,7 +18,7 @@ from gsbench.gaussians.ply import check_ply, read_ply, write_ply
 from gsbench.init.point_files import read_points
 from gsbench.normalization import Normalization
 from tests.gaussians.helpers import differences, random_gaussians
-from tests.helpers import refusal
+from tests.helpers import refusal, table
 
 
 def table_of(path, count=4):
@@ -256,21 +256,7 @@ def test_the_filter_of_mip_splatting_is_applied(tmp_path, caplog):
 
 @pytest.mark.parametrize(
     "column, refused, said",
-    [
-        ("beta", True, "the column beta: Beta Splatting's kernels are no Gaussians"),
-        ("sb_params_3", True, "Beta Splatting's"),
-        ("nu_degree", True, "Student"),
-        ("scale_t", True, "its Gaussians move with time"),
-        ("velocity_x", True, "its Gaussians move with time"),
-        ("Beta", True, "Beta Splatting's"),
-        ("beta_0", True, "Beta Splatting's"),
-        ("f_offset_0", True, "Scaffold-GS computes its Gaussians by networks"),
-        ("f_asg_12", True, "Spec-Gaussian computes its colours by networks"),
-        ("FILTER_3d", False, "Mip-Splatting's filter_3D is applied"),
-        ("segment", False, "not known and not used: column segment"),
-        ("scale_3", False, "not known and not used: column scale_3"),
-        ("red", False, ""),
-    ],
+    table(__file__, "columns"),
 )
 def test_unknown_columns_are_named_or_refused(tmp_path, column, refused, said, caplog):
     with refusal(said if refused else None):

@@ -16,19 +16,12 @@ from gsbench.gaussians.paper_values import LearningRates
 from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.raster import RenderOutput
 from tests.gaussians.helpers import random_gaussians
+from tests.helpers import table
 
 
 @pytest.mark.parametrize(
     "of, name, said",
-    [
-        ("gaussians", "scale", "Gaussians has no 'scale'; it has means, log_scales, quaternions, "),
-        ("gaussians", "scale", "sh_rest, scales, opacities, rotations; did you mean scales?"),
-        ("training", "means", "has no 'means'; it has values.means, values.log_scales, "),
-        ("training", "opacity", "values.rotations; did you mean values.opacities?"),
-        ("refinement", "gaussian", "event, strictness, cull; did you mean gaussians?"),
-        ("context", "views_", "extent, white_background, device, views, training_views"),
-        ("render", "depths", "RenderOutput has no 'depths'; it has image, alpha, radii, screen_p"),
-    ],
+    table(__file__, "attributes"),
 )
 def test_a_wrong_attribute_names_the_right_ones(of, name, said):
     gaussians = random_gaussians(3)

@@ -5,7 +5,6 @@ The files of a trial say how its job ended; the result that the job returned is 
 """
 
 import json
-import logging
 import signal
 import sys
 from contextlib import contextmanager
@@ -92,9 +91,8 @@ def test_an_error_of_a_trial_becomes_its_outcome_unless_it_concerns_all(tmp_path
 
 
 def test_a_single_trial_waits_for_another_process_and_several_are_counted(
-    tmp_path, monkeypatch, caplog
+    tmp_path, monkeypatch, logged
 ):
-    caplog.set_level(logging.INFO, "gsbench")
     waits = []
 
     def run_trial(trial, wait):
@@ -105,10 +103,10 @@ def test_a_single_trial_waits_for_another_process_and_several_are_counted(
     trials = [trial(tmp_path, seed) for seed in (0, 1)]
     (outcome,) = jobs.run_serial(trials[:1])
     assert outcome == Outcome(trials[0].folder, "done", "psnr 20.46  ssim 0.5")
-    assert not caplog.messages
+    assert not logged.messages
     jobs.run_serial(trials)
     assert waits == [True, False, False]
-    assert caplog.messages == [f"{k} of 2: {trials[k - 1].files.label}" for k in (1, 2)]
+    assert logged.messages == [f"{k} of 2: {trials[k - 1].files.label}" for k in (1, 2)]
 
 
 def collected(runs, failure="", results=""):
@@ -277,8 +275,7 @@ class Jobs:
 
 
 @pytest.mark.parametrize("minutes, limit", [(None, 365 * 24 * 60), (30, 30)])
-def test_local_jobs_run_as_many_at_once_as_asked(tmp_path, monkeypatch, caplog, minutes, limit):
-    caplog.set_level(logging.INFO, "gsbench")
+def test_local_jobs_run_as_many_at_once_as_asked(tmp_path, monkeypatch, logged, minutes, limit):
     pauses = []
     monkeypatch.setattr("time.sleep", pauses.append)
     executor = Jobs(tmp_path, [3, 1, 2, 1])
@@ -293,9 +290,9 @@ def test_local_jobs_run_as_many_at_once_as_asked(tmp_path, monkeypatch, caplog, 
     assert pauses == [1.0]  # whenever none has ended
     assert [one.folder for one in outcomes] == [trials[k].folder for k in (2, 0, 1, 3)]
     assert executor.parameters == {"timeout_min": limit}
-    assert caplog.messages[0] == ("4 trials, 2 at once; to see how far they are: gsbench status x")
-    assert caplog.messages[1].startswith(f"{trials[2].files.label}: the process ended without")
-    assert [line.endswith(f"({k} of 4)") for k, line in enumerate(caplog.messages[1:], 1)] == [
+    assert logged.messages[0] == ("4 trials, 2 at once; to see how far they are: gsbench status x")
+    assert logged.messages[1].startswith(f"{trials[2].files.label}: the process ended without")
+    assert [line.endswith(f"({k} of 4)") for k, line in enumerate(logged.messages[1:], 1)] == [
         True
     ] * 4
 
@@ -397,8 +394,7 @@ def test_without_a_listing_or_a_scheduler_nothing_counts_as_submitted(tmp_path, 
     assert (read_submission(one.folder), slurm.submitted) == (None, [])
 
 
-def test_a_command_waits_for_slurm_unless_told_otherwise(tmp_path, slurm, monkeypatch, caplog):
-    caplog.set_level(logging.INFO, "gsbench")
+def test_a_command_waits_for_slurm_unless_told_otherwise(tmp_path, slurm, monkeypatch, logged):
     launch = {key: value for key, value in SLURM.items() if key != "wait"}
     one = trial(tmp_path, launch=launch)
     monkeypatch.setattr(slurm_jobs, "_wait", lambda waiting, trials: (list(waiting), trials))
@@ -410,8 +406,8 @@ def test_a_command_waits_for_slurm_unless_told_otherwise(tmp_path, slurm, monkey
     monkeypatch.setattr(slurm_jobs, "_wait", stop)
     with pytest.raises(KeyboardInterrupt):
         slurm_jobs.run_slurm([one])
-    assert caplog.messages[0] == f"1 trial in Slurm, job 9; logs: {tmp_path.parent}"
-    assert caplog.messages[-1].endswith("`scancel 9` ends them")
+    assert logged.messages[0] == f"1 trial in Slurm, job 9; logs: {tmp_path.parent}"
+    assert logged.messages[-1].endswith("`scancel 9` ends them")
 
 
 def test_settings_become_options_of_slurm(tmp_path, monkeypatch):
@@ -454,10 +450,9 @@ def test_settings_become_options_of_slurm(tmp_path, monkeypatch):
 
 
 def test_waiting_ends_with_the_last_job_and_counts_jobs_that_left_the_queue(
-    tmp_path, monkeypatch, caplog
+    tmp_path, monkeypatch, logged
 ):
     """The first job wrote a result, the second is listed once more and then missing twice."""
-    caplog.set_level(logging.INFO, "gsbench")
     queues = iter([{"7_1"}, None, set(), {"7_1"}, set(), set()])
     asked = []
     monkeypatch.setattr(slurm_jobs, "read_queue", lambda users: asked.append(users) or next(queues))
@@ -476,6 +471,6 @@ def test_waiting_ends_with_the_last_job_and_counts_jobs_that_left_the_queue(
     assert pauses == [1.0] * 4
     assert asked == [{"ada", current_user()}] * 6
     assert not submitted.exists()
-    said = caplog.messages
+    said = logged.messages
     assert ["seed 0" in said[0], "seed 1" in said[1]] == [True, True]
     assert [line.endswith(f"({k} of 2)") for k, line in enumerate(said, 1)] == [True, True]

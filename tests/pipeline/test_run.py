@@ -1,6 +1,5 @@
 """A trial's steps in order, its files, and its failures, with stand-ins for the steps."""
 
-import logging
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -28,8 +27,7 @@ from tests.trials import record_of
 # ---- the frame
 
 
-def test_a_trial_runs_unless_it_is_done_and_one_process_at_a_time(tmp_path, monkeypatch, caplog):
-    caplog.set_level(logging.INFO, "gsbench")
+def test_a_trial_runs_unless_it_is_done_and_one_process_at_a_time(tmp_path, monkeypatch, logged):
     one = trial(tmp_path)
     record = record_of(one.values, hashes={"config": config_hash(one.values)})
     ran = []
@@ -50,7 +48,7 @@ def test_a_trial_runs_unless_it_is_done_and_one_process_at_a_time(tmp_path, monk
     assert ".a.tmp-1" not in names
     assert run_trial(one, wait=False) == record
     assert len(ran) == 1
-    assert caplog.messages == [f"{one.files.label}: already done"]
+    assert logged.messages == [f"{one.files.label}: already done"]
     assert "already done" in (one.folder / "log.txt").read_text()
 
 
@@ -203,8 +201,7 @@ def running(tmp_path, monkeypatch):
     return state
 
 
-def test_a_trial_builds_its_steps_and_writes_its_results(running, caplog):
-    caplog.set_level(logging.INFO, "gsbench")
+def test_a_trial_builds_its_steps_and_writes_its_results(running, logged):
     one, folder = running.trial, running.trial.folder
     write(folder / "failed.json", "{}")
     assert run_trial(one) == running.record
@@ -226,20 +223,19 @@ def test_a_trial_builds_its_steps_and_writes_its_results(running, caplog):
     assert set(made_of.entries) == {*names[1:]}
     assert set(made_of.published) == {"config.yaml", "init_report.json"}
     lines = ("3 training and 2 test views", "psnr 20.46  10 Gaussians")
-    assert caplog.messages == [f"{one.files.label}: {line}" for line in lines]
+    assert logged.messages == [f"{one.files.label}: {line}" for line in lines]
 
 
-def test_equal_results_are_called_done_and_useless_ones_are_named(running, caplog):
-    caplog.set_level(logging.INFO, "gsbench")
+def test_equal_results_are_called_done_and_useless_ones_are_named(running, logged):
     one = running.trial
     renders = {"num_gaussians": None, "evaluated_from": FROM_RENDERS}
     running.record = replace(running.record, one_color_psnr=21.0, **renders)
     run_trial(one)
-    assert caplog.messages[-2].endswith(": psnr 20.46")
-    assert "not better than one colour" in caplog.messages[-1]
+    assert logged.messages[-2].endswith(": psnr 20.46")
+    assert "not better than one colour" in logged.messages[-1]
     (one.folder / "init_report.json").write_text("other")
     run_trial(one)
-    assert caplog.messages[-2].endswith(": psnr 20.46  (already done)")
+    assert logged.messages[-2].endswith(": psnr 20.46  (already done)")
 
 
 def test_a_refused_part_leaves_the_earlier_configuration(running):

@@ -13,19 +13,12 @@ from gsbench.pipeline.parts import Parts, build_own_rasterizer
 from gsbench.pipeline.trial import run_trial
 from gsbench.runs import layout
 from gsbench.runs.keys import VIEWS
-from tests.helpers import refusal
+from tests.helpers import refusal, table
 
 
 @pytest.mark.parametrize(
     "words, here, said",
-    [
-        ("raster=auto", True, None),
-        ("raster=cpu", True, None),
-        ("raster=triton", False, None),  # the machine on which it will run may have a GPU
-        ("raster=triton", True, "raster=triton runs on device=cuda"),
-        ("raster=auto densify=taming", False, None),
-        ("raster=cpu densify=taming", True, None),
-    ],
+    table(__file__, "rasters"),
 )
 def test_a_rasterizer_that_cannot_run_or_lacks_a_needed_feature_is_refused_before_any_work(
     words, here, said

@@ -31,6 +31,7 @@ from gsbench.raster.cpu import (
 from gsbench.raster.cpu.workspace import Arena, ShardRunner, TensorPool
 from gsbench.raster.reference import project, tile_rectangles
 from tests.conftest import ROOT
+from tests.helpers import table
 from tests.processes import completed
 from tests.raster.promises import BLACK, PROMISES, Subject, bits_of
 
@@ -75,12 +76,7 @@ def test_depths_are_sorted_as_numpy_sorts_them():
 
 @pytest.mark.parametrize(
     "lengths, shards, bounds",
-    [
-        ([0, 0, 32, 0, 0, 0], 2, [0, 2, 6]),  # with 16 for each tile, shares of 64: 32 + 96
-        ([0, 0, 0, 0], 2, [0, 2, 4]),  # a share is met exactly
-        ([0, 0, 0, 1000], 3, [0, 3, 3, 4]),  # one tile has more than a share
-        ([5, 5, 5, 5, 5, 5], 1, [0, 6]),
-    ],
+    table(__file__, "shares of tiles"),
 )
 def test_tiles_are_divided_by_their_work(lengths, shards, bounds):
     starts = np.concatenate([[0], np.cumsum(lengths)])

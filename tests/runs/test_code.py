@@ -28,7 +28,7 @@ from gsbench.runs.code import (
 from gsbench.runs.keys import CODE_OF_STAGE
 from gsbench.system.programs import allow_modules, allowed_modules
 from tests.conftest import script
-from tests.helpers import write
+from tests.helpers import table, write
 from tests.test_architecture import modules, reached
 
 SOURCE = (
@@ -84,14 +84,7 @@ def again():
 
 @pytest.mark.parametrize(
     "old, new",
-    [
-        ("weight", "another comment"),
-        ("The loss.", "It is\n    longer."),
-        ("A module.", ""),
-        ("X * a", "(X\n            * a)"),
-        ('    """The loss."""\n', ""),
-        ("0.8", "0.80"),
-    ],
+    table(__file__, "no edits"),
 )
 def test_comments_docstrings_and_layout_do_not_count(old, new):
     assert old in SOURCE
@@ -107,16 +100,7 @@ def test_comments_in_a_table_of_data_do_not_count():
 
 @pytest.mark.parametrize(
     "old, new",
-    [
-        ("0.8", "0.81"),
-        ("*", "+"),
-        ("(a)", "(a=None)"),
-        ("X", "Y"),
-        ("    return X * a", "    return X * a\n    'more'"),
-        ("X = 0.8", "X = '0.8'"),
-        ("X * a\n", "X * a\nX = None\n"),
-        ("X * a\n", "X * a\n("),
-    ],
+    table(__file__, "edits"),
 )
 def test_edits_that_can_change_a_number_count(old, new):
     assert syntax_of(SOURCE.replace(old, new).encode()) != syntax_of(SOURCE.encode())

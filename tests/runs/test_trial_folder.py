@@ -9,13 +9,14 @@ import pytest
 
 from gsbench import cli
 from gsbench.analysis.results import load_experiment
+from gsbench.errors import InputError
 from gsbench.launch.states import states_of_experiment
 from gsbench.parsing import DamagedError
 from gsbench.runs import freshness
 from gsbench.runs.code import config_hash
 from gsbench.runs.configuration import sha256_of
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.view.trials import model_file
+from gsbench.view.trials import find_trial, model_file
 from tests.fuzz.records import EXPERIMENT, write_trial
 from tests.helpers import read_json, refusal, write
 
@@ -71,11 +72,12 @@ def test_results_without_made_of_are_accepted(trial):
     assert TrialFolder(trial).record().metrics == {"psnr": 43.2}
 
 
-@pytest.mark.parametrize("name", ["per_view.csv", "config.yaml", "point_cloud.ply"])
+@pytest.mark.parametrize("name", ["per_view.csv", "config.yaml", "point_cloud.ply", "lineage.npz"])
 @pytest.mark.parametrize("is_large", [False, True])
 def test_a_trial_with_an_edited_file_counts_nowhere(trial, name, is_large, monkeypatch):
     runs, folder = trial.parents[3], TrialFolder(trial)
-    (trial / "point_cloud.ply").write_bytes(b"ply 25.5 0.03")
+    for made in ("point_cloud.ply", "lineage.npz"):
+        (trial / made).write_text("25.5")
     if is_large:
         monkeypatch.setattr(freshness, "MAX_HASHED_BYTES", 4)
     folder.write_finished(folder.settings(), folder.record())
@@ -88,6 +90,8 @@ def test_a_trial_with_an_edited_file_counts_nowhere(trial, name, is_large, monke
     assert f"damaged, {name} was changed after results.json was written" in "".join(found.warnings)
     (state,) = (one for one in states_of_experiment(trial.parents[2]) if one.folder == trial)
     assert (state.state, name in state.note) == ("damaged", True)
+    with pytest.raises(InputError):
+        find_trial(str(trial), runs)
     (trial / name).unlink()  # models are deleted to make room
     assert TrialFolder(trial).state() == "done"
 
@@ -99,9 +103,7 @@ def test_a_large_file_with_its_old_size_and_time_is_compared_before_it_is_export
     model, folder = trial / "point_cloud.ply", TrialFolder(trial)
     model.write_bytes(b"ply 25.5")
     folder.write_finished(folder.settings(), folder.record())
-    (one,) = (
-        one for one in load_experiment(trial.parents[3], EXPERIMENT).trials if one.path == trial
-    )
+    one = find_trial(str(trial), trial.parents[3])
     assert model_file(one) == model
     state = model.stat()
     model.write_bytes(b"ply 26.5")
@@ -112,9 +114,7 @@ def test_a_large_file_with_its_old_size_and_time_is_compared_before_it_is_export
 
 def test_changed_curves_are_not_used(trial, caplog):
     edit(trial / "metrics.jsonl", "20.2", "40.2")
-    (one,) = (
-        one for one in load_experiment(trial.parents[3], EXPERIMENT).trials if one.path == trial
-    )
+    one = find_trial(str(trial), trial.parents[3])
     assert one.folder.curves() == []
     assert "metrics.jsonl was changed after it was written" in caplog.text
     assert len(one.folder.curves("events.jsonl")) == 10

@@ -1,6 +1,5 @@
 """Signals stop the program at once or at the end of a step; locks are held by one process."""
 
-import logging
 import os
 import signal
 import sys
@@ -107,8 +106,7 @@ def test_a_lock_names_its_holder_as_long_as_it_is_held(tmp_path, monkeypatch):
     assert not is_held(lock)
 
 
-def test_a_held_lock_is_waited_for_with_a_word_or_is_an_error(tmp_path, monkeypatch, caplog):
-    caplog.set_level(logging.INFO, "gsbench")
+def test_a_held_lock_is_waited_for_with_a_word_or_is_an_error(tmp_path, monkeypatch, logged):
     asked = []
 
     class Held:
@@ -129,7 +127,7 @@ def test_a_held_lock_is_waited_for_with_a_word_or_is_an_error(tmp_path, monkeypa
     with hold(tmp_path / "a", "the work"):
         pass
     assert asked == [{"timeout": 0}, {"timeout": 0}, {"poll_interval": 0.25}, "released"]
-    assert caplog.messages == ["waiting for the work: another process works on it"]
+    assert logged.messages == ["waiting for the work: another process works on it"]
 
 
 @pytest.mark.parametrize("system", ["with flock", "without"])

@@ -104,6 +104,24 @@ def run_of(client, seed):
     return run
 
 
+def sync_trial(runs, uri, seed):
+    """Send what the tracker lacks of the trial with this seed."""
+    values = trial_values(runs, seed)
+    mirror_trial(options(uri), TrialFolder.of(values).path, values)
+
+
+def complete_runs(client, count):
+    """The runs of ``count`` trials, each of which is complete and has each value once."""
+    found = trial_runs(client)
+    assert sorted(run.data.tags["seed"] for run in found) == [str(seed) for seed in range(count)]
+    for run in found:
+        assert run.info.status == "FINISHED"
+        losses = [(i, 1 / i) for i in range(1, STEPS + 1)]
+        assert history(client, run.info.run_id, "train/loss") == losses
+        assert run.data.metrics["eval/gaussians"] == 10 + int(run.data.tags["seed"])
+    return found
+
+
 MIRROR = """
 import sys
 from pathlib import Path

@@ -12,7 +12,6 @@ from urllib.parse import urlsplit
 import psutil
 import pytest
 
-from gsbench.runs.trial_folder import TrialFolder
 from gsbench.tracking import connect, ensure_experiment
 from gsbench.tracking.mlflow_sink import SETTINGS
 from tests.end_to_end.conftest import SMALL
@@ -21,16 +20,14 @@ from tests.processes import completed, heed_interrupts, wait_until
 from tests.tracking.helpers import (
     begin_trial,
     child_environment,
+    complete_runs,
     free_port,
-    history,
     mirror_command,
-    mirror_trial,
-    options,
-    trial_runs,
+    sync_trial,
     write_trial,
 )
 from tests.tracking.servers import Gate, Listener
-from tests.trials import STEPS, trial_values
+from tests.trials import trial_values
 
 pytestmark = pytest.mark.slow
 # A limit for programs that hang; a slow machine needs less.
@@ -176,17 +173,8 @@ def test_sync_completes_runs_whose_tracker_was_lost_at_any_moment(tracker, tmp_p
         gate.passed, gate.then, gate.limit = 0, then, int(share * whole)
         assert "gsbench sync" in mirror_a_trial(tmp_path, uri, seed, patience=PATIENCE)
         gate.mended()
-        values = trial_values(tmp_path, seed)
-        mirror_trial(options(uri), TrialFolder.of(values).path, values)
-    client = connect(uri, tmp_path)
-    found = trial_runs(client)
-    assert sorted(run.data.tags["seed"] for run in found) == [str(seed) for seed in range(4)]
-    for run in found:
-        assert run.info.status == "FINISHED"
-        assert history(client, run.info.run_id, "train/loss") == [
-            (i, 1 / i) for i in range(1, STEPS + 1)
-        ]
-        assert run.data.metrics["eval/gaussians"] == 10 + int(run.data.tags["seed"])
+        sync_trial(tmp_path, uri, seed)
+    complete_runs(connect(uri, tmp_path), 4)
 
 
 def mirror_a_trial(runs, uri, seed, patience):

@@ -43,14 +43,6 @@ def folders(runs):
     return [trial.folder for trial in planned]
 
 
-@pytest.fixture
-def ran(monkeypatch):
-    """The trials that a verb would run."""
-    given = []
-    monkeypatch.setattr("gsbench.app.command.run_trials", lambda trials: given.extend(trials) or 0)
-    return given
-
-
 # ---- status
 
 

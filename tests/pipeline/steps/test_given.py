@@ -324,12 +324,11 @@ def test_an_initialiser_gets_the_reference_cameras_and_they_are_in_its_key(
         step.build(tmp_path)
 
 
-def test_the_volume_threshold_is_logged_in_units_of_the_scene(views, caplog):
+def test_the_volume_threshold_is_logged_in_units_of_the_scene(views, logged):
     """Twice as large in the training, a volume is eight times as large there."""
-    caplog.set_level("INFO", "gsbench")
     moved = replace(views.capture, normalization=Normalization((1.0, 2.0, 3.0), 2.0))
     _log_normalization(moved, Volumetric(volume_threshold=0.004))
-    assert "densify.volume_threshold=0.004 is 0.0005 cubed units of the scene" in caplog.text
-    caplog.clear()
+    assert "densify.volume_threshold=0.004 is 0.0005 cubed units of the scene" in logged.text
+    logged.clear()
     _log_normalization(views.capture, Volumetric())
-    assert not caplog.text
+    assert not logged.text
