@@ -60,7 +60,7 @@ def inputs(**options):
 
 def test_an_evaluation_without_newer_settings_keeps_its_key(monkeypatch):
     monkeypatch.setattr(keys, "edited", lambda files: {})  # as in a release
-    old = {"train": TRAINED.key, "protocol": "paper-1", "unavailable": FOUR_LPIPS, "maps": False}
+    old = {"train": TRAINED.key, "protocol": "paper-1", "unavailable": FOUR_LPIPS}
     assert inputs() == old
     for more in (["gmsd", "fsim"], ["fsim", "gmsd"]):
         assert inputs(more=more)["more"] == ["fsim", "gmsd"]

@@ -51,7 +51,6 @@ def evaluate_step(views: Views, trained: Step, parts: Parts) -> Step:
         # part of the key: weights that arrive later give a new result
         "unavailable": sorted(evaluator.unavailable),
         "train": trained.key,
-        "maps": False,  # a setting of earlier versions
     }
     own = {
         name: options_of("eval", metric, user, f"{EXTRA}.{name}")
