@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from plyfile import PlyData, PlyElement
 
 from gsbench.cli import run
 from gsbench.densify import DensifyContext
@@ -149,8 +150,9 @@ def test_the_initialiser_of_its_document_runs(folder):
 
 def test_a_cloud_from_a_file_keeps_as_many_points_as_asked_for(folder):
     points = np.random.default_rng(0).uniform([-2, -2, 0], [2, 2, 1], (5000, 3))
-    np.savetxt("scan.xyz", points)
-    assert run(f"{SCENE} init=points init.path=scan.xyz init.max_points=900 name=scan".split()) == 0
+    vertices = points.view([(axis, "f8") for axis in "xyz"]).ravel()
+    PlyData([PlyElement.describe(vertices, "vertex")]).write("scan.ply")
+    assert run(f"{SCENE} init=points init.path=scan.ply init.max_points=900 name=scan".split()) == 0
     (scan,) = Path("runs").glob("scan/courtyard/points-none/*/results.json")
     assert read_json(scan)["num_init_points"] == 900
 

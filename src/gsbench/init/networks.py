@@ -290,6 +290,9 @@ def lightglue_matcher(
             old, new = f"{kind}.{layer}.", f"transformers.{layer}.{kind}."
             for name in [name for name in state if name.startswith(old)]:
                 state[name.replace(old, new)] = state.pop(name)
+    # DISK's file also has a constant 1 for each layer, "log_assignment.0.r", that no code reads.
+    unread = [f"log_assignment.{layer}.r" for layer in range(network.conf.n_layers)]
+    state = {name: value for name, value in state.items() if name not in unread}
     load_into(network, state, weights).to(device)
 
     def inputs(features: Features) -> dict[str, torch.Tensor]:
