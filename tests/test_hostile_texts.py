@@ -11,7 +11,6 @@ import pytest
 from gsbench import cli
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import LockHolder
-from gsbench.tracking.trial import TrackedTrial
 from gsbench.words import markdown_code, markdown_text
 from tests.helpers import change_json, read_json, table, write, write_lines
 from tests.trials import write_runs
@@ -123,17 +122,6 @@ def test_no_text_of_a_record_begins_a_line(place, words, capsys, monkeypatch):
             assert "<img" not in re.sub(r"\\.", "", text)
         elif text.startswith("<!"):  # HTML
             assert "<img src=x" not in text
-
-
-def test_the_note_of_a_trial_in_mlflow_is_text(place):
-    """Markdown of a stranger's would load a picture from his server."""
-    _, folders = place
-    trial = TrackedTrial(TrialFolder(folders[0]), read_json(folders[0] / "config.yaml"))
-    note = trial.summary(trial.folder.record(), 0, False).tags["note"]
-    assert BEGIN in note
-    assert not re.search(rf"^\W*{BEGIN}", note, re.MULTILINE)
-    assert "](http" not in re.sub(r"\\.", "", note)
-    assert "<img" not in re.sub(r"\\.", "", note)
 
 
 def test_markdown_shows_a_text_and_does_nothing_else():

@@ -62,7 +62,7 @@ def test_sources_include_every_function_that_kernels_call(module):
         if hasattr(value, "py_func")
         for function in functions_of(value, seen)
     ]
-    assert len(reached) > 3
+    assert reached
     missing = {Path(function.__code__.co_filename).resolve() for function in reached} - sources(
         PACKAGE
     )

@@ -30,8 +30,6 @@ class Tracker:
         if update.scalars:
             keys = {one.key.split("/")[1] for one in update.scalars}
             self.told.append(("log", keys, len(update.scalars)))
-        if "note" in update.tags:
-            self.told.append(("note", update.tags["note"]))
         if update.status:
             self.told.append(("files", list(update.files)))
             self.told.append((update.status, update.reason))
@@ -50,7 +48,7 @@ def words(told):
     return [word for word, *_ in told]
 
 
-ENDED = split("log note files FINISHED")
+ENDED = split("log files FINISHED")
 
 
 def test_a_tracker_that_fails_frees_the_trial(told, tmp_path, monkeypatch):
