@@ -165,4 +165,4 @@ def with_state(page: str, experiment: str) -> str:
 
 
 if __name__ == "__main__":
-    {"train": train, "save": save}[sys.argv[1]](Path(sys.argv[2]).resolve(), sys.argv[3])
+    {"train": train, "save": save}[sys.argv[1]](Path(sys.argv[2]).resolve(), *sys.argv[3:])
