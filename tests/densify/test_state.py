@@ -1,10 +1,12 @@
 """The state of every densifier: statistics that follow edits, lineage, saving, and causes."""
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 
 from gsbench.densify import (
     ADC,
@@ -16,6 +18,7 @@ from gsbench.densify import (
     Volumetric,
 )
 from gsbench.densify.scores import standard_normal
+from gsbench.raster.base import RenderOutput
 from tests.densify.helpers import generator, rendered, trained
 from tests.gaussians.helpers import random_gaussians
 
@@ -130,3 +133,24 @@ def test_normal_draws_on_another_device_are_seeded_by_the_generator(monkeypatch)
     drawn = standard_normal((4, 3), rng, torch.zeros(1, device="meta", dtype=torch.float64))
     assert drawn == ((4, 3), torch.float64, "meta")
     assert seeds == [int(torch.randint(2**62, (1,), generator=again))]
+
+
+def test_statistics_of_a_view_are_those_of_torch_for_visible_gaussians_alone():
+    random = torch.Generator().manual_seed(0)
+    count, scales = 50_000, torch.logspace(-18, 4, 50_000).unsqueeze(-1)
+    gradient = torch.randn(count, 2, generator=random) * scales
+    radii = torch.randint(0, 4, (count,), generator=random, dtype=torch.int32)
+    gradient[radii == 0] = math.nan  # of Gaussians that the view does not show
+    sums = torch.rand(count, generator=random)
+    seen, largest = (torch.full((count,), 2, dtype=torch.int32) for _ in range(2))
+    length = torch.where(radii > 0, gradient.norm(dim=-1), 0.0)
+    expected = sums + length, seen + (radii > 0).int(), torch.maximum(largest, radii)
+    densifier, points = ADC(), torch.zeros(count, 2, requires_grad=True)
+    densifier.statistics = dict(zip(ADC.STATISTICS, (sums, seen, largest), strict=True))
+    points.grad = gradient
+    densifier.gather(RenderOutput(torch.empty(0), torch.empty(0), radii, points))
+    found = [*densifier.statistics.values()]
+    # torch rounds the second square, too, where the processor has no fused instruction
+    assert_allclose(found[0], expected[0], rtol=2.4e-7)
+    assert torch.equal(found[1], expected[1])
+    assert torch.equal(found[2], expected[2])

@@ -25,7 +25,6 @@ from gsbench.raster.cpu import (
     executor,
     layout,
     simd,
-    statistics,
     workspace,
 )
 from gsbench.raster.cpu.workspace import Arena, ShardRunner, TensorPool
@@ -360,21 +359,3 @@ def test_no_shard_runs_after_an_error_was_raised():
     assert done == finished
     with pytest.raises(ZeroDivisionError):
         ShardRunner(1).run(12, work)
-
-
-def test_statistics_of_a_view_are_those_of_torch_for_visible_gaussians_alone():
-    random = torch.Generator().manual_seed(0)
-    count, scales = 50_000, torch.logspace(-18, 4, 50_000).unsqueeze(-1)
-    gradient = torch.randn(count, 2, generator=random) * scales
-    radii = torch.randint(0, 4, (count,), generator=random, dtype=torch.int32)
-    gradient[radii == 0] = math.nan  # of Gaussians that the view does not show
-    sums = torch.rand(count, generator=random)
-    seen, largest = (torch.full((count,), 2, dtype=torch.int32) for _ in range(2))
-    length = torch.where(radii > 0, gradient.norm(dim=-1), 0.0)
-    expected = sums + length, seen + (radii > 0).int(), torch.maximum(largest, radii)
-    found = sums.clone(), seen.clone(), largest.clone()
-    statistics.add_view(*(tensor.numpy() for tensor in (radii, gradient, *found)))
-    # torch rounds the second square, too, where the processor has no fused instruction
-    assert_allclose(found[0], expected[0], rtol=2.4e-7)
-    assert torch.equal(found[1], expected[1])
-    assert torch.equal(found[2], expected[2])

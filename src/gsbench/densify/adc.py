@@ -97,32 +97,25 @@ class ADC(Budgeted):
 
     def gather(self, render: RenderOutput) -> None:
         """Gather the statistics of an iteration within the window."""
-        gradient, statistics = self.gradient_of(render), self.statistics
-        names = "gradient_sum", "visible_count", "max_radii"
-        is_own = type(self).screen_gradient is not ADC.screen_gradient  # of a user's subclass
-        if not is_own and (gradient.device.type, gradient.dtype) == ("cpu", torch.float32):
-            from gsbench.raster.cpu.statistics import add_view
-
-            tensors = render.radii, gradient, *(statistics[name] for name in names)
-            add_view(*(tensor.numpy() for tensor in tensors))
-            return
-        visible = render.visible
+        visible, statistics = render.visible, self.statistics
         statistics["gradient_sum"] += torch.where(visible, self.screen_gradient(render), 0.0)
         statistics["visible_count"] += visible
         statistics["max_radii"] = torch.maximum(statistics["max_radii"], render.radii)
 
     def screen_gradient(self, render: RenderOutput) -> Tensor:
         """Length of the gradient by each projected mean, [N] NDC."""
-        return self.gradient_of(render).norm(dim=-1)
-
-    def gradient_of(self, render: RenderOutput) -> Tensor:
-        """The gradient by each projected mean that the rules use, [N, 2] NDC."""
         gradient = (
             render.screen_gradient_abs if self.gradient == "absolute" else render.screen_points.grad
         )
         if gradient is None:
             raise RuntimeError("observe needs the screen gradient: call it after backward")
-        return gradient
+        if (gradient.device.type, gradient.dtype) != ("cpu", torch.float32):
+            return gradient.norm(dim=-1)
+        from gsbench.raster.cpu.lengths import measure_lengths  # several times as fast as torch
+
+        lengths = gradient.new_empty(len(gradient))
+        measure_lengths(gradient.numpy(), lengths.numpy())
+        return lengths
 
     def rules(self, refinement: Refinement) -> list[Rule]:
         """A round in the order of 3DGS, then the opacity reset."""
