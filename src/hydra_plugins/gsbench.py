@@ -18,7 +18,7 @@ from omegaconf import DictConfig
 
 
 class _Plugin:
-    """What Hydra gives a launcher or a sweeper: gsbench has read its settings before."""
+    """The part that launcher and sweeper share. gsbench has read their settings before."""
 
     def __init__(self, **settings: Any) -> None:
         pass

@@ -19,7 +19,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
 from gsbench.app.grids import GRIDS, run_sweep
 from gsbench.app.hydra_main import FOLDER, run_main, words_for_files, words_for_new_folder
-from gsbench.app.sweep import BASIC, HYDRA_ERRORS, OWN, Ended, Sweep, better_direction
+from gsbench.app.sweep import BASIC, HYDRA_ERRORS, OWN, Ended, Sweep, searched_metric
 from gsbench.app.tuning import mean_of, words_of_point
 from gsbench.config.command_words import grid_points
 from gsbench.config.compose import Trial, check_permitted, installed_nodes
@@ -31,7 +31,6 @@ from gsbench.files import checked_runs_folder, storage_errors
 from gsbench.launch.batch import begin
 from gsbench.launch.jobs import Outcome, check_job_links, outcome_of_error
 from gsbench.logs import set_up_logging
-from gsbench.runs.experiments import DEFAULT_METRIC, metric_and_question
 from gsbench.system.programs import allow_modules
 from gsbench.words import command
 
@@ -89,8 +88,7 @@ def goal_of(sweep: Sweep) -> Goal | None:
     lists |= {key_of(word): word for word in sweep.words if is_sweep(word)}
     seeds = grid_points([parse_word(lists["seed"])]) if "seed" in lists else []
     values = sweep.trial([word for word in sweep.words if not is_sweep(word)]).values
-    metric = metric_and_question(str(values["eval"].get("primary") or ""))[0] or DEFAULT_METRIC
-    direction, sign = better_direction(metric, values), _sign(node)
+    (metric, direction), sign = searched_metric(values), _sign(node)
     log.info(
         "hydra/sweeper=%s gets %s%s of validation views, %s",
         sweep.other_sweeper,

@@ -21,6 +21,7 @@ from gsbench.config.explain import explained
 from gsbench.config.overrides import is_sweep, parse_word
 from gsbench.errors import InputError
 from gsbench.logs import set_up_logging
+from gsbench.runs.experiments import DEFAULT_METRIC, metric_and_question
 
 if TYPE_CHECKING:  # loads scipy, which completion does without
     from gsbench.launch.jobs import Outcome
@@ -86,14 +87,18 @@ class Sweep(Composer):
             return OverridesParser.create(config_loader()).parse_overrides(list(words))
 
 
-def better_direction(metric: str, values: Mapping[str, Any]) -> Literal[-1, 1]:
-    """1 if more of ``eval.primary`` is better, else -1. Raises InputError if neither is."""
+def searched_metric(values: Mapping[str, Any]) -> tuple[str, Literal[-1, 1]]:
+    """The metric of ``eval.primary`` (default: PSNR), and 1 if more of it is better, else -1.
+
+    Raises InputError if that is not known.
+    """
+    metric, _ = metric_and_question(str(values["eval"].get("primary") or DEFAULT_METRIC))
     direction = facts_for(metric, values).direction
     if not direction:
         raise InputError(
             f"eval.primary={metric}: whether more or less of it is better is not known"
         )
-    return 1 if direction > 0 else -1
+    return metric, 1 if direction > 0 else -1
 
 
 def check_sweep_settings(config: DictConfig, multirun: bool) -> None:

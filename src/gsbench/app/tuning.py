@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 from hydra.core.override_parser.types import Override
 
 from gsbench.analysis.results import group_by
-from gsbench.app.sweep import Run, Sweep, better_direction
+from gsbench.app.sweep import Run, Sweep, searched_metric
 from gsbench.config.command_words import check_makes_trials, grid_points
 from gsbench.config.compose import Composer, Trial
 from gsbench.config.overrides import bare_key, key_of, parse_word
@@ -32,13 +32,7 @@ from gsbench.config.schema import TUNE, TuneSettings
 from gsbench.errors import GsbenchError, InputError
 from gsbench.files import make_runs_folder, write_json
 from gsbench.runs.configuration import flatten
-from gsbench.runs.experiments import (
-    DEFAULT_METRIC,
-    SearchPoint,
-    TuningRecord,
-    make_home,
-    metric_and_question,
-)
+from gsbench.runs.experiments import SearchPoint, TuningRecord, make_home
 from gsbench.runs.layout import TUNING
 from gsbench.settings import check_values
 from gsbench.system.install import require_package
@@ -300,9 +294,7 @@ def _asked(tune: TuneSettings, trials: Sequence[Trial]) -> dict[str, Any]:
 
     Raises InputError for a metric without a better direction.
     """
-    values = trials[0].values
-    metric, _ = metric_and_question(str(values["eval"].get("primary") or DEFAULT_METRIC))
-    direction = better_direction(metric, values)
+    metric, direction = searched_metric(trials[0].values)
     try:
         points = grid_points([parse_word(f"seed={tune.seed}")])
         seeds = [int(word.partition("=")[2]) for (word,) in points]

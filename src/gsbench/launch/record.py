@@ -5,7 +5,7 @@ Loads no torch.
 
 import logging
 import shutil
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -136,8 +136,7 @@ def asked_of(trials: Sequence[Trial], rows: Sequence[Planned]) -> Asked | None:
     if not facts.direction:
         log.warning("whether more of %s is better is not known: nothing is tested", metric)
         return None
-    earlier = {question.name for question in read_history(trials[0].files.home).questions}
-    named = _named(values, metric, rows, earlier)
+    named = _named(values, metric, rows, trials[0].files.home)
     split = next((key for key, question in QUESTIONS.items() if question == about), "")
     return Asked(
         metric=metric,
@@ -162,16 +161,16 @@ def check_questions(trials: Sequence[Trial]) -> None:
 
 
 def _named(
-    values: Mapping[str, Any], metric: str, rows: Sequence[Planned], earlier: Collection[str]
+    values: Mapping[str, Any], metric: str, rows: Sequence[Planned], home: Path
 ) -> tuple[Named, ...] | None:
     """The questions that the experiment's file names, if any; raises InputError for a wrong one.
 
     A command that trains a part of the sweep may lack the arms of a question that an earlier
-    command asked: it leaves that question out.
+    command of the experiment in ``home`` asked: it leaves that question out.
     """
     if not values.get("questions"):
         return None
-    found = []
+    earlier, found = {question.name for question in read_history(home).questions}, []
     for number, entry in enumerate(values["questions"], 1):
         where = f"questions[{number}]"
         if not isinstance(entry, dict) or "idea" not in entry:

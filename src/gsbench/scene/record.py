@@ -89,6 +89,7 @@ class AppliedTransform:
         return original
 
     def equals(self, other: AppliedTransform) -> bool:
+        """Return whether both are the same, to the last bit."""
         return self.scale == other.scale and np.array_equal(self.matrix, other.matrix)
 
 

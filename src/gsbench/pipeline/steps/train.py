@@ -149,17 +149,16 @@ def _log_normalization(capture: Capture, densifier: Densifier) -> None:
 def write_training(
     folder: Path,
     summary: Mapping[str, Any],
-    lineage: Lineage | None,
+    lineage: Lineage,
     views: Views,
     device: torch.device,
     start: tuple[InitialCloud, tuple[Oddity, ...]],
 ) -> None:
     """Write a trained model's lineage, and the ``summary`` of the training with more facts."""
-    if lineage is not None:
-        arrays: dict[str, Any] = lineage.state_dict()  # of tensors, which numpy converts
-        np.savez_compressed(folder / LINEAGE, **arrays)
+    arrays: dict[str, Any] = lineage.state_dict()  # of tensors, which numpy converts
+    np.savez_compressed(folder / LINEAGE, **arrays)
     facts = {
-        "causes": {} if lineage is None else lineage.causes_of_living(),
+        "causes": lineage.causes_of_living(),
         "scene_extent": views.scene.extent / views.capture.normalization.scale,
         "initial_cloud": start[0].to_json(),
         "oddities": [odd.to_json() for odd in start[1]],
