@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gsbench.densify.base import Refinement, Rule
 from gsbench.densify.budget import Budgeted, admit
-from gsbench.densify.scores import draw, faded, revised_logits
+from gsbench.densify.scores import draw, faded, lengths_of, revised_logits
 from gsbench.events import Cause
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import RenderOutput
@@ -109,13 +109,7 @@ class ADC(Budgeted):
         )
         if gradient is None:
             raise RuntimeError("observe needs the screen gradient: call it after backward")
-        if (gradient.device.type, gradient.dtype) != ("cpu", torch.float32):
-            return gradient.norm(dim=-1)
-        from gsbench.raster.cpu.lengths import measure_lengths  # several times as fast as torch
-
-        lengths = gradient.new_empty(len(gradient))
-        measure_lengths(gradient.numpy(), lengths.numpy())
-        return lengths
+        return lengths_of(gradient)
 
     def rules(self, refinement: Refinement) -> list[Rule]:
         """A round in the order of 3DGS, then the opacity reset."""

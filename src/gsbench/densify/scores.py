@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from itertools import product
 from typing import Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -29,6 +30,17 @@ def standard_normal(shape: tuple[int, ...], rng: torch.Generator, like: Tensor) 
     seed = int(torch.randint(2**62, (1,), generator=rng))
     device_rng = torch.Generator(like.device).manual_seed(seed)
     return torch.randn(shape, generator=device_rng, dtype=like.dtype, device=like.device)
+
+
+def lengths_of(vectors: Tensor) -> Tensor:
+    """The lengths [N] of ``vectors`` [N, 2]; on a CPU by a kernel, several times as fast."""
+    if (vectors.device.type, vectors.dtype) != ("cpu", torch.float32):
+        return vectors.norm(dim=-1)
+    from gsbench.raster.cpu.lengths import measure_lengths
+
+    lengths = np.empty(len(vectors), np.float32)
+    measure_lengths(vectors.numpy(), lengths)
+    return torch.from_numpy(lengths)
 
 
 MIN_REVISED_OPACITY = 1e-6  # keeps the logit finite
