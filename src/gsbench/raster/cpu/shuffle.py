@@ -26,6 +26,7 @@ REST_STARTS = (0, LANES, REST - LANES)
 
 
 THREE_VECTORS = types.UniTuple(VECTOR, CHANNELS)
+NEIGHBOURS = LANES // CHANNELS  # neighbours of a pixel, on each side, that `neighbour_sums` reaches
 
 
 def _load(builder, pointer, place):
@@ -68,6 +69,24 @@ def store_columns(context, builder, sig, args):
     """Write 16 ``vectors`` as the columns of the matrix at ``array.flat[index : index + 256]``."""
     rows = [builder.extract_value(args[2], k) for k in range(LANES)]
     return _store_transposed(context, builder, address(context, builder, sig, args), rows)
+
+
+@lowering(types.UniTuple(VECTOR, NEIGHBOURS), "before own after")
+def neighbour_sums(context, builder, sig, args):
+    """For 16 numbers of an interleaved row, the sums of their left and right neighbours.
+
+    ``own`` are the numbers, ``before`` and ``after`` the 16 numbers beside them. Vector k has the
+    neighbours k + 1 pixels away. Loads of them would cross cache lines.
+    """
+    before, own, after = args
+    sums = []
+    for shift in range(CHANNELS, LANES, CHANNELS):
+        left = builder.shuffle_vector(
+            before, own, lane_indices(range(LANES - shift, 2 * LANES - shift))
+        )
+        right = builder.shuffle_vector(own, after, lane_indices(range(shift, LANES + shift)))
+        sums.append(builder.fadd(left, right))
+    return context.make_tuple(builder, sig.return_type, sums)
 
 
 def _row_pointers(context, builder, sig, args, numbers):
