@@ -62,6 +62,7 @@ from gsbench.raster.cpu.simd import (
     log2,
     lowest_bit,
     mask_bits,
+    mask_from_bits,
     maximum,
     minimum,
     prefetch_far,
@@ -167,7 +168,7 @@ def _project(floats, indices, begin, end, gaussians, degree, v, outputs):
 
         rgb = _color(degree, dc, offset, todo, start, gaussians.sh_rest, floats)
         red, green, blue = rgb
-        bad += select(seen, (red + green + blue) * ZERO, ZERO)
+        bad += select(mask_from_bits(todo), (red + green + blue) * ZERO, ZERO)
         clamped = select(red < ZERO, splat(ONE), ZERO)
         clamped += select(green < ZERO, splat(TWO), ZERO) + select(blue < ZERO, splat(FOUR), ZERO)
 
