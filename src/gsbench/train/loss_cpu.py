@@ -6,8 +6,11 @@ once, into a ring buffer of 11 rows, which are then filtered vertically. Statist
 are computed again in each step, so views need no further memory.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from gsbench.eval.ssim import C1, C2, WINDOW_RADIUS, window
@@ -55,11 +58,11 @@ def _blur_row(source, start, target, place, numbers):
 
 
 @inlined
-def _clear_slot(ring, slot, length, part, maps):
+def _clear_slot(ring, slot, length, maps):
     """Set a row of a ring of ``maps`` to 0: it is outside the image."""
     for m in range(maps):
         for i in range(0, length, LANES):
-            store(ring, m * part + slot + i, splat(ZERO))
+            store(ring, m * TAPS * length + slot + i, splat(ZERO))
 
 
 @inlined
@@ -111,32 +114,53 @@ def _write_row(line, row, numbers, image):
             store(image, start + place, load(line, PAD + place))
 
 
+class Pictures(NamedTuple):
+    """A render [H * W * 3], and the photograph that it is compared with, divided by ``divisor``."""
+
+    image: NDArray[np.float32]
+    target: NDArray[np.float32] | NDArray[np.uint8]
+    divisor: np.float32
+    height: int
+    width: int
+
+
 @inlined
-def _blur_images(row, numbers, image, target, divisor, lines, padded, ring, slot, part):
-    """Blur a row of the four maps horizontally, into their rings; return its |image - target|.
+def _sizes(width):
+    """The numbers of a row; these rounded up to whole vectors; and these with the padding."""
+    numbers = width * CHANNELS
+    length = (numbers + LANES - 1) // LANES * LANES
+    return numbers, length, length + 2 * PAD
+
+
+@inlined
+def _blur_images(row, pictures, lines, ring, slot):
+    """Blur a row of the four maps horizontally, into ``ring``; return its |image - target|.
 
     ``lines`` [4, padded] is scratch, with zeros beside the numbers.
     """
+    numbers, length, padded = _sizes(pictures.width)
     x, y, squares, products = lines, lines[padded:], lines[2 * padded :], lines[3 * padded :]
-    _read_row(image, row, numbers, ONE, x)
-    _read_row(target, row, numbers, divisor, y)
+    _read_row(pictures.image, row, numbers, ONE, x)
+    _read_row(pictures.target, row, numbers, pictures.divisor, y)
     l1 = splat(ZERO)
-    for i in range(PAD, PAD + numbers, LANES):
+    for i in range(PAD, PAD + length, LANES):
         a, b = load(x, i), load(y, i)
         store(squares, i, fma(a, a, b * b))  # SSIM needs only the sum of both variances
         store(products, i, a * b)
         l1 += absolute(a - b)
     for m in range(MAPS):
-        _blur_row(lines, m * padded, ring, m * part + slot, numbers)
+        _blur_row(lines, m * padded, ring, m * TAPS * length + slot, numbers)
     return l1
 
 
 @inlined
-def _compare_row(row, numbers, ring, length, part, slopes, padded):
+def _compare_row(row, width, ring, slopes):
     """The sum of SSIM of a row, by lanes; write its derivatives to ``slopes`` [3, padded].
 
     They are those by the blurred image, its blurred square and its blurred product with the target.
     """
+    numbers, length, padded = _sizes(width)
+    part = TAPS * length
     lane, similarity = load(LANE, 0), splat(ZERO)
     for i in range(0, numbers, LANES):
         mean_x = _blur_column(ring, 0, i, row, length)
@@ -165,18 +189,17 @@ def _compare_row(row, numbers, ring, length, part, slopes, padded):
 
 
 @inlined
-def _differentiate_row(
-    row, numbers, image, target, divisor, factors, ring, length, part, lines, padded, gradient
-):
+def _differentiate_row(row, pictures, factors, ring, lines, gradient):
     """Write a row of ``gradient``; ``lines`` [3, padded] is scratch."""
+    numbers, length, padded = _sizes(pictures.width)
     x, y, line = lines, lines[padded:], lines[2 * padded :]
-    _read_row(image, row, numbers, ONE, x)
-    _read_row(target, row, numbers, divisor, y)
+    _read_row(pictures.image, row, numbers, ONE, x)
+    _read_row(pictures.target, row, numbers, pictures.divisor, y)
     for i in range(0, numbers, LANES):
         a, b = load(x, PAD + i), load(y, PAD + i)
         d_mean = _blur_column(ring, 0, i, row, length)
-        d_square = _blur_column(ring, part, i, row, length)
-        d_product = _blur_column(ring, 2 * part, i, row, length)
+        d_square = _blur_column(ring, TAPS * length, i, row, length)
+        d_product = _blur_column(ring, 2 * TAPS * length, i, row, length)
         # By x: the blur of the derivative by mx, + 2 x that by E[x^2], + y that by E[xy].
         similarity = fma(d_square * TWO, a, fma(d_product, b, d_mean))
         sign = select(a > b, splat(factors[0]), select(a < b, splat(-factors[0]), ZERO))
@@ -185,66 +208,49 @@ def _differentiate_row(
 
 
 @kernel
-def loss_rows(
-    first, past, all_memory, height, width, image, target, divisor, factors, gradient, sums
-):
+def loss_rows(first, past, memory, pictures, factors, gradient, sums):
     """Write the sums of SSIM and of |image - target| of each row to ``sums`` [H, 2].
 
     The rows are those of the shards ``first`` to ``past``. ``gradient`` [H * W * 3], if not empty,
     gets that of the loss, whose ``factors`` [2] are those of |image - target| and of SSIM.
-    ``all_memory`` is scratch for all shards.
+    ``memory`` [shards, …] is scratch.
     """
-    begin, end, memory = height * first // SHARDS, height * past // SHARDS, all_memory[first]
-    numbers = width * CHANNELS
-    length = (numbers + LANES - 1) // LANES * LANES
-    padded = length + 2 * PAD
-    part = TAPS * length
-    lines, slopes = memory, memory[MAPS * padded :]
-    # A ring has the last eleven rows, blurred horizontally: so each is read once.
-    ring = memory[(MAPS + SLOPES) * padded :]
-    pulled = ring[MAPS * part :]
-    scratch = pulled[SLOPES * part :]
+    height, width = pictures.height, pictures.width
+    begin, end, differentiate = height * first // SHARDS, height * past // SHARDS, len(gradient) > 0
+    numbers, length, padded = _sizes(width)
+    lines, slopes = memory[first], memory[first][MAPS * padded :]
+    # The rings have the last eleven rows, blurred horizontally: of the maps, and of the derivatives
+    # of SSIM by them, which so never leave the cache.
+    blurred = slopes[SLOPES * padded :]
+    pulled = blurred[MAPS * TAPS * length :]
+    scratch = pulled[SLOPES * TAPS * length :]
     for i in range(0, (MAPS + SLOPES) * padded, LANES):
-        store(memory, i, splat(ZERO))
-    reach = WINDOW_RADIUS if len(gradient) == 0 else 2 * WINDOW_RADIUS
+        store(lines, i, splat(ZERO))
+    reach = 2 * WINDOW_RADIUS if differentiate else WINDOW_RADIUS
     for row in range(begin - reach, end + reach):
         slot = (row + TAPS) % TAPS * length
         if 0 <= row < height:
-            l1 = _blur_images(row, numbers, image, target, divisor, lines, padded, ring, slot, part)
+            l1 = _blur_images(row, pictures, lines, blurred, slot)
             if begin <= row < end:
                 sums[row, 1] = _sum(l1, scratch)
         else:
-            _clear_slot(ring, slot, length, part, MAPS)
-        center = row - WINDOW_RADIUS
+            _clear_slot(blurred, slot, length, MAPS)
+        center = row - WINDOW_RADIUS  # the ring has all rows of its window
         if center < begin - reach + WINDOW_RADIUS:
             continue
         slot = (center + TAPS) % TAPS * length
         if 0 <= center < height:
-            similarity = _compare_row(center, numbers, ring, length, part, slopes, padded)
+            similarity = _compare_row(center, width, blurred, slopes)
             if begin <= center < end:
                 sums[center, 0] = _sum(similarity, scratch)
-            if len(gradient) > 0:
-                # The symmetric blur is its own adjoint, so the derivatives are blurred, too.
-                for m in range(SLOPES):
-                    _blur_row(slopes, m * padded, pulled, m * part + slot, numbers)
+            # The symmetric blur is its own adjoint, so the derivatives are blurred, too.
+            for m in range(SLOPES if differentiate else 0):
+                _blur_row(slopes, m * padded, pulled, m * TAPS * length + slot, numbers)
         else:
-            _clear_slot(pulled, slot, length, part, SLOPES)
+            _clear_slot(pulled, slot, length, SLOPES)
         done = center - WINDOW_RADIUS
-        if len(gradient) > 0 and done >= begin:
-            _differentiate_row(
-                done,
-                numbers,
-                image,
-                target,
-                divisor,
-                factors,
-                pulled,
-                length,
-                part,
-                lines,
-                padded,
-                gradient,
-            )
+        if differentiate and done >= begin:
+            _differentiate_row(done, pictures, factors, pulled, lines, gradient)
 
 
 class CompiledLoss(KernelLoss):
@@ -272,20 +278,11 @@ class CompiledLoss(KernelLoss):
         size = (MAPS + SLOPES) * (TAPS + 1) * padded + LANES
         memory = arena.take("memory", (SHARDS, size), np.float32)
         gradient = self._tensors.empty((height if differentiate else 0, width, CHANNELS))
-        weights = np.array([1 - self.ssim_weight, self.ssim_weight]) / numbers
-        self._runner.run(
-            SHARDS,
-            loss_rows,
-            memory,
-            height,
-            width,
-            pixels,
-            wanted,
-            divisor,
-            weights.astype(np.float32),
-            gradient.numpy().reshape(-1),
-            sums,
-        )
+        factors = np.array([1 - self.ssim_weight, self.ssim_weight]) / numbers
+        outputs = gradient.numpy().reshape(-1), sums
+        pictures = Pictures(pixels, wanted, divisor, height, width)
+        weights = factors.astype(np.float32)
+        self._runner.run(SHARDS, loss_rows, memory, pictures, weights, *outputs)
         similarity, l1 = (float(value) / numbers for value in sums.sum(0))
         loss = (1 - self.ssim_weight) * l1 + self.ssim_weight * (1 - similarity)
         return torch.tensor([loss, l1, similarity]), gradient if differentiate else None
