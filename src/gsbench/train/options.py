@@ -48,7 +48,6 @@ class TrainConfig(LearningRates):
     mcmc_stop: NonNegativeInt = 25_000  # end of the longer window of 3DGS-MCMC
     # True: the optimiser steps before a refinement, as in gsplat, so no step is lost
     step_after_refine: bool = False
-    # DashGaussian (train/views.py): training starts on small images
     # steps of plain autograd, as trainings with a loss, term or optimiser of your own have them:
     # the same bits, in more time; a command with such a training gives it to all
     by_autograd: bool = False
