@@ -120,10 +120,9 @@ class TrialSteps:
         check_capture(self.views, parts)
         yield init
         program = parts.program
-        if program is None:
-            trained = train_step(self.views, parts)
-        else:
-            trained = external_step(self.views, program, parts)
+        trained = (
+            external_step(self.views, program, parts) if program else train_step(self.views, parts)
+        )
         yield trained
         yield ground_truth_step(self.views)
         yield evaluate_step(self.views, trained, parts)
