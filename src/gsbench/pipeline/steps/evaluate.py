@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -22,7 +22,6 @@ from gsbench.files import write_json
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
 from gsbench.gaussians.ply import read_ply
 from gsbench.logs import progress
-from gsbench.pipeline.parts import Parts
 from gsbench.pipeline.steps.regions import region_inputs, regions_of
 from gsbench.pipeline.steps.scene import Views
 from gsbench.runs.keys import EVALUATE, Step, options_of, rasterizer_inputs, step_of
@@ -37,6 +36,9 @@ from gsbench.scene.images import png_name
 from gsbench.scene.types import COUNTED, Scene, nearest_training_cameras
 from gsbench.system.resources import available_threads
 from gsbench.train.trainer import snapshot_file
+
+if TYPE_CHECKING:
+    from gsbench.pipeline.parts import Parts
 
 EXTRA = "eval.extra"  # the setting that names the user's own metrics
 

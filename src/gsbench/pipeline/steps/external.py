@@ -10,7 +10,7 @@ import tempfile
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from gsbench.densify import Lineage
 from gsbench.errors import InputError, TrainingError
@@ -26,7 +26,6 @@ from gsbench.external.settings import (
 )
 from gsbench.init import read_cloud
 from gsbench.init.base import MODEL_FOLDER, PointCloud
-from gsbench.pipeline.parts import Parts
 from gsbench.pipeline.steps.scene import Views
 from gsbench.pipeline.steps.train import check_points, write_training
 from gsbench.runs.keys import TRAIN, Step, options_of, step_of
@@ -34,6 +33,9 @@ from gsbench.runs.layout import EVENTS, POINT_CLOUD, TRAINER_LOG
 from gsbench.runs.trial_record import FROM_MODEL
 from gsbench.system.programs import SAFE_PATH
 from gsbench.words import readable_time
+
+if TYPE_CHECKING:
+    from gsbench.pipeline.parts import Parts
 
 log = logging.getLogger(__name__)
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,7 +14,6 @@ from gsbench.errors import InputError
 from gsbench.eval.options import DISTANCE
 from gsbench.eval.regions import Depth, Regions, depths_of_points, regions_by_distance
 from gsbench.init.base import MODEL_FOLDER
-from gsbench.pipeline.parts import Parts
 from gsbench.pipeline.steps.scene import Views
 from gsbench.scene.beside import (
     DEPTH,
@@ -30,6 +29,9 @@ from gsbench.scene.colmap_files import require_subfolder
 from gsbench.scene.load import lenses_of
 from gsbench.scene.types import Array, CameraModel, Capture, View
 from gsbench.scene.undistortion import flat_camera
+
+if TYPE_CHECKING:
+    from gsbench.pipeline.parts import Parts
 
 
 def check_capture(views: Views, parts: Parts) -> None:

@@ -6,7 +6,7 @@ import dataclasses
 import logging
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -21,7 +21,6 @@ from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.init import read_cloud
 from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER
 from gsbench.logs import progress
-from gsbench.pipeline.parts import Parts
 from gsbench.pipeline.steps.scene import Views
 from gsbench.runs.configuration import is_ingredient
 from gsbench.runs.keys import TRAIN, Step, options_of, rasterizer_inputs, step_of
@@ -34,6 +33,9 @@ from gsbench.system.resources import CLOCK, peak_memory_mb, reset_peak_memory
 from gsbench.train.options import IDEAS
 from gsbench.train.start import check_start
 from gsbench.train.trainer import Status, Trainer
+
+if TYPE_CHECKING:
+    from gsbench.pipeline.parts import Parts
 
 log = logging.getLogger(__name__)
 
