@@ -247,6 +247,6 @@ def test_kernels_are_timed_and_put_back_when_a_step_fails():
         "project_shards",
         "composite_tiles",
         "composite_backward_tiles",
-        "similarity_rows",
+        "loss_rows",
     } <= times.keys()
     assert min(times.values()) >= 0

@@ -67,7 +67,6 @@ trial = partial(trial_of, QUICK)
         [*SIFT, "scene.max_size=96"],
         split("init=random densify=taming init.count=3000 densify.max_gaussians=6000"),
         ["init=random", "densify=fastgs"],
-        ["init=random", "train.resolution_schedule=pictures"],
     ],
 )
 def test_ignored_pixels_do_not_change_one_bit_of_a_trial(captures, tmp_path, words):

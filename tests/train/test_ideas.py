@@ -1,7 +1,6 @@
 """Loss, terms, schedule and optimiser of the user's: what they read, what they change, errors."""
 
 from dataclasses import dataclass, replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,9 +11,8 @@ from gsbench.errors import TrainingError
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.paper_values import LearningRates
 from gsbench.gaussians.trainable import TrainableGaussians
-from gsbench.raster import create_rasterizer
 from gsbench.raster.contract import Case
-from gsbench.raster.depth import median_depth, render_depth
+from gsbench.raster.depth import render_depth
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.train.ideas import Ideas, weighted
 from tests.conftest import script
@@ -83,60 +81,6 @@ def test_the_gradient_of_depth_is_that_of_finite_differences():
             with torch.no_grad():
                 slope = (value(gaussians.means + step) - value(gaussians.means - step)) / 2e-6
             assert float(gradient[row, axis]) == pytest.approx(float(slope), rel=1e-4, abs=1e-6)
-
-
-def test_median_depth_is_that_of_the_gaussian_at_half_transmittance(case):
-    """Against blending pixel by pixel, Gaussian by Gaussian."""
-    gaussians, camera = case.gaussians(), case.camera()
-    rasterizer, black = ReferenceRasterizer(), torch.zeros(3, dtype=torch.float64)
-    z = z_of(gaussians, camera)
-    expected = torch.zeros(18, 24, dtype=torch.float64)
-    with torch.no_grad():
-        for member in z.argsort(descending=True).tolist():
-            # what is in front of a Gaussian, and it: their opacity rises with each
-            front = gaussians.select((z <= z[member]).nonzero().flatten())
-            alpha = rasterizer.render(front, camera, 0, black).alpha
-            expected = torch.where(alpha >= 0.5, z[member], expected)
-        depth = median_depth(rasterizer, gaussians, camera)
-    assert (depth > 0).any()
-    assert torch.equal(depth > 0, expected > 0)
-    assert torch.allclose(depth, expected)
-
-
-def test_median_depth_of_the_cpu_is_that_of_the_reference():
-    case = Case(90, 70, 3000, sh_degree=0)
-    gaussians = case.gaussians().map(torch.Tensor.float)
-    rasterizer = create_rasterizer("cpu", torch.device("cpu"))
-    ours = median_depth(rasterizer, gaussians, case.camera())
-    expected = median_depth(ReferenceRasterizer(), gaussians, case.camera())
-    assert ((expected > 0).float().mean() > 0.2) & (expected > 0).any()
-    # where the transmittance is a half to the last bits, the executors may choose differently
-    assert (ours == expected).float().mean() >= 0.999
-
-
-def test_only_the_chosen_gaussians_have_a_gradient_of_the_median_depth():
-    case = Case(24, 18, 5, sh_degree=0)
-    gaussians, camera = case.gaussians(), case.camera()
-    gaussians.means.requires_grad_(True)
-    depth = median_depth(ReferenceRasterizer(), gaussians, camera)
-    depth.sum().backward()
-    axis, z = gaussians.means.new_tensor(camera.rotation[2]), z_of(gaussians, camera).detach()
-    counts = (depth.detach()[..., None] == z).sum((0, 1))  # [N] pixels of each Gaussian
-    assert torch.allclose(gaussians.means.grad, counts[:, None] * axis)
-    assert 0 < int((counts > 0).sum()) < len(z) + 1
-
-
-def test_a_term_that_asks_for_it_reads_the_median_depth(lab):
-    @dataclass
-    class Median:
-        needs_median_depth = True
-
-        def __call__(self, step):
-            assert step.render.depth is None
-            assert step.render.median_depth.shape == step.photograph.shape[:2]
-            return step.render.median_depth.mean()
-
-    trained(lab, parts={"terms": [(Median(), 0.1)]}, iterations=2)
 
 
 # ---- terms and losses
@@ -374,8 +318,7 @@ def with_beside(lab):
     return lab.with_views(train=tuple(views))
 
 
-@pytest.mark.parametrize("divisor", [1, 2])
-def test_a_term_reads_the_pictures_beside_the_photograph(lab, divisor):
+def test_a_term_reads_the_pictures_beside_the_photograph(lab):
     seen = []
 
     class Beside:
@@ -386,18 +329,12 @@ def test_a_term_reads_the_pictures_beside_the_photograph(lab, divisor):
             names = [one.name for one in lab.scene.train]
             assert view.depth.unique().tolist() == [names.index(view.name) + 1]
             assert (view.more["normals"] == view.depth[..., None]).all()
-            seen.append(view.photograph.shape)
+            seen.append(view.name)
             return 0 * step.render.image.mean()
 
     ideas = own([(Beside(), 1.0)])
-    trainer = with_beside(lab).new(NoDensifier(), ideas=ideas, iterations=12)
-    if divisor > 1:
-        trainer.resolution = SimpleNamespace(
-            scale=lambda step: divisor if step < 6 else 1, position_step=lambda step: step
-        )
-    trainer.run(lab.folder)
+    with_beside(lab).new(NoDensifier(), ideas=ideas, iterations=12).run(lab.folder)
     assert len(seen) == 12
-    assert len(set(seen)) == divisor  # sizes
 
 
 def test_an_error_of_a_term_names_it_and_says_how_to_ask_for_depth(lab):

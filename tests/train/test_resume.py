@@ -22,10 +22,6 @@ OTHERS = {
     "resgs": lambda: small(ResGS, phase_ends=[0.3, 0.6], fade_interval=15, fade_stop=100),
     "taming": lambda: small(Taming, max_gaussians=150),
 }
-SMALL_FIRST = {
-    "resolution_schedule": "pictures",
-    **{"densify_start": 20, "densify_stop": 100, "densify_interval": 20},
-}
 
 
 @pytest.mark.parametrize(
@@ -33,9 +29,7 @@ SMALL_FIRST = {
 )
 def test_crashes_and_signals_at_random_iterations_do_not_change_the_result(name, lab):
     make = (STATEFUL | OTHERS)[name]
-    settings = {"log_every": 1, **(SMALL_FIRST if name in ("gns", "edgeaware") else {})}
-    whole = lab.train(make(), "whole", **settings)
-    assert lab.records(METRICS, "whole")[0].get("scale", 2) >= 2
+    whole = lab.train(make(), "whole", log_every=1)
     rng = random.Random(name)
     crashes = stops = 0
     for attempt in range(12):
@@ -53,7 +47,7 @@ def test_crashes_and_signals_at_random_iterations_do_not_change_the_result(name,
         try:
             with stop_on_signals():
                 broken_result = lab.train(
-                    make(), "broken", interrupt, checkpoint_every=13, **settings
+                    make(), "broken", interrupt, checkpoint_every=13, log_every=1
                 )
             break
         except StopError:
@@ -62,7 +56,7 @@ def test_crashes_and_signals_at_random_iterations_do_not_change_the_result(name,
             stops += 1
             assert seen[-1] in lab.checkpoints("broken")
     else:
-        broken_result = lab.train(make(), "broken", **settings)
+        broken_result = lab.train(make(), "broken", log_every=1)
     assert crashes >= 1
     assert stops >= 1
     assert same(whole, broken_result)

@@ -191,7 +191,6 @@ def test_the_optimiser_steps_after_or_before_a_refinement(before, lab):
     assert torch.equal(training.gaussians.values.means, seen[1])
     rate = training.options.position(1) * lab.scene.extent
     assert training.gaussians.position_rate == pytest.approx(rate, rel=1e-9)
-    assert training.scale == 1  # pictures of full size
 
 
 @pytest.mark.parametrize("visible_adam", [False, True])

@@ -277,7 +277,6 @@ def plain(values: Any, given: Mapping[str, Any] = MappingProxyType({})) -> Any:
 FIXED_IN_PROGRAMS: tuple[tuple[str, str, Any, str], ...] = (
     ("eval", "at", [], "shows its model only at the end: leave eval.at empty"),
     ("train", "max_seconds", None, "cannot be stopped early: give it fewer train.iterations"),
-    ("train", "resolution_schedule", "none", "has its own sizes: leave it at none"),
     *(("train", name, None, f"has its own {name}: leave it out") for name in IDEAS),
 )
 

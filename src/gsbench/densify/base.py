@@ -114,7 +114,6 @@ class Densifier:
     needs_absolute_gradient: bool = False
     needs_footprint: bool = False  # ``RenderOutput.footprint``, which not every rasterizer gives
     needs_depth: bool = False  # ``RenderOutput.depth`` of each training view
-    needs_median_depth: bool = False  # ``RenderOutput.median_depth``
     # the extra output to ask for (``RenderOutput.extra``), which not every rasterizer gives
     needs_extra: str | None = None
 

@@ -46,7 +46,6 @@ class RasterConstants:
 
 
 CONSTANTS = RasterConstants()
-MEDIAN = 0.5  # the transmittance at which the median depth lies
 
 
 def slope_limits(camera: Camera) -> tuple[float, float, float, float]:
@@ -149,8 +148,6 @@ class RenderOutput(NamesAttributes):
       no footprints.
     - ``depth`` is the expected depth along the camera's z, [H, W] world units, 0 where alpha is 0;
       None unless a part of the training asks for it (`gsbench.raster.depth.render_depth`).
-    - ``median_depth`` is the z of the Gaussian at which the transmittance falls to a half
-      (`gsbench.raster.depth.median_depth`), for parts that ask for it.
     - ``extra`` is a leaf of zeros [N, …], or None if no extra output was requested. After
       ``backward``, its ``.grad`` is the extra output.
     """
@@ -163,7 +160,6 @@ class RenderOutput(NamesAttributes):
     footprint: Callable[..., Footprint] | None = None
     extra: Tensor | None = None
     depth: Tensor | None = None
-    median_depth: Tensor | None = None
 
     @property
     def visible(self) -> Tensor:

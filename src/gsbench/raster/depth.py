@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from gsbench.gaussians.model import C0, Gaussians
-from gsbench.raster.base import MEDIAN, Rasterizer, RenderOutput, view_depths
-from gsbench.raster.reference import tiles_of
+from gsbench.raster.base import Rasterizer, RenderOutput, view_depths
 from gsbench.scene.types import Camera
 
 
@@ -29,26 +28,3 @@ def render_depth(
     # An alpha that is not 0 is at least that of one blended Gaussian, 1/255.
     depth = torch.where(alpha > 0, render.image[..., 0] / torch.where(alpha > 0, alpha, 1.0), 0.0)
     return depth, render
-
-
-def median_depth(rasterizer: Rasterizer, gaussians: Gaussians, camera: Camera) -> Tensor:
-    """The z of the Gaussian at which the transmittance falls to a half, [H, W] world units.
-
-    It is 0 where the transmittance stays above. Only that z has a gradient. An executor without
-    ``median_gaussians`` lets the operations of the reference choose.
-    """
-    z = view_depths(gaussians, camera)
-    choose = getattr(rasterizer, "median_gaussians", median_gaussians)
-    chosen = choose(gaussians, camera)  # [H, W]
-    return torch.where(chosen >= 0, z[chosen.clamp_min(0)], 0.0)
-
-
-@torch.no_grad()
-def median_gaussians(gaussians: Gaussians, camera: Camera) -> Tensor:
-    """The Gaussian at which the transmittance falls to a half, [H, W]; -1 where none is."""
-    chosen = torch.full((camera.height, camera.width), -1, device=gaussians.means.device)
-    for tile in tiles_of(gaussians, camera):
-        is_behind = tile.weights.cumsum(1) >= 1 - MEDIAN  # [P, K]
-        first = torch.where(is_behind.any(1), tile.rows[is_behind.int().argmax(1)], -1)
-        chosen[tile.place] = first.reshape(chosen[tile.place].shape)
-    return chosen

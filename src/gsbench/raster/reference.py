@@ -8,7 +8,6 @@ float64. The formulas are those of EWA splatting (Zwicker et al. 2001) as in 3DG
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -106,14 +105,21 @@ class ReferenceRasterizer:
     ) -> Footprint:
         sums, distances = gaussians.means.new_zeros(2, len(gaussians))
         covered = torch.zeros_like(sums, dtype=torch.int32)
-        for tile in tiles_of(gaussians, camera):
-            blended = tile.weights > 0  # [P, K]
-            covered.index_add_(0, tile.rows, blended.sum(0, dtype=torch.int32))
-            apart = (tile.means - tile.pixels.unsqueeze(1)).norm(dim=-1)  # [P, K]
-            distances.index_add_(0, tile.rows, (apart * blended).sum(0))
+        projected = project(gaussians, camera)
+        tiles = members_of_tiles(projected.depths, *tile_rectangles(projected, camera), camera)
+        # The K Gaussians of a tile, front to back, at its P pixels.
+        for members, place in tiles:
+            pixels = pixel_centres(place, gaussians.means)  # [P, 2]
+            rows = projected.index[members]  # [K] into all Gaussians
+            means = projected.means[members].expand(len(pixels), -1, -1)  # [P, K, 2] px
+            conics, opacities = projected.conics[members], gaussians.opacities[rows]
+            blended = blending_weights(pixels, means, conics, opacities) > 0  # [P, K]
+            covered.index_add_(0, rows, blended.sum(0, dtype=torch.int32))
+            apart = (means - pixels.unsqueeze(1)).norm(dim=-1)  # [P, K]
+            distances.index_add_(0, rows, (apart * blended).sum(0))
             if values is not None:
-                own = values[tile.place].reshape(-1, 1).to(sums)  # [P, 1]
-                sums.index_add_(0, tile.rows, (own * blended).sum(0))
+                own = values[place].reshape(-1, 1).to(sums)  # [P, 1]
+                sums.index_add_(0, rows, (own * blended).sum(0))
         return Footprint(covered, view_depths(gaussians, camera), sums, distances)
 
     @staticmethod
@@ -122,29 +128,6 @@ class ReferenceRasterizer:
         offsets = gaussians.means[index] - center
         directions = torch.nn.functional.normalize(offsets, dim=-1)  # [M, 3]
         return colors(gaussians.sh_dc[index], gaussians.sh_rest[index], directions, sh_degree)
-
-
-class BlendedTile(NamedTuple):
-    """The K Gaussians of a tile, front to back, at its P pixels."""
-
-    place: Tile
-    rows: Tensor  # [K] into all Gaussians
-    pixels: Tensor  # [P, 2]
-    means: Tensor  # [P, K, 2] px
-    weights: Tensor  # [P, K], of `blending_weights`
-
-
-@torch.no_grad()
-def tiles_of(gaussians: Gaussians, camera: Camera) -> Iterator[BlendedTile]:
-    """Yield the tiles of a view that have Gaussians, without gradients."""
-    projected = project(gaussians, camera)
-    tiles = members_of_tiles(projected.depths, *tile_rectangles(projected, camera), camera)
-    for members, place in tiles:
-        pixels, index = pixel_centres(place, gaussians.means), projected.index[members]
-        means = projected.means[members].expand(len(pixels), -1, -1)  # [P, K, 2]
-        conics, opacities = projected.conics[members], gaussians.opacities[index]
-        weights = blending_weights(pixels, means, conics, opacities)
-        yield BlendedTile(place, index, pixels, means, weights)
 
 
 def pixel_centres(tile: Tile, like: Tensor) -> Tensor:

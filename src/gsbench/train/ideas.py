@@ -46,11 +46,10 @@ class TrainedView(NamesAttributes):
 class Step(NamesAttributes):
     """Facts that a loss or a term may read of an iteration (1, 2, …).
 
-    ``render`` has ``image`` [H, W, 3], ``alpha`` [H, W] and, if the class asks for them
-    (``needs_depth = True``, ``needs_median_depth = True``), ``depth`` and ``median_depth`` [H, W];
-    masked pixels of the image are those of the photograph. Everything of ``render`` and
-    ``gaussians`` has gradients. ``rng`` is the training's generator for its parts, on the CPU;
-    checkpoints keep its state.
+    ``render`` has ``image`` [H, W, 3], ``alpha`` [H, W] and, if the class asks for it
+    (``needs_depth = True``), ``depth`` [H, W]; masked pixels of the image are those of the
+    photograph. Everything of ``render`` and ``gaussians`` has gradients. ``rng`` is the training's
+    generator for its parts, on the CPU; checkpoints keep its state.
     """
 
     iteration: int

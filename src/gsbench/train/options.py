@@ -2,7 +2,7 @@
 
 from collections.abc import MutableMapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 
@@ -49,7 +49,6 @@ class TrainConfig(LearningRates):
     # True: the optimiser steps before a refinement, as in gsplat, so no step is lost
     step_after_refine: bool = False
     # DashGaussian (train/views.py): training starts on small images
-    resolution_schedule: Literal["none", "pictures"] = "none"
     # steps of plain autograd, as trainings with a loss, term or optimiser of your own have them:
     # the same bits, in more time; a command with such a training gives it to all
     by_autograd: bool = False

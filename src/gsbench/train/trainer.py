@@ -23,10 +23,10 @@ from gsbench.gaussians.ply import write_ply
 from gsbench.gaussians.trainable import StepAll, TrainableGaussians
 from gsbench.raster import Rasterizer
 from gsbench.raster.base import RenderOutput
-from gsbench.raster.depth import median_depth, render_depth
+from gsbench.raster.depth import render_depth
 from gsbench.raster.executors import find_executor, lacks
 from gsbench.runs.layout import CURVES, EVENTS, HISTOGRAMS
-from gsbench.scene.beside import DEPTH, resized
+from gsbench.scene.beside import DEPTH
 from gsbench.scene.types import Camera, Scene
 from gsbench.system.resources import CLOCK, free_bytes
 from gsbench.system.stopping import deferred, requested
@@ -44,8 +44,6 @@ from gsbench.train.records import (
 )
 from gsbench.train.views import (
     CameraOrder,
-    Resolution,
-    ScaledViews,
     SceneViews,
     Targets,
     generators,
@@ -126,10 +124,7 @@ class Trainer:
         self.options, self.ideas, self.snapshot_at = options, ideas, frozenset(snapshot_at)
         self.device = initial.means.device
         readers = [densifier, *ideas.named.values()]
-        self.needs_depth, self.needs_median_depth = (
-            any(getattr(part, name, False) for part in readers)
-            for name in ("needs_depth", "needs_median_depth")
-        )
+        self.needs_depth = any(getattr(part, "needs_depth", False) for part in readers)
         self.shows_view = "view" in signature(densifier.observe).parameters
         initial = densifier.prepare(initial)
         color = [*options.background]
@@ -137,9 +132,8 @@ class Trainer:
         self.loss = PhotometricLoss(options.ssim_weight, torch.get_num_threads())
         self.fast, step_all = fast_steps(rasterizer, self.loss, options, self.background)
         self.used: FastStep | None = None  # by this iteration
-        adds_depth = self.needs_depth or self.needs_median_depth
         replaced = ideas.reads_renders or ideas.optimizer is not None
-        if options.by_autograd or replaced or adds_depth:
+        if options.by_autograd or replaced or self.needs_depth:
             self.fast = None
         self.gaussians = TrainableGaussians(
             initial, options, scene.extent, step_all, ideas.optimizer
@@ -158,8 +152,6 @@ class Trainer:
         views, free = self.scene.train, free_bytes(self.device)
         budget = None if free is None else int(SHARE_FOR_IMAGES * free)
         self.targets = Targets(views, self.device, budget)
-        self.scaled_views = ScaledViews(views, self.targets, self.device, budget)
-        self.resolution = Resolution(self.options, views)
         degree = partial(sh_degree_at, self.options)
         shown = SceneViews(views, self.targets, self.rasterizer, self.background, self.loss, degree)
         is_white = bool((self.background == 1).all())
@@ -208,8 +200,6 @@ class Trainer:
                         append(stream, volume_histogram(self.step, log_scales))
                 if self.step % options.log_every == 0 or last:
                     record = self.losses.wait() | counts | {"sh_degree": self.sh_degree}
-                    if options.resolution_schedule != "none":
-                        record["scale"] = self.scale
                     # Measure again: on a GPU, `wait` has waited for queued work.
                     self.seconds = earlier_seconds + _clock() - started
                     rate = (self.step - first_step) / max(self.seconds - earlier_seconds, 1e-9)
@@ -239,7 +229,7 @@ class Trainer:
         """
         self.step += 1
         step, options = self.step, self.options
-        self.gaussians.set_step(self.resolution.position_step(step))
+        self.gaussians.set_step(step)
         if self.ideas.schedule is not None:
             base = self.gaussians.base_rates(self.gaussians.position_rate)
             for name, rate in scheduled(self.ideas.schedule, step, base).items():
@@ -278,8 +268,8 @@ class Trainer:
 
         Returns the render, and the scalars for ``losses``.
         """
-        cameras, targets = self.scaled_views.at(self.scale)
-        target, mask = targets.get(index), targets.mask(index)
+        camera = self.scene.train[index].camera
+        target, mask = self.targets.get(index), self.targets.mask(index)
         regularizer = self.densifier.regularizer(self.gaussians.values)
         self.used = self.fast
         if self.fast is not None and self.fast.applies_adam:
@@ -288,7 +278,7 @@ class Trainer:
         if self.used is not None:
             return self.used.step(
                 self.gaussians,
-                cameras[index],
+                camera,
                 target,
                 self.sh_degree,
                 self.densifier.needs_absolute_gradient,
@@ -297,7 +287,7 @@ class Trainer:
                 regularizer,
             )
         render = self.render(index)
-        depth_points = self._add_depth(render, cameras[index])
+        depth_points = self._add_depth(render, camera)
         image = replace_ignored(render.image, target, mask)
         total, scalars = self._loss(render, index, image, target)
         total.backward()
@@ -341,44 +331,38 @@ class Trainer:
         return total, scalars
 
     def _add_depth(self, render: RenderOutput, camera: Camera) -> Tensor | None:
-        """Add the depths that parts ask for to a render.
+        """Add the depth to a render, if a part asks for it.
 
-        Returns the projected means [N, 2] that get the gradient of the expected depth.
+        Returns the projected means [N, 2] that get the gradient of the depth.
         """
-        gaussians = self.gaussians.values
-        if self.needs_median_depth:
-            render.median_depth = median_depth(self.rasterizer, gaussians, camera)
         if not self.needs_depth:
             return None
-        render.depth, of_depth = render_depth(self.rasterizer, gaussians, camera)
+        render.depth, of_depth = render_depth(self.rasterizer, self.gaussians.values, camera)
         return of_depth.screen_points
 
     def _view(self, index: int) -> TrainedView:
-        """The training view ``index`` at the current size."""
-        cameras, targets = self.scaled_views.at(self.scale)
-        view, camera = self.scene.train[index], cameras[index]
+        """The training view ``index`` as ideas see it."""
+        view = self.scene.train[index]
         beside = {
-            name: torch.from_numpy(resized(pixels, camera.width, camera.height)).to(self.device)
-            for name, pixels in view.beside.items()
+            name: torch.from_numpy(pixels).to(self.device) for name, pixels in view.beside.items()
         }
         return TrainedView(
             view.name,
-            camera,
-            as_unit_range(targets.get(index), torch.float32),
-            targets.mask(index),
+            view.camera,
+            as_unit_range(self.targets.get(index), torch.float32),
+            self.targets.mask(index),
             beside.pop(DEPTH, None),
             beside,
         )
 
     def render(self, index: int) -> RenderOutput:
         """Render the training view ``index`` as in the current iteration, with gradients."""
-        camera = self.scaled_views.at(self.scale)[0][index]
         # Passed only if needed: a user's rasterizer may not have this argument.
         wanted = self.densifier.needs_extra
         extra = {} if wanted is None else {"extra": wanted}
         return self.rasterizer.render(
             self.gaussians.values,
-            camera,
+            self.scene.train[index].camera,
             self.sh_degree,
             self.background,
             self.densifier.needs_absolute_gradient,
@@ -406,11 +390,6 @@ class Trainer:
     @property
     def sh_degree(self) -> int:
         return sh_degree_at(self.options, self.step)
-
-    @property
-    def scale(self) -> int:
-        """The divisor of the sides of pictures in the current iteration."""
-        return self.resolution.scale(self.step)
 
     def _nobody_looks(self) -> bool:
         """Return whether nothing sees the model between the backward pass and Adam.

@@ -18,7 +18,7 @@ import math
 
 import numpy as np
 
-from gsbench.raster.base import CONSTANTS, MEDIAN
+from gsbench.raster.base import CONSTANTS
 from gsbench.raster.cpu import layout as at
 from gsbench.raster.cpu.shuffle import BLOCK, CHANNELS, load_colors, store_block, store_colors
 from gsbench.raster.cpu.simd import (
@@ -44,7 +44,6 @@ from gsbench.system.jit import inlined, kernel
 
 LOG2_ALPHA_MIN = np.float32(math.log2(CONSTANTS.alpha_min))
 ALPHA_MAX = np.float32(CONSTANTS.alpha_max)
-HALF = np.float32(MEDIAN)
 TRANSMITTANCE_MIN = np.float32(CONSTANTS.transmittance_min)
 # A block is kept if its largest alpha is almost 1/255: rounding must not lose a pixel.
 LOG2_BLOCK_MIN = np.float32(math.log2(CONSTANTS.alpha_min) - 0.01)
@@ -520,31 +519,3 @@ def cover_tiles(first, past, memory, frame, values, covered, sums, distances):
             covered[shard, index] += np.int32(row[COVERED])
             sums[shard, index] += row[VALUES]
             distances[shard, index] += row[DISTANCES]
-
-
-@kernel
-def choose_median_tiles(first, past, frame, chosen):
-    """Write the Gaussian at which T falls to a half into ``chosen`` [H * W]; -1 where it does not.
-
-    Pixel by pixel: most stop after a few entries, which vectors of sixteen would not gain from.
-    """
-    width, height = frame.camera.width, frame.camera.height
-    records = frame.records
-    for tile in range(frame.bounds[first], frame.bounds[past]):
-        left, top = _origin(tile, frame.camera.tiles_x)
-        for y in range(top, min(top + at.TILE, height)):
-            for x in range(left, min(left + at.TILE, width)):
-                transmittance, found = ONE, -1
-                for entry in range(frame.starts[tile], frame.starts[tile + 1]):
-                    base = frame.entries[entry] * at.RECORD
-                    dy = np.float32(y) - records[base + at.MEAN_Y]
-                    t = np.float32(x) - records[base + at.MEAN_X] + records[base + at.SHEAR] * dy
-                    curve = records[base + at.CURVE_T] * t * t
-                    curve += records[base + at.CURVE_Y] * dy * dy
-                    power = records[base + at.LOG2_OPACITY] + curve
-                    if power >= LOG2_ALPHA_MIN:
-                        transmittance *= ONE - min(np.float32(2.0**power), ALPHA_MAX)
-                        if transmittance <= HALF:
-                            found = frame.record_ints[base + at.INDEX]
-                            break
-                chosen[y * width + x] = found

@@ -24,7 +24,6 @@ from gsbench.raster.cpu.binning import (
 )
 from gsbench.raster.cpu.composite import (
     LOG2_ALPHA_MIN,
-    choose_median_tiles,
     composite_backward_tiles,
     composite_tiles,
     cover_tiles,
@@ -40,7 +39,6 @@ from gsbench.raster.staged import (
     StagedRasterizer,
     raise_for_values,
 )
-from gsbench.scene.types import Camera
 from gsbench.system.resources import available_cores
 
 # Fixed numbers, so that results have the same bits for any number of threads. Each shard of tiles
@@ -281,15 +279,6 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         # The shards are added in one order, whatever the number of threads.
         totals = (torch.from_numpy(shards.sum(0, dtype=shards.dtype)) for shards in outputs)
         return Footprint(next(totals), view_depths(gaussians, request.camera), *totals)
-
-    def median_gaussians(self, gaussians: Gaussians, camera: Camera) -> Tensor:
-        """The Gaussian at which the transmittance falls to a half, [H, W]; -1 where none is."""
-        black = torch.zeros(3)
-        request = RenderRequest(camera, 0, black, None, None, Lifetime())
-        frame = self.forward(gaussians.detach(), request)[3].frame
-        chosen = np.empty(camera.height * camera.width, np.int64)
-        self._runner.run(TILE_SHARDS, choose_median_tiles, frame, chosen)
-        return torch.from_numpy(chosen.reshape(camera.height, camera.width))
 
 
 @lru_cache(maxsize=8)
