@@ -30,8 +30,10 @@ class Calls(Callback):
 
 
 @pytest.fixture
-def place(tmp_path, monkeypatch, runs):
+def place(tmp_path, monkeypatch):
     """The working folder of a command, with modules that were never allowed, and ``mine``."""
+    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
+    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [entry for entry in sys.path if entry])
     (tmp_path / "bomb.py").write_text(BOMB)
     write(tmp_path / "bombs/__init__.py", BOMB)

@@ -36,7 +36,9 @@ class Raises(ADC):
 
 
 @pytest.fixture(autouse=True)
-def place(tmp_path, monkeypatch, runs):
+def place(tmp_path, monkeypatch):
+    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
+    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
     (tmp_path / "own.py").write_text(OWN)
     (tmp_path / "broken.py").write_text("def (:\n")

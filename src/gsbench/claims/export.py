@@ -24,14 +24,7 @@ from gsbench.analysis.fairness import searches_of
 from gsbench.analysis.images import PixelMeasures, region_record, textured_error
 from gsbench.analysis.quantities import TEXTURED
 from gsbench.analysis.results import Experiment, TrialResult, group_by, newest_code, read_views
-from gsbench.claims.archive import (
-    FORMAT,
-    MANIFEST,
-    NO_CONFIGURATION,
-    PICTURES,
-    VERSION,
-    check_size,
-)
+from gsbench.claims.archive import FORMAT, MANIFEST, NO_CONFIGURATION, PICTURES, VERSION, check_size
 from gsbench.errors import InputError
 from gsbench.files import atomic
 from gsbench.parsing import read_bytes, read_typed, read_yaml

@@ -48,11 +48,7 @@ from gsbench.runs import keys, layout
 from gsbench.runs.commands import digest_of, read_history
 from gsbench.runs.store import Store, StoredResult
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.runs.trial_record import (
-    AskedBefore,
-    Failure,
-    TrialRecord,
-)
+from gsbench.runs.trial_record import AskedBefore, Failure, TrialRecord
 from gsbench.scene.colmap_files import model_files
 from gsbench.scene.types import Capture
 from gsbench.system.locks import hold
