@@ -12,6 +12,18 @@ def install():
     return script("install")
 
 
+def recorded(install, monkeypatch, fails):
+    """The commands that the script runs from now on; one fails if ``fails(command)``."""
+    ran = []
+
+    def run(command, **_):
+        ran.append(command)
+        return subprocess.CompletedProcess(command, int(fails(command)), stdout="")
+
+    monkeypatch.setattr(install.subprocess, "run", run)
+    return ran
+
+
 def test_indexes_of_pips_settings_are_passed_to_uv(install, monkeypatch):
     listed = "global.index-url='https://a.org/simple'\nglobal.timeout='9'\n:env:.extra-index-url='https://b.org'\n"
     monkeypatch.setattr(
@@ -27,14 +39,8 @@ def test_indexes_of_pips_settings_are_passed_to_uv(install, monkeypatch):
 
 @pytest.mark.parametrize("uv, code, last", [("uv", 0, "uv"), ("uv", 1, "pip"), (None, 0, "pip")])
 def test_pip_installs_if_uv_is_missing_or_fails(install, monkeypatch, uv, code, last):
-    ran = []
-
-    def run(command, **_):
-        ran.append(command)
-        return subprocess.CompletedProcess(command, code if command[0] == "uv" else 0, stdout="")
-
+    ran = recorded(install, monkeypatch, lambda command: code and command[0] == "uv")
     monkeypatch.setattr(install, "find_uv", lambda pip: uv)
-    monkeypatch.setattr(install.subprocess, "run", run)
     assert install.main(["-e", "."]) == 0
     assert ran[-1][-2:] == ["-e", "."]
     assert (ran[-1][0] == "uv") == (last == "uv")
@@ -44,14 +50,8 @@ def test_pip_installs_if_uv_is_missing_or_fails(install, monkeypatch, uv, code, 
 def test_an_environment_without_pip_uses_that_of_its_base_else_makes_one(
     install, monkeypatch, base_fails, used
 ):
-    ran = []
-
-    def run(command, **_):
-        ran.append(command)
-        return subprocess.CompletedProcess(command, base_fails)
-
+    ran = recorded(install, monkeypatch, lambda command: base_fails)
     monkeypatch.setattr(install.importlib.util, "find_spec", lambda name: None)
-    monkeypatch.setattr(install.subprocess, "run", run)
     assert install.find_pip() == getattr(install, used)
     assert ("ensurepip" in ran[-1]) == bool(base_fails)
 
@@ -60,14 +60,8 @@ def test_an_environment_without_pip_uses_that_of_its_base_else_makes_one(
 def test_an_environment_without_pip_gets_pythons_own_if_no_newer_one_is_found(
     install, monkeypatch, newer, made
 ):
-    ran = []
-
-    def run(command, **_):
-        ran.append(command)
-        return subprocess.CompletedProcess(command, newer if "pip>=25.1" in command else 0)
-
+    ran = recorded(install, monkeypatch, lambda command: newer and "pip>=25.1" in command)
     monkeypatch.setattr(install, "find_uv", lambda pip: None)
     monkeypatch.setattr(install, "find_pip", lambda: install.BASE_PIP)
-    monkeypatch.setattr(install.subprocess, "run", run)
     assert install.main(["-e", "."]) == 0
     assert any("ensurepip" in command for command in ran[:-1]) == made

@@ -93,6 +93,11 @@ def nested(levels, innermost=1):
     return innermost
 
 
+def shown(value):
+    """The name of a case: pytest takes no surrogates."""
+    return str(value)[:20].encode("ascii", "replace").decode()
+
+
 @pytest.mark.parametrize(
     "value, fault",
     [
@@ -117,7 +122,7 @@ def nested(levels, innermost=1):
             "a has a key that is a text with a lone surrogate (half a character)",
         ),
     ],
-    ids=lambda value: str(value)[:20].encode("ascii", "replace").decode(),
+    ids=shown,
 )
 def test_values_that_are_not_plain_are_named_by_their_place(value, fault):
     assert fault_of(value) == fault
@@ -145,7 +150,7 @@ def test_values_are_counted_and_may_be_infinite_where_allowed():
         ("a: 2020-01-01", "is damaged: a is of type date"),
         ("a: \udcff", "is not YAML ("),
     ],
-    ids=lambda value: str(value)[:20].encode("ascii", "replace").decode(),
+    ids=shown,
 )
 def test_dangers_in_yaml_are_named(tmp_path, text, fault):
     (tmp_path / "a.yaml").write_text(text, errors="surrogateescape")

@@ -53,6 +53,8 @@ def test_a_similar_word_is_suggested_whatever_its_case():
     assert did_you_mean("TABLES", ["status", "tables"]) == "; did you mean tables?"
     assert did_you_mean("SEEd", ["seed", "SEED"]) == "; did you mean SEED?"
     assert did_you_mean("xyz", ["status"]) == ""
+    assert did_you_mean("min_model_size", ["max_image_size"]) == ""
+    assert did_you_mean("grad", ["gradient"]) == "; did you mean gradient?"
 
 
 @pytest.mark.parametrize("text", ["", " ", "a\tb", "~nosuchuser/x"])

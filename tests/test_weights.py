@@ -187,13 +187,17 @@ def test_download_that_ends_early_or_is_damaged_leaves_nothing(
     assert list(no_weights.iterdir()) == []
 
 
-@pytest.mark.parametrize("name", ["net.pth", "net.safetensors", "net-pth"])
-def test_tensors_are_read_from_both_formats(tmp_path, name):
-    path = tmp_path / name
-    if name.endswith("safetensors"):
+def save_state(path):
+    if path.name.endswith("safetensors"):
         pytest.importorskip("safetensors.torch").save_file(STATE, path)
     else:
         torch.save(STATE, path)
+
+
+@pytest.mark.parametrize("name", ["net.pth", "net.safetensors", "net-pth"])
+def test_tensors_are_read_from_both_formats(tmp_path, name):
+    path = tmp_path / name
+    save_state(path)
     state = load_state(path)
     assert state.keys() == STATE.keys()
     assert_close(state["a.weight"], STATE["a.weight"])
@@ -240,10 +244,7 @@ def test_code_in_a_file_is_not_run(tmp_path, how):
 def test_truncated_and_foreign_files_are_refused(tmp_path, name, content):
     path = tmp_path / name
     if content == "half":
-        if name.endswith("safetensors"):
-            pytest.importorskip("safetensors.torch").save_file(STATE, path)
-        else:
-            torch.save(STATE, path)
+        save_state(path)
         content = path.read_bytes()[: path.stat().st_size // 2]
     path.write_bytes(content)
     with pytest.raises(MissingWeightsError, match="cannot be read as plain tensors") as caught:

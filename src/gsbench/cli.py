@@ -130,7 +130,7 @@ def _verb(name: str, argv: list[str]) -> int:
 
         raise InputError(
             f"{name!r} is neither a verb nor a setting like key=value"
-            f"{hint_for(name) or did_you_mean(name, list(VERBS))} (verbs: {', '.join(VERBS)})"
+            f"{hint_for(name) or did_you_mean(name, VERBS)} (verbs: {', '.join(VERBS)})"
         )
     verb, runs = load_verb(name), checked_runs_folder(os.environ.get("GSBENCH_RUNS", "runs"))
     with storage_errors(runs):

@@ -186,32 +186,35 @@ def require_no_links(runs: Path, place: Path, below: bool = False) -> None:
     """
     # A runs folder from someone else may hold links. Through them, a log would overwrite files
     # outside the folder, and packing or publishing would include such files.
-    path = runs
+    path = str(runs)  # texts, since thousands of trials come here
     for part in place.relative_to(runs).parts:
-        path /= part
+        path = os.path.join(path, part)
         with suppress(FileNotFoundError, NotADirectoryError):
-            mode = os.lstat(path).st_mode
-            if not stat.S_ISDIR(mode) and not stat.S_ISREG(mode):
+            if _is_special(os.lstat(path).st_mode):
                 raise _no_plain_file(path)
-    folders = [place] if below else []
+    folders = [str(place)] if below else []
     while folders:
         with suppress(FileNotFoundError, NotADirectoryError), os.scandir(folders.pop()) as entries:
             for entry in entries:
                 if entry.is_dir(follow_symlinks=False):
-                    folders.append(Path(entry.path))
+                    folders.append(entry.path)
                 elif not entry.is_file(follow_symlinks=False):
-                    raise _no_plain_file(Path(entry.path))
+                    raise _no_plain_file(entry.path)
 
 
 def remove_special_files(folder: Path) -> None:
     """Remove the links, pipes and devices below ``folder``, but not the targets of links."""
     for path in sorted(folder.rglob("*")):
-        mode = os.lstat(path).st_mode
-        if not stat.S_ISDIR(mode) and not stat.S_ISREG(mode):
+        if _is_special(os.lstat(path).st_mode):
             path.unlink()
 
 
-def _no_plain_file(path: Path) -> InputError:
+def _is_special(mode: int) -> bool:
+    """Return whether it is the mode of a link, a pipe, a device or a socket."""
+    return not stat.S_ISDIR(mode) and not stat.S_ISREG(mode)
+
+
+def _no_plain_file(path: str | Path) -> InputError:
     return InputError(
         f"{path} is a link or not a regular file, and gsbench follows no links in a runs folder: "
         "remove it"
@@ -224,8 +227,7 @@ def require_regular(path: Path) -> None:
     A missing file is allowed.
     """
     with suppress(OSError):
-        mode = path.stat().st_mode
-        if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
+        if _is_special(path.stat().st_mode):
             raise InputError(f"{path} is not a regular file: put a copy of its content there")
 
 

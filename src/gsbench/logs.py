@@ -65,12 +65,13 @@ class PrintableStream:
         try:
             yield
         except OSError as error:
-            if isinstance(error, BrokenPipeError) and self._is_result:
+            if not self._is_result:
+                return
+            if isinstance(error, BrokenPipeError):
                 raise  # its reader, such as `head`, has ended
-            if self._is_result:
-                raise OutputError(
-                    f"the output cannot be written ({error.strerror}): send it elsewhere"
-                ) from None
+            raise OutputError(
+                f"the output cannot be written ({error.strerror}): send it elsewhere"
+            ) from None
 
     def writelines(self, lines: Sequence[str]) -> None:
         for line in lines:
@@ -166,7 +167,7 @@ def _is_new(record: logging.LogRecord) -> bool:
     if "is_new" not in known:  # several handlers ask about one record
         known["is_new"] = record.getMessage() not in _shown_of_scenes
         _shown_of_scenes.add(record.getMessage())
-    return bool(known["is_new"])
+    return known["is_new"]
 
 
 def _make_printable(record: logging.LogRecord) -> bool:

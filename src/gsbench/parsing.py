@@ -372,9 +372,7 @@ def parse_typed(content: bytes, kind: type[T], path: Path) -> T:
     than 4,300 digits.
     """
     try:
-        reader: Any = kind
-        result: T = adapter(reader).validate_json(content)
-        return result
+        return adapter(cast(Any, kind)).validate_json(content)
     except ValidationError as error:
         raise DamagedError(path, describe_misfit(error)) from None
 

@@ -12,7 +12,7 @@ import re
 import reprlib
 import sys
 import types
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -106,9 +106,8 @@ def check_values(cls: type, values: Mapping[str, Any], group: str) -> dict[str, 
     return result
 
 
-def unknown_setting(key: str, name: str, known: Iterable[str]) -> str:
+def unknown_setting(key: str, name: str, known: Collection[str]) -> str:
     """The message for a ``key`` whose last part ``name`` is not among the ``known`` settings."""
-    known = list(known)
     existing = f"there are: {', '.join(known)}" if known else "there are no settings"
     return f"{key} is not a setting{did_you_mean(name, known)} ({existing})"
 

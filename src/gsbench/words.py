@@ -13,6 +13,9 @@ from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any
 
 MAX_NAMED = 3  # names that a message lists; further ones are only counted
+# Share of letters that two names have in common, from which one may be meant for the other. A slip
+# in a setting leaves .66 and more; unlike settings, such as downscale and depth_scale, reach .64.
+LIKE = 0.65
 # Characters that a terminal acts on instead of showing: control characters except line feed and
 # tab, line separators, marks that change the direction of writing (UAX #9), and surrogates, which
 # file names may contain.
@@ -99,8 +102,8 @@ def true_minus(number: str) -> str:
 def did_you_mean(word: str, choices: Iterable[str]) -> str:
     """'; did you mean X?' if a choice is similar to ``word``, else ''."""
     choices = list(choices)
-    near = difflib.get_close_matches(word, choices, n=1) or difflib.get_close_matches(
-        word.lower(), choices, n=1
+    near = difflib.get_close_matches(word, choices, 1, LIKE) or difflib.get_close_matches(
+        word.lower(), choices, 1, LIKE
     )
     return f"; did you mean {near[0]}?" if near else ""
 

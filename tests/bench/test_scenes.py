@@ -32,11 +32,10 @@ def test_the_camera_before_a_scene_is_at_twice_the_median_distance_from_its_midd
 
 
 @pytest.mark.parametrize("make", SCENES.values(), ids=SCENES)
-def test_scenes_have_the_wanted_count_and_are_seeded_and_seen(make):
+def test_scenes_have_the_wanted_count_and_are_repeatable_and_seen(make):
     scene = make(500)
     assert len(scene) == 500
     assert torch.equal(scene.means, make(500).means)
-    assert not torch.equal(scene.means, make(500, seed=1).means)
     for camera in (frontal_camera(60, 45), camera_before(scene, 60, 45)):
         output = ReferenceRasterizer().render(scene, camera, 3, torch.zeros(3))
         assert 0.3 < output.visible.float().mean() <= 1

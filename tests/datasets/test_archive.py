@@ -38,6 +38,10 @@ def packed(*names):
     return stream.getvalue()
 
 
+def opened(data):
+    return open_archive(io.BytesIO(data), "x.zip")
+
+
 def patched(data, signature, offset, layout, value):
     at = data.index(signature) + offset
     return data[:at] + struct.pack(layout, value) + data[at + struct.calcsize(layout) :]
@@ -50,7 +54,7 @@ DIRECTORY, LOCAL = b"PK\x01\x02", b"PK\x03\x04"
 def test_an_archive_of_a_later_version_is_refused(version, tmp_path):
     data = patched(packed("s/images/a.jpg"), DIRECTORY, 6, "<H", version)
     with refusal("is not a complete zip archive"):
-        open_archive(io.BytesIO(data), "x.zip")
+        opened(data)
 
 
 def extract_only(archive, target, which=0):
@@ -61,7 +65,7 @@ def extract_only(archive, target, which=0):
 @pytest.mark.parametrize("value", [5, 10**9, 2**32 - 2])
 def test_a_wrong_offset_counts_as_damage(value, tmp_path):
     data = patched(packed("s/images/a.jpg"), DIRECTORY, 42, "<I", value)
-    with open_archive(io.BytesIO(data), "x.zip") as archive, pytest.raises(DamagedMemberError):
+    with opened(data) as archive, pytest.raises(DamagedMemberError):
         extract_only(archive, tmp_path / "a.jpg")
     assert not (tmp_path / "a.jpg").exists()
 
@@ -70,7 +74,7 @@ def test_the_progress_of_a_damaged_member_is_taken_back(tmp_path):
     data = patched(packed("s/images/a.jpg"), DIRECTORY, 24, "<I", 14)  # bytes
     counts = []
     with (
-        open_archive(io.BytesIO(data), "x.zip") as archive,
+        opened(data) as archive,
         pytest.raises(DamagedMemberError, match="13 bytes instead of 14"),
     ):
         extract(archive, archive.infolist()[0], tmp_path / "new" / "a.jpg", counts.append)
@@ -83,7 +87,7 @@ def test_progress_counts_the_bytes_of_the_missing_files(tmp_path):
     write(there, b"content of it")  # by an earlier fetch that was interrupted
     told = []
     data = packed("s/images/a.jpg", "s/images/b.jpg", "s/images/c.jpg")
-    with open_archive(io.BytesIO(data), "x.zip") as archive:
+    with opened(data) as archive:
         line = fetch_scene(
             archive, "s", "x.zip", tmp_path, files, PATIENT, lambda *at: told.append(at)
         )
@@ -94,7 +98,7 @@ def test_progress_counts_the_bytes_of_the_missing_files(tmp_path):
 def test_a_packing_that_cannot_be_read_is_no_damage(tmp_path):
     data = patched(packed("s/images/a.jpg"), DIRECTORY, 8, "<H", 1)  # encrypted
     with (
-        open_archive(io.BytesIO(data), "x.zip") as archive,
+        opened(data) as archive,
         refusal(r"a\.jpg is packed in a way that cannot be read here"),
     ):
         extract_only(archive, tmp_path / "a.jpg")
@@ -104,17 +108,14 @@ def test_a_member_without_a_name_is_skipped():
     data = packed("s/images/a.jpg", "x")
     # zipfile cuts a name at the first NUL
     data = patched(data, b"x" + data[data.rindex(b"x") + 1 :], 0, "<B", 0)
-    with open_archive(io.BytesIO(data), "x.zip") as archive:
+    with opened(data) as archive:
         assert "" in archive.namelist()
         assert list(wanted_members(archive, "s", ["images"], "x.zip")) == ["images/a.jpg"]
 
 
-@pytest.mark.parametrize(
-    "names, said",
-    TABLES["names that no files can have"],
-)
+@pytest.mark.parametrize("names, said", TABLES["names that no files can have"])
 def test_names_that_cannot_be_files_together_are_refused(names, said):
-    with open_archive(io.BytesIO(packed(*names)), "x.zip") as archive, refusal(said):
+    with opened(packed(*names)) as archive, refusal(said):
         wanted_members(archive, "s", ["images"], "x.zip")
 
 
@@ -128,7 +129,7 @@ def test_damaged_bytes_of_a_member_are_detected(compression, tmp_path):
     for place in range(begin, begin + 200):
         damaged = data[:place] + bytes([data[place] ^ 0xFF]) + data[place + 1 :]
         damage = contextlib.suppress(DamagedMemberError, InputError)
-        with open_archive(io.BytesIO(damaged), "x.zip") as archive, damage:
+        with opened(damaged) as archive, damage:
             extract_only(archive, tmp_path / "a.jpg")
             # no reader uses this byte
             assert (tmp_path / "a.jpg").read_bytes() == content

@@ -52,6 +52,11 @@ def wanted(place, images):
     }
 
 
+def bring_garden(fetch, data):
+    assert fetch("mipnerf360", "garden") == 0
+    assert files_below(data / "garden") == wanted("garden", "images_4")
+
+
 def test_every_scene_of_the_catalogue_has_a_scene_file_with_the_same_folder():
     known = {}
     for dataset in read_catalog().values():
@@ -90,8 +95,7 @@ def test_a_second_fetch_makes_no_request(fetch, server, data, capsys):
     assert len(server.requests) == asked
     assert "garden: is here" in capsys.readouterr().out
     shutil.rmtree(data / "garden" / "sparse")
-    assert fetch("mipnerf360", "garden") == 0
-    assert files_below(data / "garden") == wanted("garden", "images_4")
+    bring_garden(fetch, data)
 
 
 def test_an_interrupted_fetch_continues(fetch, server, data):
@@ -108,8 +112,7 @@ def test_an_interrupted_fetch_continues(fetch, server, data):
     (data / ".fetch" / "garden" / "images_4" / "old.JPG").touch()  # of another archive
     server.manners = Manners()
     asked = len(server.requests)
-    assert fetch("mipnerf360", "garden") == 0
-    assert files_below(data / "garden") == wanted("garden", "images_4")
+    bring_garden(fetch, data)
     assert not (data / ".fetch" / "garden").exists()
     # what was staged is not fetched again; the directory is read once
     missing = len(wanted("garden", "images_4")) - len(staged)
@@ -131,8 +134,7 @@ def test_damaged_bytes_are_detected_and_not_kept(fetch, server, data, capsys):
     assert "garden/images_4/IMG_0002.JPG arrives damaged" in capsys.readouterr().err
     assert not (data / "garden").exists()
     server.manners = Manners()
-    assert fetch("mipnerf360", "garden") == 0
-    assert files_below(data / "garden") == wanted("garden", "images_4")
+    bring_garden(fetch, data)
 
 
 def test_a_folder_can_be_the_mirror(archives, data, capsys):

@@ -30,10 +30,7 @@ def write(path, properties, values, text, order):
 
 @pytest.mark.parametrize("text", [False, True])
 @pytest.mark.parametrize("order", ["<", ">"])
-@pytest.mark.parametrize(
-    "names, kind, scale",
-    TABLES["colours of PLY files"],
-)
+@pytest.mark.parametrize("names, kind, scale", TABLES["colours of PLY files"])
 def test_ply_properties_may_have_any_order_and_type(tmp_path, text, order, names, kind, scale):
     red, green, blue = ((name, kind) for name in names)
     properties = [blue, ("z", "f8"), ("nx", "f4"), ("x", "f4"), red, ("y", "f8"), green]
@@ -43,10 +40,7 @@ def test_ply_properties_may_have_any_order_and_type(tmp_path, text, order, names
     assert_array_equal(colors, RGB)
 
 
-@pytest.mark.parametrize(
-    "name, text, message",
-    TABLES["clouds refused"],
-)
+@pytest.mark.parametrize("name, text, message", TABLES["clouds refused"])
 def test_files_that_are_no_clouds_are_refused_with_the_remedy(tmp_path, name, text, message):
     (tmp_path / name).write_text(text)
     with refusal(message):

@@ -89,10 +89,7 @@ def test_the_progress_of_each_phase_is_reported_from_start_to_end(shared, told):
     assert [states[-1][2] for states in phases.values()] == [8, 28, 1]
 
 
-@pytest.mark.parametrize(
-    "poses, points_from, names, needed",
-    TABLES["images and references"],
-)
+@pytest.mark.parametrize("poses, points_from, names, needed", TABLES["images and references"])
 def test_poses_and_points_from_choose_the_photographs_and_the_need_for_a_reference(
     poses, points_from, names, needed
 ):
@@ -162,10 +159,7 @@ def test_photos_that_cannot_be_matched_are_refused(tmp_path, pixels, said):
         Sfm().run(capture_of(tmp_path), tmp_path.with_name("out"))
 
 
-@pytest.mark.parametrize(
-    "pairs, count, auto, every, poses, kept",
-    TABLES["pairs"],
-)
+@pytest.mark.parametrize("pairs, count, auto, every, poses, kept", TABLES["pairs"])
 def test_all_pairs_are_matched_if_those_of_auto_place_few_images(
     monkeypatch, caplog, pairs, count, auto, every, poses, kept
 ):

@@ -30,12 +30,11 @@ def test_both_files_of_a_notebook_agree_and_outputs_are_small(path):
     notebook = nbformat.read(path.with_suffix(".ipynb"), as_version=4)
     nbformat.validate(notebook)
     mend = f"make notebooks, after an edit of {path.name}"
-    cells = [
-        (cell.cell_type, cell.source, cell.metadata.get("tags", [])) for cell in notebook.cells
-    ]
-    assert cells == [
-        (cell.cell_type, cell.source, cell.metadata.get("tags", [])) for cell in source.cells
-    ], mend
+    made, written = (
+        [(cell.cell_type, cell.source, cell.metadata.get("tags", [])) for cell in one.cells]
+        for one in (notebook, source)
+    )
+    assert made == written, mend
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
     assert any("image/png" in output.get("data", {}) for output in outputs), mend
     assert not [output for output in outputs if output.output_type == "error"]

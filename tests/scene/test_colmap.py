@@ -9,12 +9,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
-from gsbench.scene.colmap import (
-    model_points,
-    read_model,
-    read_reference,
-    write_model,
-)
+from gsbench.scene.colmap import model_points, read_model, read_reference, write_model
 from gsbench.scene.types import Camera
 from tests.helpers import refusal
 from tests.scene.cameras import cameras_of
@@ -140,19 +135,15 @@ def test_names_with_blanks_and_empty_second_lines_are_read(tmp_path):
     model = read_model(write_text_model(tmp_path))
     assert sorted(image.name for image in model.images.values()) == ["a.png", "b c.png"]
     assert model.points3D[1].color.tolist() == [0, 255, 0]
-    numbers = (
-        "1 1 0 0 0 0 0 5 1 1\n1 2 -1 3 4 -1 5 6 -1 7 8 -1"  # a name and points that may be mixed up
-    )
+    # a name and points that may be mixed up
+    numbers = "1 1 0 0 0 0 0 5 1 1\n1 2 -1 3 4 -1 5 6 -1 7 8 -1"
     assert read_model(write_text_model(tmp_path, images=numbers)).images[1].name == "1"
 
 
 POSED = "1 1 0 0 0 0 0 5 1"
 
 
-@pytest.mark.parametrize(
-    "stem, text, said",
-    TABLES["bad lines"],
-)
+@pytest.mark.parametrize("stem, text, said", TABLES["bad lines"])
 def test_a_bad_line_of_a_text_model_is_named(tmp_path, stem, text, said):
     with refusal(rf"{tmp_path}.*{said}"):
         read_model(write_text_model(tmp_path, **({"points3D": ""} | {stem: text})))

@@ -131,10 +131,7 @@ def test_settings_that_contradict_each_other_are_refused(settings, message):
         SceneConfig(**({"name": "a", "kind": "colmap", "path": "/a"} | settings))
 
 
-@pytest.mark.parametrize(
-    "kind, changes",
-    TABLES["settings that are not read"],
-)
+@pytest.mark.parametrize("kind, changes", TABLES["settings that are not read"])
 def test_a_setting_that_the_kind_of_scene_does_not_read_is_refused(kind, changes):
     path = None if kind == "courtyard" else "/a"
     (key,) = changes

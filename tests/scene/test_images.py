@@ -49,10 +49,7 @@ def test_damaged_files_are_named(tmp_path, suffix):
 
 
 # the sizes of Mip-NeRF 360's own images_4 and images_2
-@pytest.mark.parametrize(
-    "native, factor, expected",
-    TABLES["sizes of Mip-NeRF 360"],
-)
+@pytest.mark.parametrize("native, factor, expected", TABLES["sizes of Mip-NeRF 360"])
 def test_downscaled_sizes_are_those_of_mipnerf360(native, factor, expected):
     assert downscaled_size(*native, expected[0]) == tuple(expected)
     assert same_up_to_rounding(expected, native)
@@ -65,10 +62,7 @@ def test_sizes_never_grow_and_the_longest_side_is_exact():
     assert downscaled_size(9, 6, max_size=1) == (1, 1)
 
 
-@pytest.mark.parametrize(
-    "size, same",
-    TABLES["rounded sides"],
-)
+@pytest.mark.parametrize("size, same", TABLES["rounded sides"])
 def test_sides_may_be_rounded_by_one_pixel(size, same):
     assert same_up_to_rounding(size, (40, 30)) == same
 

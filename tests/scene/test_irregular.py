@@ -116,10 +116,7 @@ def test_images_are_listed_by_real_folders_and_outside_ones_by_their_link(photos
     assert list_images(photos) == ["c.png", "far/b.png", "z/a.png"]
 
 
-@pytest.mark.parametrize(
-    "names, said",
-    TABLES["files that may be photographs"],
-)
+@pytest.mark.parametrize("names, said", TABLES["files that may be photographs"])
 def test_files_that_may_be_photographs_are_counted_in_a_warning(photos, caplog, names, said):
     for name in names:
         (photos / name).touch()

@@ -81,8 +81,7 @@ PERSPECTIVE = [name for name in MODELS if "FISHEYE" not in name]
 
 
 @pytest.mark.parametrize(
-    "name, amount",
-    [*((name, 1.0) for name in MODELS), *((name, 1e-7) for name in PERSPECTIVE[:2])],
+    "name, amount", [*((name, 1.0) for name in MODELS), *((name, 1e-7) for name in PERSPECTIVE[:2])]
 )
 def test_a_point_is_seen_at_the_pixel_where_pycolmap_undistorts_it(
     make_scene, tmp_path, name, amount, in_process
@@ -122,10 +121,11 @@ def test_distortion_below_a_twentieth_of_a_pixel_is_ignored_and_above_it_is_not(
     assert plain_camera(camera) == CameraModel("PINHOLE", WIDTH, HEIGHT, (150, 150, 100, 75))
 
 
-@pytest.mark.parametrize(
-    "name, params, share",
-    TABLES["lenses that turn back"],
-)
+def inspect_lens(camera):
+    inspect("lens", lens_findings({"a.png": camera}), "here")
+
+
+@pytest.mark.parametrize("name, params, share", TABLES["lenses that turn back"])
 def test_lenses_that_turn_back_inside_the_picture_are_refused(
     name, params, share, caplog, in_process
 ):
@@ -134,7 +134,7 @@ def test_lenses_that_turn_back_inside_the_picture_are_refused(
     assert found == pytest.approx(share, abs=0.01)
     said = rf"the camera of a.png \({name}: .*\) turns back .*: {found:.1%}"
     with refusal(said if share else None):
-        inspect("lens", lens_findings({"a.png": camera}), "here")
+        inspect_lens(camera)
     assert not caplog.records
 
 
@@ -142,17 +142,14 @@ def test_a_small_fold_in_the_corners_is_reported(caplog):
     camera = CameraModel("SIMPLE_RADIAL", 160, 120, (90.0, 80.0, 60.0, -0.185))
     ((share, *_),) = flatten([camera])
     assert 0 < share < 0.01
-    inspect("lens", lens_findings({"a.png": camera}), "here")
+    inspect_lens(camera)
     assert "turns back inside the picture" in caplog.text
 
 
 def test_a_lens_that_leaves_little_of_the_photograph_is_reported(caplog):
-    def check(camera):
-        inspect("lens", lens_findings({"a.png": camera}), "here")
-
-    check(CameraModel("OPENCV", 160, 120, (120.0, 120, 80, 60, -0.3, 0.1, 0, 0)))
+    inspect_lens(CameraModel("OPENCV", 160, 120, (120.0, 120, 80, 60, -0.3, 0.1, 0, 0)))
     assert not caplog.records
-    check(CameraModel("OPENCV", 160, 120, (120.0, 120, 80, 60, -45, 1017, 0, 0)))
+    inspect_lens(CameraModel("OPENCV", 160, 120, (120.0, 120, 80, 60, -45, 1017, 0, 0)))
     assert "1017, 0, 0) leaves 51x38 of 160x120 px undistorted: check its lens" in caplog.text
 
 
@@ -257,25 +254,25 @@ def test_a_file_of_another_shape_than_its_camera_is_refused(make_scene, tmp_path
 
 @pytest.mark.parametrize("name", ["cameras.json", "00000.png", "manifest.json"])
 def test_stored_views_that_were_changed_are_prepared_again(name, make_scene, tmp_path, caplog):
-    capture, store = read_colmap(make_scene()), tmp_path / "cache"
-    first = load_scene(capture, capture.model, Store(store), max_size=20)
-    (file,) = store.rglob(name)
+    capture = read_colmap(make_scene())
+    first = loaded(capture, tmp_path, max_size=20)
+    (file,) = (tmp_path / "cache").rglob(name)
     file.write_bytes(file.read_bytes()[:100])
-    again = load_scene(capture, capture.model, Store(store), max_size=20)
+    again = loaded(capture, tmp_path, max_size=20)
     assert "is damaged" in caplog.text
     assert again.train[0].camera.fx == first.train[0].camera.fx
     assert_array_equal(first.train[0].image, again.train[0].image)
 
 
 def test_a_photograph_that_changed_its_size_since_it_was_prepared_is_refused(make_scene, tmp_path):
-    capture, store = read_colmap(make_scene()), tmp_path / "cache"
-    load_scene(capture, capture.model, Store(store))
+    capture = read_colmap(make_scene())
+    loaded(capture, tmp_path)
     file = capture.images / capture.train_names[0]
     with Image.open(file) as image:
         smaller = image.resize((image.width // 2, image.height // 2))
     smaller.save(file)
     with refusal("changed after it was prepared: run again"):
-        load_scene(capture, capture.model, Store(store))
+        loaded(capture, tmp_path)
 
 
 def test_centred_moves_the_principal_point_only(make_scene, tmp_path):
@@ -290,21 +287,21 @@ def test_centred_moves_the_principal_point_only(make_scene, tmp_path):
 
 def test_views_without_pose_are_left_out_with_a_count(make_scene, tmp_path, caplog):
     capture = read_colmap(make_scene(), test_every=3)
-    small = make_scene(names=("00.png", "01.png", "02.png", "04.png"), root="partial")
+    placed = ("00.png", "01.png", "02.png", "04.png")
+    capture = replace(capture, model=make_scene(names=placed, root="partial") / "sparse/0")
     with caplog.at_level(logging.WARNING):
-        scene = load_scene(capture, small / "sparse/0", Store(tmp_path / "cache"))
+        scene = loaded(capture, tmp_path)
     assert [view.name for view in scene.train] == ["01.png", "02.png", "04.png"]
     assert [view.name for view in scene.test] == ["00.png"]
     assert "scene toy: 2 views without a pose left out: 03.png, 05.png" in caplog.text
-    two = make_scene(names=("00.png", "01.png"), root="two")
-    with refusal("2 images of 6 of scene toy have a pose"):
-        load_scene(capture, two / "sparse/0", Store(tmp_path / "cache"))
-    placed = ("00.png", "01.png", "02.png", "04.png")
-    for names, said in ((placed, "no training view has a pose"), (("03.png",), "no test view has")):
+    two = make_scene(names=placed[:2], root="two") / "sparse/0"
+    for change, said in (
+        ({"model": two}, "2 images of 6 of scene toy have a pose"),
+        ({"test_names": placed}, "no training view has a pose"),
+        ({"test_names": ("03.png",)}, "no test view has"),
+    ):
         with refusal(said):
-            load_scene(
-                replace(capture, test_names=names), small / "sparse/0", Store(tmp_path / "cache2")
-            )
+            loaded(replace(capture, **change), tmp_path / "other")
 
 
 def test_a_truncated_photo_is_named_and_leaves_no_cache(make_scene, tmp_path):

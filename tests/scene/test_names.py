@@ -12,10 +12,7 @@ from tests.helpers import refusal
 from tests.scene.tables import TABLES
 
 
-@pytest.mark.parametrize(
-    "photographs, pictures, rule",
-    TABLES["pictures matched"],
-)
+@pytest.mark.parametrize("photographs, pictures, rule", TABLES["pictures matched"])
 def test_names_are_matched_by_the_strictest_rule_that_fits(photographs, pictures, rule):
     found = match_pictures(photographs, random.Random(0).sample(pictures, len(pictures)))
     assert found.pairs == dict(zip(photographs, pictures, strict=True))
@@ -30,10 +27,7 @@ def test_renders_of_training_views_are_left_out():
     assert len(found.left_out) == 8
 
 
-@pytest.mark.parametrize(
-    "photographs, pictures, words",
-    TABLES["pictures refused"],
-)
+@pytest.mark.parametrize("photographs, pictures, words", TABLES["pictures refused"])
 def test_missing_and_ambiguous_pictures_are_refused(photographs, pictures, words):
     with refusal(words):
         match_pictures(photographs, pictures)

@@ -125,10 +125,7 @@ def test_results_are_stored_under_the_readers_code_its_settings_and_what_it_read
     assert key(Reader(raw(shifted, *posed().photographs[1:]))) != first
 
 
-@pytest.mark.parametrize(
-    "settings, said",
-    TABLES["kinds of readers"],
-)
+@pytest.mark.parametrize("settings, said", TABLES["kinds of readers"])
 def test_a_reader_goes_with_its_kind_of_scene(settings, said):
     with pytest.raises(InputError, match=said):
         SceneConfig(name="own", path="/a", **settings)

@@ -59,19 +59,13 @@ def test_files_with_another_extension_are_used_and_missing_ones_left_out(make_sc
     assert "1 image with a camera but without a file: cam/5.JPG" in caplog.text
 
 
-@pytest.mark.parametrize(
-    "wanted, files, matches",
-    TABLES["names"],
-)
+@pytest.mark.parametrize("wanted, files, matches", TABLES["names"])
 def test_names_match_their_files_and_ambiguous_ones_are_refused(wanted, files, matches):
     with refusal(None if isinstance(matches, dict) else matches):
         assert match(wanted, files) == matches
 
 
-@pytest.mark.parametrize(
-    "wanted, files, matches",
-    TABLES["names in other folders"],
-)
+@pytest.mark.parametrize("wanted, files, matches", TABLES["names in other folders"])
 def test_names_in_other_folders_match_by_the_last_parts_of_their_paths(wanted, files, matches):
     with refusal(None if isinstance(matches, dict) else matches):
         assert match_anywhere(wanted, files) == matches
@@ -96,10 +90,7 @@ def test_a_model_whose_names_have_another_folder_gives_the_same_capture(make_sce
 
 
 @pytest.mark.parametrize("text", [False, True])
-@pytest.mark.parametrize(
-    "models, chosen",
-    TABLES["models"],
-)
+@pytest.mark.parametrize("models, chosen", TABLES["models"])
 def test_the_model_with_the_most_images_is_read(make_scene, caplog, models, chosen, text):
     for sparse, count in models.items():
         root = make_scene(names=[f"{k}.png" for k in range(count)], sparse=sparse, text=text)
@@ -185,10 +176,7 @@ LISTS = {  # name of a file: what it lists
 }
 
 
-@pytest.mark.parametrize(
-    "train, test, trained_on, tested_on",
-    TABLES["split lists"],
-)
+@pytest.mark.parametrize("train, test, trained_on, tested_on", TABLES["split lists"])
 def test_lists_choose_the_training_and_test_views(make_scene, train, test, trained_on, tested_on):
     root = make_scene()
     for name, text in LISTS.items():
@@ -237,24 +225,13 @@ def test_missing_folders_images_and_models_are_named(make_scene, tmp_path):
         read_colmap(root)
 
 
-@pytest.mark.parametrize(
-    "place, given, remedy",
-    TABLES["places of models"],
-)
+@pytest.mark.parametrize("place, given, remedy", TABLES["places of models"])
 def test_an_error_says_where_a_model_lies(make_scene, place, given, remedy):
     root = make_scene(sparse=place)
     if place.startswith("dense"):
         (root / "images").rename((root / place).parent / "images")
     with refusal(f"no COLMAP model in .*: .*{remedy.format(root)}$"):
         read_colmap(root / given)
-
-
-def test_a_database_without_a_model_is_named(make_scene):
-    root = make_scene()
-    (root / "sparse").rename(root.parent / "elsewhere")
-    (root / "database.db").touch()
-    with refusal("a database holds no poses: make one with COLMAP"):
-        read_colmap(root)
 
 
 def test_what_is_not_read_of_a_folder_is_named(make_scene, caplog):
@@ -281,27 +258,10 @@ def test_a_scene_is_named_after_its_folder_and_a_missing_model_is_reported(make_
     assert said.startswith(f"scene fern: {root / 'other'}: no COLMAP model here")
 
 
-def test_a_missing_list_is_named(make_scene):
-    with refusal(r"scene\.test_list: .*cannot be read \(No such file or directory\): name a"):
-        read_colmap(make_scene(), test_list="\\n")
-
-
-@pytest.mark.parametrize(
-    "lacking, message",
-    [
-        ("points3D.txt", "is not complete: add points3D.txt; points3D.txt may be empty"),
-        ("images.txt", "is not complete: add images.txt$"),
-    ],
-)
-def test_a_model_without_one_of_its_files_is_named(make_scene, lacking, message):
+@pytest.mark.parametrize("lacking, file, settings, said", TABLES["what is lacking"])
+def test_what_a_folder_lacks_is_named(make_scene, lacking, file, settings, said):
     root = make_scene(text=True)
-    (root / "sparse/0" / lacking).unlink()
-    with refusal(message):
-        read_colmap(root)
-
-
-def test_a_list_in_a_code_page_names_its_line(make_scene):
-    root = make_scene()
-    (root / "test_list.txt").write_bytes(b"a.png\nK\xfcche.png\n")
-    with refusal(r"line 2 is not UTF-8 \(K.xfcche.png\): save it as UTF-8"):
-        read_colmap(root, split="list")
+    (root / lacking).rename(root.parent / "elsewhere")
+    (root / file).write_bytes(b"a.png\nK\xfcche.png\n")
+    with refusal(said):
+        read_colmap(root, **settings)

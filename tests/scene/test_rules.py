@@ -36,13 +36,13 @@ def scene(left_out={}, near={}, **changes):  # noqa: B006 - nobody changes them
     return Scene("toy", views(**changes), views((0.5,)), twins=twins)
 
 
-def panorama(is_panorama):
-    return Facts(photographs=[Facts(name="a.jpg", camera=None, is_panorama=is_panorama)])
-
-
 # id: a subject that is just fine, one that is not, what is said of it
 ROWS = {
-    "panorama": (panorama(False), panorama(True), "1 photograph declared as panoramas"),
+    "panorama": (
+        Facts(panoramas=[]),
+        Facts(panoramas=["a.jpg"]),
+        "1 photograph declared as panoramas",
+    ),
     "estimated-field-of-view": (
         Facts(fields_of_view=[Finding(150.0)]),
         Facts(fields_of_view=[Finding(151.0, (), {"focal": 13.0})]),

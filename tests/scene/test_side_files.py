@@ -20,10 +20,7 @@ def photographs(folder, pattern="{}.jpg", scale=1, seed=0, change=lambda picture
     return folder
 
 
-@pytest.mark.parametrize(
-    "pattern, scale, named",
-    TABLES["other files"],
-)
+@pytest.mark.parametrize("pattern, scale, named", TABLES["other files"])
 def test_other_files_beside_photographs_change_no_capture(tmp_path, caplog, pattern, scale, named):
     alone = read_photos(photographs(tmp_path / "alone"))
     caplog.clear()
@@ -33,10 +30,7 @@ def test_other_files_beside_photographs_change_no_capture(tmp_path, caplog, patt
     assert len(caplog.records) == bool(named)
 
 
-@pytest.mark.parametrize(
-    "patterns, kept",
-    TABLES["folders of several sizes"],
-)
+@pytest.mark.parametrize("patterns, kept", TABLES["folders of several sizes"])
 def test_of_folders_of_several_sizes_the_largest_is_read(tmp_path, caplog, patterns, kept):
     for pattern, scale in patterns.items():
         photographs(tmp_path, pattern, scale)
@@ -44,10 +38,7 @@ def test_of_folders_of_several_sizes_the_largest_is_read(tmp_path, caplog, patte
     assert "left out, no photographs" in caplog.text
 
 
-@pytest.mark.parametrize(
-    "patterns",
-    TABLES["folders of photographs"],
-)
+@pytest.mark.parametrize("patterns", TABLES["folders of photographs"])
 def test_photographs_in_folders_of_other_names_are_all_read(tmp_path, caplog, patterns):
     for number, pattern in enumerate(patterns):
         photographs(tmp_path, pattern, seed=COUNT * number)

@@ -128,10 +128,7 @@ def test_the_applied_transform_is_undone_for_cameras_and_points(tmp_path):
 IDENTITY = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
 
 
-@pytest.mark.parametrize(
-    "change, said",
-    TABLES["files with other points"],
-)
+@pytest.mark.parametrize("change, said", TABLES["files with other points"])
 def test_two_files_must_name_the_same_points_under_one_transform(tmp_path, change, said):
     folder = in_blenders_files(write(tmp_path, ply_file_path="a.ply"))
     for name in ("a.ply", "b.ply"):
@@ -158,10 +155,7 @@ def in_blenders_files(folder):
     return folder
 
 
-@pytest.mark.parametrize(
-    "said, model, params",
-    TABLES["intrinsics"],
-)
+@pytest.mark.parametrize("said, model, params", TABLES["intrinsics"])
 def test_intrinsics_are_read_from_the_file_or_from_each_frame(tmp_path, said, model, params):
     def move_to_frames(document):
         in_each_frame(**{key: document.pop(key) for key in SHARED}, **said)(document)
@@ -414,10 +408,7 @@ def test_unknown_keys_are_named_in_one_line(tmp_path, caplog):
     assert record.getMessage().endswith("3 keys are not known and not used: exporter, fl_X, lens")
 
 
-@pytest.mark.parametrize(
-    "lists, train, test",
-    TABLES["lists of nerfstudio"],
-)
+@pytest.mark.parametrize("lists, train, test", TABLES["lists of nerfstudio"])
 def test_nerfstudios_lists_of_filenames_are_the_split(tmp_path, lists, train, test, caplog):
     def names(numbers):
         return tuple(f"images/{k}.png" for k in numbers)

@@ -21,10 +21,7 @@ from tests.scene.tables import TABLES
 from tests.train.conftest import orbit_camera
 
 
-@pytest.mark.parametrize(
-    "names, wanted, left_out",
-    TABLES["copies by name"],
-)
+@pytest.mark.parametrize("names, wanted, left_out", TABLES["copies by name"])
 def test_one_of_several_photographs_with_the_same_stem_is_used(names, wanted, left_out):
     assert copies_by_name(names, wanted) == left_out
 

@@ -71,10 +71,7 @@ def _same(typed: str, value: Any) -> bool:
 def fitting(trials: Sequence[TrialResult], words: Sequence[str]) -> dict[Arm, list[TrialResult]]:
     """The trials that one of ``words`` names, by arm; ``trials`` have their variants."""
     names = [ArmName.read(word) for word in words]
-    return group_by(
-        (trial for trial in trials if any(name.fits(trial) for name in names)),
-        lambda trial: trial.arm,
-    )
+    return group_by((one for one in trials if any(name.fits(one) for name in names)), "arm")
 
 
 def trials_of_arm(trials: Sequence[TrialResult], word: str, where: str = "") -> list[TrialResult]:

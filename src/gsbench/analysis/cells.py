@@ -75,9 +75,8 @@ def _settings_with(trial: TrialResult, name: str) -> Mapping[str, Any]:
     return trial.config if name in trial.config or is_hashed(name) else trial.whole_config
 
 
-def check_fields(trials: Iterable[TrialResult], names: Iterable[str]) -> None:
+def check_fields(trials: Sequence[TrialResult], names: Iterable[str]) -> None:
     """Raise ``InputError`` for the first name that is no field or setting of any trial."""
-    trials = list(trials)
     for name in names:
         if name in TRIAL_FIELDS:
             continue

@@ -73,7 +73,7 @@ def textured_error(trial: TrialResult) -> float:
     """
     stored = read_if_sound(trial.path / FROM_PIXELS, PixelMeasures)
     if stored is not None:
-        return float(stored.error_textured)
+        return stored.error_textured
     errors = []
     for view in view_names(trial):
         render, truth, counted = read_view(trial, view)
@@ -195,7 +195,7 @@ def compare_view(which: str, pair: TrialPair, view: str) -> ViewComparison:
     Raises InputError if its pictures differ in size.
     """
     first, second, truth = read_compared(*pair, view)
-    errors = [absolute_error(image, truth=truth) for image in (first, second)]  # [H, W] each
+    errors = [absolute_error(image, truth) for image in (first, second)]  # [H, W] each
     nearer = np.clip((errors[0] - errors[1]) / FULL_COLOUR, -1, 1)  # [H, W], above 0: the second is
     gain = nearer[..., None]  # [H, W, 1]
     white, blue, red = (

@@ -154,17 +154,15 @@ def _thresholds(design: Design, level: float, shares: tuple[float, ...]) -> NDAr
 # ---- the designs that suffice
 
 
-def fewest_seeds(
-    power: Callable[[Design], float], scenes: Iterable[int], most: int = MAX_SEEDS
-) -> list[Design]:
+def fewest_seeds(power: Callable[[Design], float], scenes: Iterable[int]) -> list[Design]:
     """The designs with a power of `POWER`, one per number of ``scenes``, with the fewest seeds.
 
     Those with the fewest trials come first.
 
-    A number of scenes is left out if it needs more than ``most`` seeds, or no fewer seeds than
+    A number of scenes is left out if it needs more than `MAX_SEEDS` seeds, or no fewer seeds than
     fewer scenes do. The power rises with the number of seeds.
     """
-    chosen: list[Design] = []
+    chosen, most = list[Design](), MAX_SEEDS
     for count in scenes:
         designs = [Design(count, seeds) for seeds in range(2, most + 1)]
         weaker = bisect_left(designs, POWER, key=power)  # how many have less power

@@ -116,13 +116,12 @@ def relative_change(
 
 
 def choose_quantities(
-    trials: Iterable[TrialResult], names: Iterable[str] | None = None
+    trials: Sequence[TrialResult], names: Iterable[str] | None = None
 ) -> list[Quantity]:
     """The named quantities; by default all metrics, the LPIPS asked for, and the main costs.
 
     Of metrics in regions, the default has PSNR and the metric of the verdict.
     """
-    trials = list(trials)
     if names is None:
         wanted = {key for trial in trials for key in _lpips_asked_for(trial)}
         costs = [key for key in ("gaussians", "train_time") if any(map(COSTS[key][1], trials))]
@@ -136,13 +135,12 @@ def choose_quantities(
     return [quantity(name, trials) for name in names]
 
 
-def quantity(name: str, trials: Iterable[TrialResult]) -> Quantity:
+def quantity(name: str, trials: Sequence[TrialResult]) -> Quantity:
     """The quantity ``name`` (a metric, a cost or an alias) for tables.
 
     Counts and times have a unit that suits the smallest and the largest trial, unless the name
     fixes the unit (`FIXED_UNITS`). Raises ``InputError`` for an unknown name.
     """
-    trials = list(trials)
     key = ALIASES.get(name, name)
     metric, _, step = key.rpartition(AT)
     if not step.isdigit():  # psnr, or psnr@far
@@ -167,14 +165,13 @@ def quantity(name: str, trials: Iterable[TrialResult]) -> Quantity:
     )
 
 
-def asked_quantity(key: str, trials: Iterable[TrialResult] = ()) -> Quantity:
+def asked_quantity(key: str, trials: Sequence[TrialResult] = ()) -> Quantity:
     """The number that a question about ``key`` compares: a metric at the end, or a cost.
 
     If ``key`` is a user's metric that no trial has, the quantity has default facts.
     """
     if key == TEXTURED.key:
         return TEXTURED
-    trials = list(trials)
     # a table of results may have a column of the name
     if key in COSTS and not any(key in trial.metrics for trial in trials):
         name, read = COSTS[key]

@@ -52,9 +52,9 @@ def plan_looks(maximum: int) -> tuple[int, ...]:
     return tuple(dict.fromkeys([*early, *range(EACH_UP_TO, maximum, 4), maximum]))
 
 
-def level_of(n: int, among: int = 1, rate: float = ALPHA) -> float:
+def level_of(n: int, among: int = 1) -> float:
     """The level of each of ``among`` questions of the n-th command about an idea."""
-    return rate * 2 / (n * (n + 1)) / among
+    return ALPHA * 2 / (n * (n + 1)) / among
 
 
 def look_shares(looks: int) -> tuple[float, ...]:

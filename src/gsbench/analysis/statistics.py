@@ -86,7 +86,7 @@ class Region:
         places = [np.interp(value, axis, np.arange(len(axis))) for value, axis in axes]
         f = scipy.ndimage.map_coordinates(known["f"], np.broadcast_arrays(*places), order=1)
         f = np.where(np.less(level, LEAST_LEVEL) | (self.scenes == 1), 0.0, f)
-        return np.asarray(self._student(level) * np.exp(f * self._ratio(level)))
+        return self._student(level) * np.exp(f * self._ratio(level))
 
     def p_values(self, sizes: Array) -> Array:
         """The two-sided p [D] of means with these ``sizes`` [D] in standard errors."""
@@ -98,12 +98,12 @@ class Region:
         return np.exp(high)
 
     def _student(self, level: Array | float) -> Array:
-        return np.asarray(-scipy.special.stdtrit(self.seeds - 1, np.asarray(level) / 2))
+        return -scipy.special.stdtrit(self.seeds - 1, np.asarray(level) / 2)
 
     def _ratio(self, level: Array | float) -> Array:
         """log(normal / Student's threshold); below the lowest level of the table, that of it."""
         own = np.clip(level, table()["levels"][-1], MOST_P)
-        return np.asarray(np.log(-scipy.special.ndtri(own / 2) / self._student(own)))
+        return np.log(-scipy.special.ndtri(own / 2) / self._student(own))
 
 
 def evenness(variances: Array) -> Array:
@@ -113,7 +113,7 @@ def evenness(variances: Array) -> Array:
     if scenes == 1:
         return np.zeros_like(total)
     shares = np.divide(total, largest, out=np.ones_like(total), where=largest > 0)
-    return np.asarray(np.log(shares) / np.log(scenes))
+    return np.log(shares) / np.log(scenes)
 
 
 @dataclass(frozen=True)

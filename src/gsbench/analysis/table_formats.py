@@ -137,7 +137,7 @@ def csv_of(frame: pd.DataFrame) -> str:
             return value
         return ("'" if FORMULA.match(value.lstrip()) else "") + printable(value)
 
-    return str(frame.map(plain).rename(columns=plain).to_csv(index=False, lineterminator="\n"))
+    return frame.map(plain).rename(columns=plain).to_csv(index=False, lineterminator="\n")
 
 
 def to_markdown(table: Table) -> str:

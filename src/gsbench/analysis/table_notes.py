@@ -69,8 +69,8 @@ def comparison_notes(comparison: Comparison) -> list[Note]:
         for first, second in comparison.pairs
         for note in caveats([*by_arm[first], *by_arm[second]], first, second)
     ]
-    both = comparison.trials, comparison.pairs
-    return [*comparison.remarks, *counts_notes(*both), *between]
+    counts = counts_notes(comparison.trials, comparison.pairs)
+    return [*comparison.remarks, *counts, *between]
 
 
 def doubt_notes(trials: Sequence[TrialResult]) -> list[Note]:

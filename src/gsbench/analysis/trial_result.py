@@ -56,8 +56,7 @@ def load_flat_config(folder: Path) -> dict[str, Any]:
         raise DamagedError(
             folder / CONFIG, f"is damaged: it lacks one of the groups {', '.join(GROUPS)}"
         )
-    settings: dict[str, Any] = lines_in(flatten(values))
-    return settings
+    return lines_in(flatten(values))
 
 
 def config_if_readable(folder: Path) -> Mapping[str, Any]:

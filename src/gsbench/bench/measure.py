@@ -163,7 +163,7 @@ def peak_memory(raster: str, setting: Setting) -> float:
 def run_bench(
     rasters: Sequence[str],
     settings: Iterable[Setting],
-    repeats: int = 5,
+    repeats: int,
     memory: bool = True,
 ) -> list[dict[str, Any]]:
     """Time the training step with each of ``rasters`` in each of ``settings``.

@@ -24,13 +24,13 @@ SIGMA_SPREAD = 0.7  # standard deviation of log sigma
 CROWD_SHARE, CROWD_SIDE = 0.05, 0.007
 
 
-def trained_like_gaussians(count: int, seed: int = SEED) -> Gaussians:
+def trained_like_gaussians(count: int) -> Gaussians:
     """Make ``count`` Gaussians like those of a trained model.
 
     Many are small and flat, a few are large, and opacities vary. They fill the view of
     `frontal_camera` and a margin around it.
     """
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(SEED)
     depth = FIRST_DEPTH * (torch.rand(count, generator=generator) * math.log(DEPTH_RATIO)).exp()
     fields = torch.tensor([1.4, 1.05])
     slopes = (torch.rand(count, 2, generator=generator) - 0.5) * fields  # [N, 2] x/z, y/z
@@ -48,13 +48,13 @@ def trained_like_gaussians(count: int, seed: int = SEED) -> Gaussians:
     )
 
 
-def crowded_gaussians(count: int, seed: int = SEED) -> Gaussians:
+def crowded_gaussians(count: int) -> Gaussians:
     """Make `trained_like_gaussians`, but a twentieth of them is over one tile near the middle.
 
     So it is in a picture of 1600x1060 px. There the longest list is several hundred times the mean;
     a rasterizer in which one program composites a list is as slow as this one.
     """
-    gaussians = trained_like_gaussians(count, seed)
+    gaussians = trained_like_gaussians(count)
     slopes = gaussians.means[:, :2] / gaussians.means[:, 2:]  # [N, 2]
     # Moved to one side of the middle, which is often a border between tiles.
     crowded = CROWD_SIDE * (slopes - slopes.amin(0)) * gaussians.means[:, 2:]

@@ -24,14 +24,7 @@ from gsbench.analysis.fairness import searches_of
 from gsbench.analysis.images import PixelMeasures, region_record, textured_error
 from gsbench.analysis.quantities import TEXTURED
 from gsbench.analysis.results import Experiment, TrialResult, group_by, newest_code, read_views
-from gsbench.claims.archive import (
-    FORMAT,
-    MANIFEST,
-    NO_CONFIGURATION,
-    PICTURES,
-    VERSION,
-    check_size,
-)
+from gsbench.claims.archive import FORMAT, MANIFEST, NO_CONFIGURATION, PICTURES, VERSION, check_size
 from gsbench.errors import InputError
 from gsbench.files import atomic
 from gsbench.parsing import read_bytes, read_typed, read_yaml
@@ -149,7 +142,7 @@ def _searches(home: Path, trials: Sequence[TrialResult]) -> dict[str, bytes]:
     found = {}
     if (home / TUNING).exists():
         found[home.name] = read_typed(home / TUNING, TuningRecord)
-    for of_arm in group_by(trials, lambda trial: trial.key).values():
+    for of_arm in group_by(trials, "key").values():
         found |= searches_of(of_arm[0])
     return {
         f"{name}/{TUNING}": _page(without_paths(search.to_json())) for name, search in found.items()
@@ -178,7 +171,7 @@ def without_private_words(words: Sequence[str]) -> list[str]:
     for word in words:
         group = re.split(r"[./=]", word.lstrip("+~"), maxsplit=1)[0]
         if group not in PRIVATE:
-            shared.append(ITEM.sub(lambda item: str(without_paths(item[0])), word))
+            shared.append(ITEM.sub(lambda item: without_paths(item[0]), word))
     return shared
 
 
@@ -212,8 +205,7 @@ def _results(trial: TrialResult) -> dict[str, Any]:
     # unpacked files are new, so what was measured before a declaration would look later
     record.setdefault("measured", time.strftime(STAMP, time.gmtime(trial.measured)))
     reasons = {metric: without_folders(reason) for metric, reason in record["unavailable"].items()}
-    results: dict[str, Any] = without_paths(record | {"unavailable": reasons})
-    return results
+    return without_paths(record | {"unavailable": reasons})
 
 
 def without_paths(value: Any) -> Any:

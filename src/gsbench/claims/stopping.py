@@ -124,8 +124,7 @@ def log_verdicts(trials: Iterable[Trial]) -> None:
         if experiment.history.ledger is not None:
             continue
         comparison = compare(newest_code(experiment))
-        both = comparison.trials, comparison.pairs
-        before = counts_notes(*both)
+        before = counts_notes(comparison.trials, comparison.pairs)
         headlines = [answer.headline for answer in comparison.answers]
         for line in [*texts(before), *headlines, *comparison.experiment.versions]:
             log.info("%s", line)

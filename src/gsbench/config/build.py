@@ -57,8 +57,6 @@ def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
     its code sees them. Raises InputError naming the key that is unknown or wrong.
     """
     target = values["_target_"]
-    if not target:
-        raise InputError(f"{group} names no _target_: the class to use")
     for place, nested_target in targets_in(values, tuple(group.split("."))):
         check_target(nested_target, ".".join(place), allow_targets, packages_allowed_at(place))
     external = group == "densify" and is_external(values)

@@ -222,8 +222,10 @@ class Composer:
                 again = None if seed is None else self._trial(words, words)
                 trial = again or self._trial_of_hydra(words, number)
             trials.append(trial if seed is None else with_seed(trial, seed))
-        # Times compare ideas only if all arms train in the same way.
-        if len({_by_autograd(trial.values["train"]) for trial in trials}) > 1:
+        # Times compare ideas only if all arms train in the same way: if a setting or a part of one
+        # needs steps of plain autograd, all take them.
+        asking = (BY_AUTOGRAD, "loss", "terms", "optimizer")
+        if len({any(map(trial.values["train"].get, asking)) for trial in trials}) > 1:
             return self.trials([[*words, f"train.{BY_AUTOGRAD}=true"] for words in jobs])
         return trials
 
@@ -279,7 +281,11 @@ class Composer:
 
     def _choose(self, words: Sequence[str]) -> DictConfig:
         """Hydra's composition of the choices among ``words``, checked; do not change it."""
-        key = tuple(_choices(words).values())
+        # of two words for one group, with the same signs, the later one counts
+        choices = {
+            parse_word(word).get_key_element(): word for word in words if not _is_value(word)
+        }
+        key = tuple(choices.values())
         if key not in self._chosen:
             with hydra_ready():
                 self._chosen[key] = self._compose(key, words)
@@ -329,11 +335,6 @@ class Composer:
                 check_choice(word, str(value))
 
 
-def _by_autograd(train: Mapping[str, Any]) -> bool:
-    """Return whether a part of the training needs steps of plain autograd, or a setting asks."""
-    return any(train.get(name) for name in (BY_AUTOGRAD, "loss", "terms", "optimizer"))
-
-
 def _swept_groups(sweeper: DictConfig) -> set[str]:
     """The groups of which a sweep in a file lists choices or settings."""
     raw: Any = OmegaConf.to_container(sweeper, resolve=False)
@@ -348,11 +349,6 @@ def _is_value(word: str) -> bool:
     override = parse_word(word)
     key = override.key_or_group
     return "." in key or key in ROOT_SETTINGS or isinstance(override.value(), dict)
-
-
-def _choices(words: Sequence[str]) -> dict[str, str]:
-    """The words that choose in groups, by their keys with signs; the later one counts."""
-    return {parse_word(word).get_key_element(): word for word in words if not _is_value(word)}
 
 
 def _without_seed(words: Sequence[str]) -> tuple[tuple[str, ...], int | None]:

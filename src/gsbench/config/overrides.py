@@ -97,4 +97,4 @@ def _quoted(word: str) -> str:
 
 def is_sweep(word: str) -> bool:
     """Return whether a word lists several values."""
-    return bool(parse_word(word).is_sweep_override())
+    return parse_word(word).is_sweep_override()

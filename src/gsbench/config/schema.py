@@ -194,10 +194,7 @@ ROOT_SETTINGS = frozenset(
 @cache
 def class_defaults() -> dict[str, dict[str, dict[str, Any]]]:
     """The options that classes add to their base classes, by group and name of the class."""
-    found: dict[str, dict[str, dict[str, Any]]] = json.loads(
-        CLASS_DEFAULTS.read_text(encoding="utf-8")
-    )
-    return found
+    return json.loads(CLASS_DEFAULTS.read_text(encoding="utf-8"))
 
 
 @cache

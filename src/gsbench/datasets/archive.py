@@ -138,9 +138,8 @@ def wanted_members(
 
 def is_complete(path: Path, size: int, crc: int) -> bool:
     """Return whether the file ``path`` exists with this size and CRC-32."""
-    if not path.is_file() or path.stat().st_size != size:
-        return False
-    return zlib.crc32(path.read_bytes()) == crc
+    has_size = path.is_file() and path.stat().st_size == size
+    return has_size and zlib.crc32(path.read_bytes()) == crc
 
 
 def extract(

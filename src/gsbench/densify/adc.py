@@ -193,7 +193,7 @@ class ADC(Budgeted):
         event.split_gradient += self.split(
             refinement,
             to_split,
-            gaussians.values.log_scales.detach()[to_split] - math.log(self.split_shrink),
+            gaussians.values.log_scales[to_split] - math.log(self.split_shrink),
             self.split_children,
             Cause.SPLIT_GRADIENT,
             self.revised_opacity,
@@ -251,5 +251,5 @@ class ADC(Budgeted):
         The moments of all opacities become zero, as in 3DGS.
         """
         limit = math.log(ceiling / (1 - ceiling))
-        logits = refinement.gaussians.values.opacity_logits.detach().clamp_max(limit)
+        logits = refinement.gaussians.values.opacity_logits.clamp_max(limit)
         refinement.gaussians.overwrite("opacity_logits", logits)

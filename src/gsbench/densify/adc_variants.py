@@ -219,7 +219,7 @@ class SteepGS(ADC):
         gaussians = refinement.gaussians
         over, large, values, directions = self.saddles(refinement)
         selected, blocked = admit(over, -values, 1, self.allowance(refinement))
-        parents = gaussians.values.detach().select(selected)
+        parents = gaussians.values.select(selected)
         is_large = large[selected].unsqueeze(-1)  # [S, 1]
         direction = directions[selected].to(parents.means)  # [S, 3]
         noise = standard_normal((2 * len(parents), 3), refinement.rng, parents.means)

@@ -62,7 +62,7 @@ class Statistic(NamedTuple):
     """
 
     dtype: torch.dtype
-    shape: tuple[int, ...] = ()
+    shape: tuple[int, ...]
 
 
 class Densifier:
@@ -167,7 +167,7 @@ class Densifier:
     def refine(
         self, step: int, gaussians: TrainableGaussians, rng: torch.Generator
     ) -> RefineEvent | None:
-        """Apply the rules that are due and return the record of their edits.
+        """Apply the rules that are due, without gradients, and return the record of their edits.
 
         Returns None if no rule is due.
         """
@@ -218,10 +218,10 @@ class Densifier:
         gaussians = refinement.gaussians
         parents = selected.nonzero().squeeze(-1)  # [C]
         if revised_opacity and len(parents):
-            logits = gaussians.values.opacity_logits.detach().clone()
+            logits = gaussians.values.opacity_logits.clone()
             logits[parents] = revised_logits(logits[parents])
             gaussians.overwrite("opacity_logits", logits, where=selected)
-        copies = gaussians.values.detach().select(parents)
+        copies = gaussians.values.select(parents)
         self.edit(refinement, append=copies, parents=parents, cause=cause)
         return len(parents)
 
@@ -243,9 +243,7 @@ class Densifier:
         children are drawn from the density of their parent; otherwise they are the parent's mean.
         """
         parents = selected.nonzero().squeeze(-1)  # [S]
-        new = Gaussians.concatenate(
-            [refinement.gaussians.values.detach().select(parents)] * children
-        )
+        new = Gaussians.concatenate([refinement.gaussians.values.select(parents)] * children)
         if sampled:
             # along the axes of each Gaussian
             offsets = standard_normal((len(new), 3), refinement.rng, new.means) * new.scales

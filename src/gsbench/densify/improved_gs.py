@@ -51,7 +51,7 @@ class LongAxis(ADC):
         """Split the Gaussians whose mean gradient reaches the threshold."""
         over, _ = self.candidates(refinement)
         selected, blocked = self.choose(refinement, over, 1)
-        parents = refinement.gaussians.values.detach().select(selected)
+        parents = refinement.gaussians.values.select(selected)
         offset = REACH * self.split_distance
         children = halves(parents, offset, *self._factors, self.opacity_factor)
         self.split_in_halves(refinement, selected, children)
@@ -201,7 +201,7 @@ class EdgeAware(LongAxis):
 
         Their opacities did not recover from the opacity reset.
         """
-        opacities = refinement.gaussians.values.opacities.detach()
+        opacities = refinement.gaussians.values.opacities
         if len(opacities):
             self.prune_below(refinement, quantile(opacities.sort().values, self.recovery_share))
 
@@ -330,7 +330,7 @@ class GNS(EdgeAware):
 
     def meet_budget(self, refinement: Refinement) -> None:
         """Keep ``max_gaussians`` Gaussians, drawn by opacity, and end the pressure."""
-        opacities = refinement.gaussians.values.opacities.detach()
+        opacities = refinement.gaussians.values.opacities
         candidates = torch.ones_like(opacities, dtype=torch.bool)
         kept = draw(candidates, opacities, self.max_gaussians, refinement.rng)
         if len(opacities) > CLOSE * self.max_gaussians:

@@ -26,10 +26,9 @@ class Lineage:
     @staticmethod
     def _entries(parents: Tensor, cause: Cause, step: int) -> dict[str, Tensor]:
         """The history of new Gaussians, given the identities [A] of their parents."""
-        causes = torch.full_like(parents, int(cause), dtype=torch.uint8)
         return {
             "parents": parents,
-            "causes": causes,
+            "causes": torch.full_like(parents, int(cause), dtype=torch.uint8),
             "steps": torch.full_like(parents, step, dtype=torch.int32),
         }
 

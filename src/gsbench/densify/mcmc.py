@@ -101,7 +101,7 @@ class MCMC(SpreadOut):
         count = int(dead.sum())
         if count in (0, len(gaussians)):
             return
-        opacities = gaussians.values.opacities.detach().masked_fill(dead, 0)
+        opacities = gaussians.values.opacities.masked_fill(dead, 0)
         self._copy(refinement, opacities, count, ~dead, Cause.RELOCATED)
         refinement.event.relocated = count
 
@@ -115,7 +115,7 @@ class MCMC(SpreadOut):
         event.blocked_by_cap += wanted - event.added
         if event.added == 0:
             return
-        self._copy(refinement, gaussians.values.opacities.detach(), event.added, None, Cause.ADDED)
+        self._copy(refinement, gaussians.values.opacities, event.added, None, Cause.ADDED)
 
     def _copy(
         self, refinement: Refinement, weights: Tensor, count: int, keep: Tensor | None, cause: Cause
@@ -129,17 +129,17 @@ class MCMC(SpreadOut):
         copies = torch.bincount(sources, minlength=len(gaussians)) + 1  # [N], the Gaussian included
         touched = copies > 1
         limited = copies[touched].clamp_max(self.max_copies)
-        opacity, shrink = shared_opacity(gaussians.values.opacities.detach()[touched], limited)
+        opacity, shrink = shared_opacity(gaussians.values.opacities[touched], limited)
         opacity = opacity.clamp(self.min_opacity, 1 - 1e-6)
-        logits = gaussians.values.opacity_logits.detach().clone()
+        logits = gaussians.values.opacity_logits.clone()
         logits[touched] = torch.logit(opacity)
-        log_scales = gaussians.values.log_scales.detach().clone()
+        log_scales = gaussians.values.log_scales.clone()
         log_scales[touched] += shrink.log().unsqueeze(-1)
         changed = {"opacity_logits": logits, "log_scales": log_scales}
         # all six parameters: overwriting zeroes the moments
         for name, tensor in gaussians.values.tensors().items():
             gaussians.overwrite(name, changed.get(name, tensor), where=touched)
-        self.edit(refinement, keep, gaussians.values.detach().select(sources), sources, cause)
+        self.edit(refinement, keep, gaussians.values.select(sources), sources, cause)
 
 
 def _rotated(w: Tensor, axis: Tensor, vectors: Tensor) -> Tensor:
@@ -171,8 +171,8 @@ def _draw(weights: Tensor, count: int, rng: torch.Generator) -> Tensor:
     """
     cumulative = weights.double().cpu().cumsum(0)
     draws = torch.rand(count, generator=rng, dtype=torch.float64) * cumulative[-1]
-    index = torch.searchsorted(cumulative, draws, right=True).clamp_max(len(weights) - 1)
-    return index.to(weights.device)
+    index = torch.searchsorted(cumulative, draws, right=True)
+    return index.clamp_max(len(weights) - 1).to(weights.device)
 
 
 # Constants from LichtFeld-Studio's code (src/training/strategies/mrnf.cpp,
@@ -248,7 +248,7 @@ class MRNF(SpreadOut):
         wanted = int(self.growth_share * int(candidates.sum()) + 0.5)
 
         free = (self.allowance(refinement) or 0) + num_pruned
-        opacity_scores = values.opacities.detach() * edge_factor
+        opacity_scores = values.opacities * edge_factor
         replacing = draw(seen & ~pruned, opacity_scores, num_pruned, rng)
         remaining = max(0, wanted - int(replacing.sum())) if step < self.grow_until else 0
         eligible = candidates & ~pruned & ~replacing
@@ -258,7 +258,7 @@ class MRNF(SpreadOut):
         event.pruned_opacity += num_pruned
         parents = (replacing | growing).nonzero().squeeze(-1)  # [S]
         event.split_gradient += len(parents)
-        children = halves(values.detach().select(parents), SPLIT_OFFSET, *SPLIT_FACTORS)
+        children = halves(values.select(parents), SPLIT_OFFSET, *SPLIT_FACTORS)
         kept = ~(pruned | replacing | growing)
         self.edit(refinement, kept, children, parents.repeat(2), Cause.SPLIT_GRADIENT)
 
@@ -266,7 +266,7 @@ class MRNF(SpreadOut):
         """The refine weights [N] over the training views at the indices ``views``."""
         training, largest = self.context.training_views, torch.zeros_like(gaussians.opacity_logits)
         for index in views:
-            image = training.render(index, gaussians, step).image.detach()
+            image = training.render(index, gaussians, step).image
             error = training.dissimilarity(index, image)  # [H, W]
             error = error / error.mean().clamp_min(torch.finfo(error.dtype).tiny)
             weights = error.unsqueeze(-1).expand(-1, -1, 3).contiguous()
@@ -276,7 +276,7 @@ class MRNF(SpreadOut):
 
     def to_prune(self, gaussians: Gaussians) -> Tensor:
         """Mask [N] of the Gaussians that are transparent, too small, too large, or too far away."""
-        center, half, _ = bounds(gaussians.means.detach())
+        center, half, _ = bounds(gaussians.means)
         limit = REACH * half
         scales = gaussians.log_scales
         far = (gaussians.means - center).abs().amax(-1) > limit

@@ -124,7 +124,7 @@ class ResGS(ADC):
         refinement.event.split_gradient += self.split(
             refinement,
             selected,
-            gaussians.values.log_scales.detach()[selected] - math.log(self.split_shrink),
+            gaussians.values.log_scales[selected] - math.log(self.split_shrink),
             1,
             Cause.SPLIT_GRADIENT,
             keep_parent=True,
@@ -133,7 +133,7 @@ class ResGS(ADC):
         self.statistics["level"][before:] = levels
         parents = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.device)
         parents[:before] = selected
-        logits = gaussians.values.opacity_logits.detach()
+        logits = gaussians.values.opacity_logits
         fainter = torch.where(parents, faded(logits, self.parent_opacity), logits)
         gaussians.overwrite("opacity_logits", fainter, where=parents)
 
@@ -148,5 +148,5 @@ class ResGS(ADC):
 
         Gaussians that are not needed become faint and are pruned.
         """
-        logits = refinement.gaussians.values.opacity_logits.detach()
+        logits = refinement.gaussians.values.opacity_logits
         refinement.gaussians.overwrite("opacity_logits", faded(logits, self.fade))

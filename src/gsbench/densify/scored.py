@@ -22,7 +22,7 @@ from gsbench.densify.scores import (
 from gsbench.gaussians.model import Gaussians
 from gsbench.settings import Fraction, OpenFraction
 
-# keeps the weights of the draw for pruning finite (from the authors' code)
+# keeps the weights of draws for pruning finite (from the authors' code of both)
 MIN_DIVISOR = 1e-6
 
 
@@ -104,10 +104,6 @@ class FastGS(AbsGS):
         self.remove(refinement, faint, self.statistics["score"] > self.final_score)
 
 
-# keeps 1 / score, the weights of the draw for pruning, finite (from the authors' code)
-MIN_SCORE = 1e-6
-
-
 @dataclass
 class Taming(ADC):
     """ADC whose candidates are drawn by score, up to a budget (Mallick et al., arXiv 2406.15643).
@@ -155,7 +151,7 @@ class Taming(ADC):
         views, total = self.context.training_views, torch.zeros_like(values.opacity_logits)
         for index in draw_views(views, self.score_views, rng):
             total += self.score_in(index, values, refinement.step)
-        self.statistics["score"] = (total + MIN_SCORE).float()
+        self.statistics["score"] = (total + MIN_DIVISOR).float()
 
     def score_in(self, index: int, gaussians: Gaussians, step: int) -> Tensor:
         """The score [N] that training view ``index`` adds."""
@@ -168,10 +164,10 @@ class Taming(ADC):
         footprint, visible = render.require_footprint(pixels), render.visible
         terms = (
             (self.weight_gradient, self.mean_gradient()),
-            (self.weight_opacity, gaussians.opacities.detach()),
+            (self.weight_opacity, gaussians.opacities),
             (self.weight_depth, torch.where(visible, footprint.depths, 0.0)),
             (self.weight_radius, render.radii.to(error)),
-            (self.weight_scale, gaussians.scales.detach().prod(-1)),
+            (self.weight_scale, gaussians.scales.prod(-1)),
             (self.weight_distance, footprint.distances),
             (self.weight_values, footprint.values),
             (self.weight_pixels, footprint.pixels.to(error)),

@@ -78,28 +78,23 @@ class TrainingViews(Protocol):
 
     def image(self, index: int) -> Tensor:
         """The photograph of a view, [H, W, 3] uint8 on the device of the Gaussians."""
-        ...
 
     def render(self, index: int, gaussians: Gaussians, step: int) -> RenderOutput:
         """Render a view as the training does at iteration ``step``."""
-        ...
 
     def dissimilarity(self, index: int, image: Tensor) -> Tensor:
         """max(0, 1 - SSIM) of a rendered ``image`` [H, W, 3] and the photograph, [H, W].
 
         SSIM is the mean over channels.
         """
-        ...
 
     def loss(self, index: int, image: Tensor) -> Tensor:
         """The photometric loss of a rendered ``image`` [H, W, 3]; a scalar."""
-        ...
 
 
 def draw_views(views: TrainingViews, count: int, rng: torch.Generator) -> list[int]:
     """Draw ``count`` different views, or all if there are fewer."""
-    indices: list[int] = torch.randperm(len(views), generator=rng)[:count].tolist()
-    return indices
+    return torch.randperm(len(views), generator=rng)[:count].tolist()
 
 
 def blended_sums(
@@ -112,7 +107,7 @@ def blended_sums(
     with respect to that colour, which any rasterizer computes. All colours are set to grey, so that
     no rasterizer clamps them (a clamped colour has no gradient).
     """
-    probe = Gaussians(**{name: tensor.detach() for name, tensor in gaussians.tensors().items()})
+    probe = gaussians.detach()
     probe.sh_dc = torch.zeros_like(probe.sh_dc, requires_grad=True)
     probe.sh_rest = torch.zeros_like(probe.sh_rest)
     with torch.enable_grad():
@@ -134,9 +129,8 @@ def edge_map(image: Tensor) -> Tensor:
     luma = (sums + HALF) >> SHIFT
     edges = torch.zeros_like(luma)
     height, width = luma.shape
-    block = torch.zeros_like(luma[1:-1, 1:-1])  # sums of 3 x 3 pixels
-    for y, x in product(range(3), repeat=2):
-        block += luma[y : height - 2 + y, x : width - 2 + x]
+    shifts = product(range(3), repeat=2)
+    block = sum(luma[y : height - 2 + y, x : width - 2 + x] for y, x in shifts)  # 3 x 3 pixels
     edges[1:-1, 1:-1] = (9 * luma[1:-1, 1:-1] - block).clamp(0, 255)
     return to_unit_range(edges.float())
 
@@ -208,7 +202,7 @@ def draw(candidates: Tensor, scores: Tensor, count: int, rng: torch.Generator) -
     """
     index = candidates.nonzero().squeeze(-1).cpu()  # [C]
     times = torch.empty(len(index), dtype=torch.float64).exponential_(generator=rng)
-    keys = times / scores.detach().cpu()[index]
+    keys = times / scores.cpu()[index]
     drawn = torch.zeros(len(candidates), dtype=torch.bool)
     drawn[index[torch.sort(keys, stable=True).indices[: max(count, 0)]]] = True
     return drawn.to(candidates.device)

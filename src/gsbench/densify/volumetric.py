@@ -165,7 +165,7 @@ class Volumetric(ADC):
     def split_by_volume(self, refinement: Refinement) -> None:
         """Split every Gaussian with V > V_th (eq. 5 to 7)."""
         event, strictness = refinement.event, refinement.strictness
-        log_scales = refinement.gaussians.values.log_scales.detach()
+        log_scales = refinement.gaussians.values.log_scales
         volumes = log_volume(log_scales)  # [N]
         threshold = self.log_threshold(volumes, strictness)
         children = self.child_log_scales(log_scales)  # [N, 3]

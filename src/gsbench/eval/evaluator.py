@@ -176,7 +176,7 @@ class Evaluator:
         ):
             if unknown := [key for key in given if key not in known]:
                 raise InputError(f"unknown {what} {unknown[0]!r}; choose among {', '.join(known)}")
-        self.protocol: Protocol = protocol
+        self.protocol = protocol
         self.extra, self.more = dict(extra), tuple(sorted(more))
         self.device = torch.device(device)
         self.unavailable: dict[str, str] = {}

@@ -54,8 +54,9 @@ def known_keys() -> tuple[str, ...]:
 
 def lpips_variants() -> tuple[str, ...]:
     """The values allowed in ``eval.lpips``."""
-    own = [facts.key for facts in METRICS if facts.setting == "eval.lpips"]
-    return tuple(key.removeprefix(LPIPS) for key in own)
+    return tuple(
+        facts.key.removeprefix(LPIPS) for facts in METRICS if facts.setting == "eval.lpips"
+    )
 
 
 def further_keys() -> tuple[str, ...]:

@@ -158,7 +158,7 @@ class Lpips:
         pairs = zip(first.split(1), second.split(1), strict=True)
         return torch.stack([self._pair(a, b, weights) for a, b in pairs])  # [B]
 
-    def _pair(self, first: Tensor, second: Tensor, weights: Tensor | None = None) -> Tensor:
+    def _pair(self, first: Tensor, second: Tensor, weights: Tensor | None) -> Tensor:
         """The distance [] of two images [1, 3, H, W]."""
         # Both images pass a layer before the next one, so that features of earlier layers need not
         # be kept.
@@ -191,7 +191,7 @@ def load_lpips(
 
 
 def _feature_distance(
-    first: Tensor, second: Tensor, head: Tensor, weights: Tensor | None = None
+    first: Tensor, second: Tensor, head: Tensor, weights: Tensor | None
 ) -> Tensor:
     """Spatial mean of the weighted squared difference of unit feature vectors.
 

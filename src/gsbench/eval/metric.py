@@ -39,7 +39,6 @@ class Metric(Protocol):
         The render is rounded to 8 bits. Both images have equal pixels where a mask ignores them.
         May raise `UnavailableError`.
         """
-        ...
 
 
 @runtime_checkable
@@ -54,7 +53,6 @@ class MaskedMetric(Metric, Protocol):
 
         ``mask`` is [H, W] bool; the images are those of `measure`.
         """
-        ...
 
 
 class UnavailableError(Exception):

@@ -17,12 +17,12 @@ from gsbench.files import DAMAGE
 from gsbench.logs import Progress, no_progress
 from gsbench.runs.trial_record import Oddity
 from gsbench.scene.beside import read_mask
-from gsbench.scene.images import EXIF_ORIENTATION, open_image, read_image
+from gsbench.scene.images import EXIF_ORIENTATION, SIXTEEN_BIT_MODES, open_image, read_image
 from gsbench.scene.rules import Finding, inspect
 
 # A view of so many pixels takes half a minute; a file of some kB may claim more.
 MAX_PIXELS = 64_000_000
-GREY_MODES = ("1", "L", "LA", "I;16", "I;16B", "I;16L", "I;16N")
+GREY_MODES = ("1", "L", "LA", *SIXTEEN_BIT_MODES)
 UPRIGHT = (0, 1)  # EXIF orientations; 0 is written by some cameras for none
 LOSSY_WEBP = b"VP8 "  # the first chunk of a WebP file without alpha that is compressed with loss
 
@@ -83,9 +83,6 @@ def read_picture(path: Path, is_render: bool) -> NDArray[np.uint8]:
     return pixels
 
 
-Looks = Sequence[tuple[str, Look, Look]]  # a view, its render, its photograph
-
-
 # Tests of a render and its photograph, by the ids of the rules about pictures
 ODD: Mapping[str, Callable[[Look, Look], bool]] = {
     "transparent-render": lambda render, _: render.transparent,
@@ -99,15 +96,6 @@ ODD: Mapping[str, Callable[[Look, Look], bool]] = {
 }
 
 
-def find_odd_pictures(looks: Looks, where: str) -> tuple[Oddity, ...]:
-    """Log and return what is odd: one line for each rule that applies to some views."""
-    found = {
-        rule: [Finding(1, [view]) for view, *both in looks if applies(*both)]
-        for rule, applies in ODD.items()
-    }
-    return inspect("pictures", found, where)
-
-
 @dataclass(frozen=True)
 class PicturePair:
     """A view with the files of its photograph, its rendered picture and its mask, if any."""
@@ -119,12 +107,13 @@ class PicturePair:
 
 
 def check_pairs(pairs: Sequence[PicturePair], where: str) -> tuple[Oddity, ...]:
-    """Look at all pictures, which are from ``where``, before any is measured: what is odd.
+    """Look at all pictures, which are from ``where``, before any is measured.
 
-    Raises `InputError` for a picture whose size differs from its photograph's, or is too large:
-    pictures are never resized.
+    Logs and returns what is odd: one line for each rule that applies to some views. Raises
+    `InputError` for a picture whose size differs from its photograph's, or is too large: pictures
+    are never resized.
     """
-    looks = []
+    found: dict[str, list[Finding]] = {rule: [] for rule in ODD}
     for pair in pairs:
         render, truth = look_at(pair.picture), look_at(pair.photograph)
         (width, height), wanted = render.size, truth.size
@@ -140,8 +129,10 @@ def check_pairs(pairs: Sequence[PicturePair], where: str) -> tuple[Oddity, ...]:
                 f"{pair.picture} is {width}x{height} px: pictures of more than "
                 f"{MAX_PIXELS / 1e6:g} megapixels are not measured; render and shrink both"
             )
-        looks.append((pair.view, render, truth))
-    return find_odd_pictures(looks, where)
+        for rule, applies in ODD.items():
+            if applies(render, truth):
+                found[rule].append(Finding(1, [pair.view]))
+    return inspect("pictures", found, where)
 
 
 def measure(

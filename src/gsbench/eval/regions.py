@@ -33,8 +33,7 @@ def depths_of_points(points: NDArray[np.float64], camera: Camera) -> Depth:
         return np.zeros((camera.height, camera.width), np.float32)
     columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     _, nearest = cKDTree(places[seen]).query(np.stack([columns, rows], axis=-1))  # [H, W]
-    depths: Depth = z[seen].astype(np.float32)[nearest]
-    return depths
+    return z[seen].astype(np.float32)[nearest]
 
 
 def regions_by_distance(depths: Mapping[str, Depth]) -> dict[str, Regions]:

@@ -13,7 +13,7 @@ from plyfile import PlyData, PlyElement
 
 from gsbench.errors import InputError
 from gsbench.files import DAMAGE, atomic
-from gsbench.gaussians.model import MAX_SH_DEGREE, NUM_SH_REST, Gaussians
+from gsbench.gaussians.model import NUM_SH_REST, Gaussians
 from gsbench.gaussians.ply_files import (
     check_columns,
     filtered,
@@ -34,17 +34,15 @@ POSITION = ["x", "y", "z"]
 DC, SCALES = ([f"{kind}_{i}" for i in range(3)] for kind in ("f_dc", "scale"))
 ROTATIONS = [f"rot_{i}" for i in range(4)]
 REQUIRED = [*POSITION, *DC, "opacity", *SCALES, *ROTATIONS]
-COLUMNS = [
-    *[*POSITION, "nx", "ny", "nz", *DC, *[f"{REST}{i}" for i in range(NUM_REST)]],
-    *["opacity", *SCALES, *ROTATIONS],
-]
+ALL_REST = [f"{REST}{i}" for i in range(NUM_REST)]
+COLUMNS = [*POSITION, "nx", "ny", "nz", *DC, *ALL_REST, "opacity", *SCALES, *ROTATIONS]
 Column = NDArray[Any]  # [N]
 T = TypeVar("T")
 
 # Marks files of gsbench, whose values need no doubt.
 OWN_COMMENT = "written by gsbench"
 
-REST_COUNTS = tuple(3 * ((degree + 1) ** 2 - 1) for degree in range(MAX_SH_DEGREE + 1))
+REST_COUNTS = (0, 9, 24, 45)  # of SH degree 0 to 3
 # Replaces an infinite logit; negated for an opacity of 0. Its opacity, 1 - 2^-23, is as close to 1
 # as float32 allows with a gradient.
 MAX_LOGIT = 23 * math.log(2)
@@ -191,8 +189,8 @@ def _check_properties(vertices: Any, path: Path) -> list[str]:
 
     Raises InputError unless the properties are those of a 3DGS PLY.
     """
-    present = set(vertices.dtype.names or ())
-    check_columns(vertices.dtype.names or (), COLUMNS, path)
+    present = vertices.dtype.names or ()
+    check_columns(present, COLUMNS, path)
     present_rest = {name for name in present if name.startswith(REST)}
     rest = [f"{REST}{i}" for i in range(len(present_rest))]
     missing = [name for name in REQUIRED if name not in present]
@@ -205,7 +203,7 @@ def _check_properties(vertices: Any, path: Path) -> list[str]:
         )
     if missing or len(vertices) == 0:
         listed = ", ".join(missing) or "all, since it is empty"
-        is_cloud = present >= set(POSITION) and "f_dc_0" in missing
+        is_cloud = set(present) >= set(POSITION) and "f_dc_0" in missing
         hint = ": it is a point cloud, which init=points reads" if is_cloud else ""
         if missing == ["scale_2"]:
             hint = ": it has flat Gaussians (2DGS), and gsbench draws 3D Gaussians alone"

@@ -4,6 +4,7 @@ import io
 import logging
 import re
 from collections.abc import Collection, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -148,10 +149,8 @@ def check_columns(names: Collection[str], known: Collection[str], path: Path) ->
         for name in names
         if name not in known and not HARMLESS.fullmatch(name) and not is_filter(name)
     ]
-    for name in unknown:
-        if reason := next(
-            (REFUSED[key] for key in REFUSED if re.fullmatch(key, name.lower())), None
-        ):
+    for name, (pattern, reason) in product(unknown, REFUSED.items()):
+        if re.fullmatch(pattern, name.lower()):
             raise InputError(
                 f"{path}: it has the column {name}: {reason}, and gsbench draws Gaussians alone"
             )

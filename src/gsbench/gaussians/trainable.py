@@ -247,14 +247,10 @@ class TrainableGaussians:
 
         It is None for a parameter that was replaced since.
         """
-        states: list[ParameterState | None] = []
-        for (name, parameter), own in zip(
-            self.values.tensors().items(), known.parameters, strict=True
-        ):
-            current = parameter is own
-            if current:
-                self.adam[name].step += 1
-            states.append(self.adam[name] if current else None)
+        pairs = zip(self.values.tensors().items(), known.parameters, strict=True)
+        states = [self.adam[name] if parameter is own else None for (name, parameter), own in pairs]
+        for state in filter(None, states):
+            state.step += 1
         return states
 
     @torch.no_grad()
@@ -280,7 +276,7 @@ class TrainableGaussians:
             raise ValueError(
                 f"overwrite: {name} has shape {tuple(parameter.shape)}, got {tuple(values.shape)}"
             )
-        self._replace(name, values.detach().clone())
+        self._replace(name, values.clone())
         for _, tensor in self.adam[name].rows(len(values)):
             tensor[... if where is None else where] = 0
 

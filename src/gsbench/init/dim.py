@@ -124,8 +124,9 @@ class Dim(Reconstruction):
         from gsbench.init.colmap.matches import verify_pairs
 
         weights = self.find_weights()
-        digests = [*map(file_sha256, weights)]
-        store, pairs, counts = self._store(job, task.names, weights, digests), task.pairs, {}
+        digests = {path.name: file_sha256(path) for path in weights}
+        store = self._store(job, task.names, weights, [*digests.values()])
+        pairs, counts = task.pairs, {}
         with timer.phase("extract"):
             steps = _steps(task.names, "extract", progress)
             keypoints = {name: store.features(name).colmap_keypoints for name in steps}
@@ -150,11 +151,10 @@ class Dim(Reconstruction):
         write_features(task.database, keypoints, found)
         with timer.phase("verify"):
             verify_pairs(task.database, self, progress)
-        named = {path.name: digest for path, digest in zip(weights, digests, strict=True)}
         lack = f"no keypoint in {some_of(empty)}: no point comes from these images"
         return {
             "counts": counts,
-            "settings": self.extraction | self.matching | {"weights_sha256": named},
+            "settings": self.extraction | self.matching | {"weights_sha256": digests},
             "warnings": [lack] if empty else [],
             "packages": ["torch", "kornia", *["transformers"] * (self.extractor == "superpoint")],
         }
@@ -172,8 +172,9 @@ class Dim(Reconstruction):
         device = select_device(self.device, "init.device")
         extraction, matching = self.extraction, self.matching
         # loaded when an image needs them, since a run that is continued may need no network
-        build = networks.EXTRACTORS[self.extractor]
-        extractor = cache(partial(build, extraction, weights[0], device))
+        extractor = cache(
+            partial(networks.EXTRACTORS[self.extractor], extraction, weights[0], device)
+        )
         matcher = cache(partial(networks.build_matcher, extraction, matching, weights[-1], device))
 
         def extract(name: str) -> Features:
@@ -185,8 +186,9 @@ class Dim(Reconstruction):
             return networks.match(matcher(), *pair)
 
         room = 2 + CACHE_BYTES // (BYTES_OF_KEYPOINT * self.max_keypoints)
-        settings = extraction, matching, digests
-        folder = networks.store_folder(job.work_dir, job.capture, names, *settings)
+        folder = networks.store_folder(
+            job.work_dir, job.capture, names, extraction, matching, digests
+        )
         return networks.FeatureStore(folder, extract, match, room)
 
 

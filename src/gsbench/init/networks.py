@@ -61,8 +61,13 @@ class Features:
         height, width = mask.shape
         columns, rows = np.floor(self.colmap_keypoints).astype(np.int64).T  # [K] each
         kept = mask[rows.clip(0, height - 1), columns.clip(0, width - 1)]
-        arrays = self.keypoints[kept], self.descriptors[kept], self.scores[kept]
-        return Features(*arrays, self.network_size, self.file_size)
+        return Features(
+            self.keypoints[kept],
+            self.descriptors[kept],
+            self.scores[kept],
+            self.network_size,
+            self.file_size,
+        )
 
 
 FORMAT_VERSION = 2  # to be raised when the same settings give different files
@@ -107,8 +112,7 @@ class FeatureStore:
     def matches(self, *pair: str) -> Matches:
         """The matches of a pair of images."""
         found = self._stored(lambda: {"found": self._match(*map(self.features, pair))}, *pair)
-        matches: Matches = found["found"]
-        return matches
+        return found["found"]
 
     def _stored(self, make: Callable[[], Mapping[str, Any]], *names: str) -> Mapping[str, Any]:
         """The arrays in the file of ``names``, which ``make`` returns if it cannot be read."""
@@ -178,11 +182,12 @@ def _superpoint(settings: Settings, weights: Path, device: torch.device) -> Extr
         )
     )
     state = load_state(weights)
-    prefix = LIGHTGLUE_DETECTOR_PREFIX
-    detector = [name for name in state if name.startswith(prefix)]
-    if detector:
-        state = {name.removeprefix(prefix): state[name] for name in detector}
-    load_into(network, state, weights).to(device)
+    detector = {
+        name.removeprefix(LIGHTGLUE_DETECTOR_PREFIX): value
+        for name, value in state.items()
+        if name.startswith(LIGHTGLUE_DETECTOR_PREFIX)
+    }
+    load_into(network, detector or state, weights).to(device)
 
     def extract(image: Tensor) -> Found:
         height, width = image.shape[-2:]
@@ -194,9 +199,8 @@ def _superpoint(settings: Settings, weights: Path, device: torch.device) -> Extr
         keypoints = (output.keypoints[0] * size).round()  # [K, 2]
         # The network's own border removal is off, because it tests the right and bottom borders in
         # the wrong unit.
-        border = SUPERPOINT_BORDER
-        inside = ((keypoints >= border) & (keypoints < size - border)).all(dim=1)
-        keep = inside & output.mask[0].bool()
+        inside = (keypoints >= SUPERPOINT_BORDER) & (keypoints < size - SUPERPOINT_BORDER)
+        keep = inside.all(dim=1) & output.mask[0].bool()
         return keypoints[keep], output.descriptors[0][keep], output.scores[0][keep]
 
     return extract
@@ -290,9 +294,8 @@ def lightglue_matcher(
             old, new = f"{kind}.{layer}.", f"transformers.{layer}.{kind}."
             for name in [name for name in state if name.startswith(old)]:
                 state[name.replace(old, new)] = state.pop(name)
-    # DISK's file also has a constant 1 for each layer, "log_assignment.0.r", that no code reads.
-    unread = [f"log_assignment.{layer}.r" for layer in range(network.conf.n_layers)]
-    state = {name: value for name, value in state.items() if name not in unread}
+        # DISK's file also has a constant 1 for each layer, which no code reads.
+        state.pop(f"log_assignment.{layer}.r", None)
     load_into(network, state, weights).to(device)
 
     def inputs(features: Features) -> dict[str, torch.Tensor]:

@@ -26,7 +26,6 @@ PREFIX = re.compile(r"^(colou?r|rgb|diffuse|ambient|scalar)_")
 # Colours up to this are fractions, even if tone mapping or rounding went beyond 1. As bytes they
 # would all be black.
 MAX_FRACTION = 2.0
-OF_COLMAP = "it belongs to a COLMAP model: init=dataset reads its folder"
 REMEDY = "convert it to PLY with the properties x, y, z [red, green, blue], such as by CloudCompare"
 
 
@@ -64,7 +63,7 @@ def read_points(path: Path) -> tuple[Array, ByteArray | None]:
 
 def _other_format(path: Path) -> str:
     if path.stem in ("points3D", "images", "cameras"):
-        return OF_COLMAP
+        return "it belongs to a COLMAP model: init=dataset reads its folder"
     kind = recognised_format(path)
     return f"it is {kind}" if kind else f"it is no PLY: {REMEDY}"
 

@@ -53,8 +53,7 @@ def make_report(
         },
         **further,
     )
-    odd = find_oddities(report, model, capture)
-    return replace(report, warnings=tuple(warnings), oddities=odd)
+    return replace(report, warnings=tuple(warnings), oddities=find_oddities(report, model, capture))
 
 
 def measure_gauge(extent: float, scale_to_reference: float | None) -> Gauge:

@@ -9,6 +9,7 @@ import logging
 import shutil
 from abc import abstractmethod
 from collections import Counter
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -146,9 +147,7 @@ def build_model(job: Job, progress: Progress) -> InitReport:
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.WARNING)
     capture, timer = job.capture, Timer()
     cameras = job.reference or capture.model
-    reference = None
-    if cameras is not None:
-        reference = read_reference(replace(capture, model=cameras))
+    reference = None if cameras is None else read_reference(replace(capture, model=cameras))
     options, model, facts = _best_attempt(job, reference, timer, progress)
     if facts["poses"] == "own":
         exact = capture.exact_poses and job.reference is None
@@ -176,16 +175,13 @@ def _best_attempt(
 ) -> Attempt:
     """The job's model; if ``pairs=auto`` places few images, that of all pairs if it has more."""
     options, total = job.options, len(job.capture.image_names)
-    lacks_pairs = options.pairs == "auto" and total > ALL_PAIRS_UP_TO
+    if options.pairs != "auto" or total <= ALL_PAIRS_UP_TO:
+        return _attempt(job, reference, timer, progress)
     made, placed = None, 0
-    try:
+    with suppress(UnplacedError):
         made = _attempt(job, reference, timer, progress)
         placed = made[1].num_reg_images()
-    except UnplacedError:
-        if not lacks_pairs:
-            raise
-    is_enough = not lacks_pairs or placed >= REGISTERED_SHARE * total
-    if made and (is_enough or made[2]["poses"] == "shared"):
+    if made and (placed >= REGISTERED_SHARE * total or made[2]["poses"] == "shared"):
         return made
     logger.warning(
         "%s: %d of %d images placed from the pairs of init.pairs=auto: the others are matched, too",
@@ -229,16 +225,17 @@ def _attempt(
         with timer.phase("triangulate"):
             model = mapping.triangulate(task, scratch, reference, options, progress)
         if options.ignores_test_photographs(reference):
-            points = TrainingPoints(options.points_from, model.num_points3D(), None, None)
-            facts["training_points"] = points
+            kept = model.num_points3D()
+            facts["training_points"] = TrainingPoints(options.points_from, kept, None, None)
         return options, model, {**facts, "poses": "shared", "scale_to_reference": 1.0}
     with timer.phase("map"):
         found = mapping.map_images(task, scratch, options, progress)
     facts["counts"]["models"] = found.models
     facts["warnings"] += found.warnings
     if options.points_from == "train":
-        points = keep_training_points(found.model, capture.train_names, task.images)
-        facts["training_points"] = points
+        facts["training_points"] = keep_training_points(
+            found.model, capture.train_names, task.images
+        )
     return options, found.model, {**facts, "poses": "own", "mapped_by": found.strategy}
 
 

@@ -92,7 +92,11 @@ def describe_plan(trials: Sequence[Trial], parallel: int = 1) -> list[str]:
             state = state_in_queue(folder.path, queue) or state
         note = ""
         if state == "done":
-            note = _what_is_left(trial)
+            # what a run would do with it, as far as that is known without downloads
+            left = folder.why_not_done(
+                trial.values, lambda options: unavailable_now(options | {"download": False})
+            )
+            note = f"  will be checked: {left}" if left else ""
         elif experiment := finished.elsewhere(folder):
             note = f"  as in {experiment}: nothing to compute"
         else:
@@ -122,14 +126,6 @@ def describe_plan(trials: Sequence[Trial], parallel: int = 1) -> list[str]:
         sources += [f"{guess}; without compiling (once) and initial clouds (SfM)"] * bool(guess)
         time = f"about {duration}{at_once}, {'; '.join(sources)}"
     return [*lines, f"time: {time}"]
-
-
-def _what_is_left(trial: Trial) -> str:
-    """A note on what a run would do with a finished trial; "" if nothing. Downloads nothing."""
-    change = trial.files.why_not_done(
-        trial.values, lambda options: unavailable_now(options | {"download": False})
-    )
-    return "" if change is None else f"  will be checked: {change}"
 
 
 def unavailable_now(options: Mapping[str, Any]) -> Collection[str]:

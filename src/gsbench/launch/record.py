@@ -5,7 +5,7 @@ Loads no torch.
 
 import logging
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +57,7 @@ def record(trials: Sequence[Trial], asks: bool = True) -> list[Question]:
     Raises InputError if trials of one experiment name different metrics.
     """
     asked_metrics(trials)
-    typed = group_by([one for one in trials if one.overrides], lambda one: one.files.home)
+    typed = group_by([one for one in trials if one.overrides], "files.home")
     return [question for home, own in typed.items() for question in _record(home, own, asks)]
 
 
@@ -156,7 +156,7 @@ def asked_of(trials: Sequence[Trial], rows: Sequence[Planned]) -> Asked | None:
 def check_questions(trials: Sequence[Trial]) -> None:
     """Raise InputError for a wrong question that an experiment's file names."""
     asked_metrics(trials)
-    for own in group_by(trials, lambda one: one.files.home).values():
+    for own in group_by(trials, "files.home").values():
         asked_of(own, planned_rows(own))
 
 
@@ -220,19 +220,18 @@ def check_looks(trials: Sequence[Trial], rows: Sequence[Planned]) -> tuple[int, 
 
 def forget_refused(trials: Sequence[Trial]) -> None:
     """Remove the trials of a command of which all were refused, unless their training has begun."""
-    for home, own in group_by(trials, lambda trial: trial.files.home).items():
+    for home, own in group_by(trials, "files.home").items():
         begun = (RESULTS, ASKED)
         folders = {trial.folder for trial in own}
         remove(home, [one for one in folders if not any((one / name).exists() for name in begun)])
 
 
-def remove(home: Path, folders: Iterable[Path]) -> None:
+def remove(home: Path, folders: Collection[Path]) -> None:
     """Delete the folders of trials and drop them from the plan of the experiment in ``home``.
 
     The results of stages stay in the store: if the old code comes back, nothing is computed again.
     That they gave results stays known, so they count as tries.
     """
-    folders = list(folders)
     for folder in folders:
         require_no_links(home.parent, folder, below=True)
         # first: a half-deleted trial must not look complete

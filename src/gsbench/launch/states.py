@@ -292,7 +292,7 @@ def arm_names(trials: Iterable[Trial | TrialState]) -> dict[Path, str]:
     """
     names = {}
     words = {trial.folder: _settings_of(trial.overrides) for trial in trials}
-    for arm, folders in group_by(words, lambda folder: folder.parent.name).items():
+    for arm, folders in group_by(words, "parent.name").items():
         shared = set.intersection(*(words[folder] for folder in folders))
         hashes = {folder: folder.name.partition(SEED)[0] for folder in folders}
         for folder in folders:

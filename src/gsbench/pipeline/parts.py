@@ -76,14 +76,12 @@ class Parts:
         # else COLMAP would take all cores
         if values.get("threads") == "auto" and values["_target_"].startswith(GSBENCH):
             values = values | {"threads": self.threads}
-        initializer: Initializer = build("init", values, self._allowed)
-        return initializer
+        return build("init", values, self._allowed)
 
     @cached_property
     def trainer(self) -> Densifier | External:
         """The trainer of the group densify: a densifier, or another program."""
-        trainer: Densifier | External = build("densify", self.values["densify"], self._allowed)
-        return trainer
+        return build("densify", self.values["densify"], self._allowed)
 
     @property
     def program(self) -> External | None:

@@ -48,11 +48,7 @@ from gsbench.runs import keys, layout
 from gsbench.runs.commands import digest_of, read_history
 from gsbench.runs.store import Store, StoredResult
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.runs.trial_record import (
-    AskedBefore,
-    Failure,
-    TrialRecord,
-)
+from gsbench.runs.trial_record import AskedBefore, Failure, TrialRecord
 from gsbench.scene.colmap_files import model_files
 from gsbench.scene.types import Capture
 from gsbench.system.locks import hold
@@ -120,10 +116,9 @@ class TrialSteps:
         check_capture(self.views, parts)
         yield init
         program = parts.program
-        if program is None:
-            trained = train_step(self.views, parts)
-        else:
-            trained = external_step(self.views, program, parts)
+        trained = (
+            external_step(self.views, program, parts) if program else train_step(self.views, parts)
+        )
         yield trained
         yield ground_truth_step(self.views)
         yield evaluate_step(self.views, trained, parts)

@@ -214,8 +214,7 @@ def ask_about(
         return command_now(questions=tuple(found)) if found else None
 
     append(home, make)
-    covering = read_history(home).covering(digest, *this)
-    return [question.id for question in covering]
+    return [question.id for question in read_history(home).covering(digest, *this)]
 
 
 def _results(

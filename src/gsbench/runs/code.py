@@ -26,7 +26,7 @@ import yaml
 from pydantic import Field
 
 from gsbench.files import file_sha256, user_cache, write_json
-from gsbench.parsing import DamagedError, SafeLoader, read_if_sound, read_json
+from gsbench.parsing import SafeLoader, read_if_sound
 from gsbench.runs.configuration import GSBENCH, Values, determining_settings, sha256_of, targets_in
 
 PACKAGE = Path(__file__).resolve().parents[1]
@@ -118,11 +118,7 @@ def _digest(contents: Mapping[str, bytes]) -> str:
 
 @cache
 def _released() -> dict[str, dict[str, str]]:
-    try:
-        released: dict[str, dict[str, str]] = read_json(PACKAGE / RELEASED)
-    except (FileNotFoundError, DamagedError):
-        return {}
-    return released
+    return read_if_sound(PACKAGE / RELEASED, dict[str, dict[str, str]]) or {}
 
 
 def syntax_of(source: bytes, name: str = "") -> bytes:

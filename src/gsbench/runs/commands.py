@@ -23,16 +23,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field
 
 from gsbench.files import open_plain, require_no_links
-from gsbench.parsing import (
-    Amount,
-    Count,
-    DamagedError,
-    Raw,
-    Record,
-    Text,
-    parse_typed,
-    read_bytes,
-)
+from gsbench.parsing import Amount, Count, DamagedError, Raw, Record, Text, parse_typed, read_bytes
 from gsbench.runs.code import config_hash, edited, states_of, user_modules
 from gsbench.runs.configuration import SHOWN, Values, sha256_of
 from gsbench.runs.experiments import Arm, make_home

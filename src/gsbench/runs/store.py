@@ -206,7 +206,7 @@ class Store:
         """
         for stage in stages:
             for partial in (self.root / stage.name).glob(".*.partial"):
-                key = partial.name[1 : -len(".partial")]
+                key = _key_of(partial)
                 if not stage.resumable or self.folder(stage, key).exists():
                     lock = partial.with_name(f".{key}.lock")
                     with suppress(BusyError), suppress(OSError), hold(lock, key, wait=False):

@@ -262,16 +262,11 @@ def record_from(content: bytes, path: Path) -> TrialRecord:
     try:
         return adapter(TrialRecord).validate_json(content)
     except ValidationError as error:
-        status_fault = next(
-            (fault for fault in error.errors() if fault["loc"] == ("status",)), None
-        )
-        if status_fault is not None:
-            status = (
-                "missing"
-                if status_fault["type"] == "missing"
-                else reprlib.repr(status_fault["input"])
-            )
-            raise UnfinishedError(path, f"is unfinished, its status is {status}") from None
+        for fault in error.errors():
+            if fault["loc"] == ("status",):
+                is_missing = fault["type"] == "missing"
+                status = "missing" if is_missing else reprlib.repr(fault["input"])
+                raise UnfinishedError(path, f"is unfinished, its status is {status}") from None
         raise DamagedError(path, describe_misfit(error)) from None
 
 

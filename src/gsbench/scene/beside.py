@@ -62,8 +62,14 @@ def check_masks(rows: Sequence[Photograph]) -> None:
     for row in rows:
         if row.mask is not None:
             size = image_size(row.mask)
-            texts = {"size": "{}x{}".format(*size), "full": "{}x{}".format(*row.size)}
-            given("mask-of-other-size", size != row.size, str(row.mask), name=row.name, **texts)
+            given(
+                "mask-of-other-size",
+                size != row.size,
+                str(row.mask),
+                name=row.name,
+                size=f"{size[0]}x{size[1]}",
+                full=f"{row.size[0]}x{row.size[1]}",
+            )
 
 
 def read_mask(path: Path, may_be_black: bool = False) -> Mask:
@@ -139,8 +145,7 @@ def fill_ignored(image: ByteArray, mask: Mask) -> ByteArray:
     from scipy.ndimage import distance_transform_edt  # slow to import
 
     nearest = distance_transform_edt(~mask, return_distances=False, return_indices=True)
-    filled: ByteArray = image[tuple(nearest)]
-    return filled
+    return image[tuple(nearest)]
 
 
 def resize_mask(mask: Mask, width: int, height: int) -> Mask:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from gsbench.normalization import Normalization
 from gsbench.scene.colmap_read import read_model as read_model
 from gsbench.scene.images import check_size, image_size
 from gsbench.scene.names import match_anywhere
-from gsbench.scene.types import Array, ByteArray, Camera, CameraModel, Capture, to_pinhole
+from gsbench.scene.types import Array, ByteArray, Camera, CameraModel, Capture, Posed, to_pinhole
 from gsbench.scene.undistortion import as_colmap, as_values
 from gsbench.scene.undistortion import plain_camera as plain_camera
 
@@ -25,9 +26,7 @@ def posed_images(model: pycolmap.Reconstruction) -> dict[str, pycolmap.Image]:
     return {image.name: image for _, image in sorted(model.images.items()) if image.has_pose}
 
 
-def posed_by_name(
-    model: pycolmap.Reconstruction,
-) -> dict[str, tuple[CameraModel, Array, Array]]:
+def posed_by_name(model: pycolmap.Reconstruction) -> dict[str, Posed]:
     """Camera, rotation [3, 3] and translation [3] of the images that have a pose, by name."""
     cameras = {number: as_values(camera) for number, camera in model.cameras.items()}
     found = {}
@@ -39,8 +38,9 @@ def posed_by_name(
 
 def camera_centers(model: pycolmap.Reconstruction) -> Array:
     """The centres [V, 3] of the images that have a pose, in the order of their ids."""
-    centers = [image.projection_center() for image in posed_images(model).values()]
-    return np.array(centers, dtype=np.float64).reshape(-1, 3)
+    return np.array(
+        [image.projection_center() for image in posed_images(model).values()], dtype=np.float64
+    ).reshape(-1, 3)
 
 
 def normalize_capture(capture: Capture, folder: Path) -> None:
@@ -88,7 +88,7 @@ def read_reference(capture: Capture) -> pycolmap.Reconstruction:
     fitted = pycolmap.Reconstruction()
     # The files of one camera may have several sizes, for example if some were shrunk. Then each
     # size gets a camera, and the first one keeps the id.
-    next_camera_id = max(model.cameras, default=0) + 1
+    further = count(max(model.cameras, default=0) + 1)
     camera_ids: dict[tuple[int, tuple[int, int]], int] = {}
     for model_name, image in posed.items():
         if model_name not in names:
@@ -98,11 +98,8 @@ def read_reference(capture: Capture) -> pycolmap.Reconstruction:
         size = file_camera.width, file_camera.height
         key = image.camera_id, size
         if key not in camera_ids:
-            if image.camera_id in camera_ids.values():
-                camera_ids[key], next_camera_id = next_camera_id, next_camera_id + 1
-            else:
-                camera_ids[key] = image.camera_id
-            file_camera.camera_id = camera_ids[key]
+            is_taken = image.camera_id in camera_ids.values()
+            camera_ids[key] = file_camera.camera_id = next(further) if is_taken else image.camera_id
             fitted.add_camera_with_trivial_rig(file_camera)
         scale = np.array(size) / (camera.width, camera.height)
         points = np.array([point.xy for point in image.points2D], dtype=np.float64).reshape(-1, 2)
@@ -165,18 +162,18 @@ def write_model(folder: Path, cameras: Mapping[str, Camera], cloud: Cloud | None
     ``cloud``, positions [P, 3] and colours [P, 3], becomes the model's points, without tracks. By
     default the model has no points.
     """
-    frames = {}
-    for name, camera in cameras.items():
-        pinhole = CameraModel("PINHOLE", camera.width, camera.height, camera.params)
-        frames[name] = pinhole, camera.rotation, camera.translation
+    frames = {
+        name: (
+            CameraModel("PINHOLE", camera.width, camera.height, camera.params),
+            camera.rotation,
+            camera.translation,
+        )
+        for name, camera in cameras.items()
+    }
     write_frames(folder, frames, cloud)
 
 
-def write_frames(
-    folder: Path,
-    frames: Mapping[str, tuple[CameraModel, Array, Array]],
-    cloud: Cloud | None = None,
-) -> None:
+def write_frames(folder: Path, frames: Mapping[str, Posed], cloud: Cloud | None = None) -> None:
     """Write cameras of any model with world-to-camera rotations [3, 3] and translations [3].
 
     Images with equal intrinsics share one camera. ``cloud`` is as in `write_model`.

@@ -22,16 +22,15 @@ def model_files(folder: Path) -> list[Path]:
         ]
         for suffix in (".bin", ".txt")
     }
-    for suffix, lacking in lacking_by_suffix.items():
-        if not lacking:
-            files = [folder / f"{stem}{suffix}" for stem in (*REQUIRED, *OPTIONAL)]
-            return [file for file in files if file.is_file()]
-    for lacking in lacking_by_suffix.values():
-        if len(lacking) < len(REQUIRED):
-            hint = "; points3D.txt may be empty" if lacking == ["points3D.txt"] else ""
-            raise InputError(
-                f"{folder}: the COLMAP model is not complete: add {' and '.join(lacking)}{hint}"
-            )
+    suffix, lacking = min(lacking_by_suffix.items(), key=lambda item: len(item[1]))
+    if not lacking:
+        files = [folder / f"{stem}{suffix}" for stem in (*REQUIRED, *OPTIONAL)]
+        return [file for file in files if file.is_file()]
+    if len(lacking) < len(REQUIRED):
+        hint = "; points3D.txt may be empty" if lacking == ["points3D.txt"] else ""
+        raise InputError(
+            f"{folder}: the COLMAP model is not complete: add {' and '.join(lacking)}{hint}"
+        )
     raise InputError(
         f"{folder}: no COLMAP model here: expected cameras, images and points3D as .bin or .txt"
     )

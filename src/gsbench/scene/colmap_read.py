@@ -189,7 +189,8 @@ def _check_values(folder: Path, model: pycolmap.Reconstruction) -> None:
     # COLMAP normalises only the quaternions of images.
     for number, rig in model.rigs.items():
         for sensor, pose in rig.non_ref_sensors.items():
-            if pose is not None and _normalize(pose, f"a sensor of rig {number}"):
+            if pose is not None:
+                _normalize(pose, f"a sensor of rig {number}")
                 rig.set_sensor_from_rig(sensor, pose)
     for number, frame in model.frames.items():
         if frame.has_pose():
@@ -209,12 +210,10 @@ def _check_values(folder: Path, model: pycolmap.Reconstruction) -> None:
             _check_end((folder / name).read_bytes(), COUNT.size + size)
 
 
-def _normalize(pose: pycolmap.Rigid3d, owner: str) -> bool:
-    """Give a rotation unit length unless it has; returns whether it changed."""
+def _normalize(pose: pycolmap.Rigid3d, owner: str) -> None:
+    """Give a rotation unit length unless it has."""
     length = pose.rotation.norm()
     if not 1 / MAX_LENGTH < length < MAX_LENGTH:
         raise ValueError(f"{owner} has no pose that can be used")
-    if abs(length - 1) <= UNIT_TOLERANCE:
-        return False
-    pose.rotation.normalize()
-    return True
+    if abs(length - 1) > UNIT_TOLERANCE:
+        pose.rotation.normalize()

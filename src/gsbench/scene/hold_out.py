@@ -84,8 +84,7 @@ def along_principal_axis(centers: Array) -> Array:
 
 
 def _principal_axes(centers: Array) -> Array:
-    axes: Array = np.linalg.svd(centers - centers.mean(axis=0), full_matrices=False)[2]
-    return axes
+    return np.linalg.svd(centers - centers.mean(axis=0), full_matrices=False)[2]
 
 
 def point_looked_at(forwards: Array, centers: Array) -> Array | None:
@@ -96,8 +95,7 @@ def point_looked_at(forwards: Array, centers: Array) -> Array | None:
         return None
     # The sum over cameras of |P (p - c)|^2, where P takes away what lies along a viewing axis, is
     # least where (mean P) p = mean (P c).
-    solution: Array = np.linalg.solve(normal, (across @ centers[:, :, None]).mean(axis=0)[:, 0])
-    return solution
+    return np.linalg.solve(normal, (across @ centers[:, :, None]).mean(axis=0)[:, 0])
 
 
 def scene_up(downs: Array, centers: Array) -> Array:
@@ -134,9 +132,8 @@ def select_images(names: Sequence[str], max_images: int) -> list[str]:
         >>> select_images(["a", "b", "c", "d", "e"], 3)
         ['a', 'b', 'd']
     """
-    if len(names) <= max_images:
-        return list(names)
-    return [names[k * len(names) // max_images] for k in range(max_images)]
+    count = min(max_images, len(names))
+    return [names[k * len(names) // count] for k in range(count)]
 
 
 def resolve(wanted: Sequence[str] | None, names: Sequence[str]) -> list[str] | None:
@@ -153,7 +150,7 @@ def resolve(wanted: Sequence[str] | None, names: Sequence[str]) -> list[str] | N
 
 
 def split_names(
-    names: Sequence[str], train: Sequence[str] | None = None, test: Sequence[str] | None = None
+    names: Sequence[str], train: Sequence[str] | None, test: Sequence[str] | None
 ) -> tuple[list[str], list[str]]:
     """Split sorted names into (training, test) by lists.
 

@@ -31,7 +31,7 @@ NOT_READ = {suffix: kind for kind, own in FILES["not_read"].items() for suffix i
 # on every file.
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")  # JPEG includes MPO, which holds several JPEGs
 EXIF_ORIENTATION = 0x0112
-_SIXTEEN_BIT_MODES = ("I;16", "I;16L", "I;16B", "I;16N")
+SIXTEEN_BIT_MODES = ("I;16", "I;16L", "I;16B", "I;16N")
 _WIDE_MODES = ("I", "F")  # 32-bit integers and floats, which have no agreed value for white
 
 
@@ -133,7 +133,7 @@ def read_image(path: Path, backdrop: Backdrop = "black") -> ByteArray:
                 f"{path}: pixels of type {image.mode!r} have no defined white: convert it to "
                 "8-bit RGB"
             )
-        if image.mode in _SIXTEEN_BIT_MODES:
+        if image.mode in SIXTEEN_BIT_MODES:
             grey = (np.asarray(image).astype(np.uint16) >> 8).astype(np.uint8)  # [H, W]
             return np.repeat(grey[..., None], 3, axis=2)
         if image.has_transparency_data:

@@ -212,8 +212,7 @@ def _model_cameras(
             fitted = camera_of_file(model.cameras[image.camera_id], capture.images / name)
             cameras[name] = plain_camera(fitted), image.cam_from_world().matrix().tolist()
     which = f"of {len(wanted)} of scene {capture.name} have a pose"
-    mend = "take more overlapping photos, or another init"
-    require_enough(len(cameras), model_dir, which, mend)
+    require_enough(len(cameras), model_dir, which, "take more overlapping photos, or another init")
     _inspect_views(capture, cameras)  # before hours of work
     return dict(sorted(cameras.items()))
 

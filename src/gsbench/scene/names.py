@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from os.path import commonprefix
 from pathlib import PurePosixPath
-from typing import Any
+from typing import Any, TypeVar
 
 from gsbench.errors import InputError
 from gsbench.parsing import table_beside
@@ -20,6 +20,7 @@ from gsbench.words import counted, some_of
 FILES: dict[str, Any] = table_beside(__file__, "files.yaml")
 IMAGE_SUFFIXES = frozenset(FILES["photographs"])
 
+T = TypeVar("T")
 Key = Callable[[str], str]
 Step = Callable[[Sequence[str]], Sequence[str]]
 
@@ -55,9 +56,9 @@ def keys_of(form: Key) -> tuple[Key, ...]:
 NAME_KEYS = keys_of(plain)
 
 
-def grouped(names: Iterable[str], key_of: Key) -> dict[str, list[str]]:
+def grouped(names: Iterable[str], key_of: Callable[[str], T]) -> dict[T, list[str]]:
     """The names by their key."""
-    groups: dict[str, list[str]] = defaultdict(list)
+    groups: dict[T, list[str]] = defaultdict(list)
     for name in names:
         groups[key_of(name)].append(name)
     return groups
@@ -89,7 +90,8 @@ def match(
                     f"{found[0]} may be {' or '.join(sorted(own))}: give each image a file of its "
                     "own"
                 )
-            matches |= dict.fromkeys(own, found[0]) if found else {}
+            if found:
+                matches[own[0]] = found[0]
     return matches
 
 

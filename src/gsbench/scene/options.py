@@ -1,7 +1,7 @@
 """The settings of a scene: where photographs lie, how many, how large, which are held out."""
 
 import math
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -22,7 +22,7 @@ from gsbench.settings import (
 MAX_IMAGES = 200  # the paper's limit per scene
 
 
-def downscaled_size(width: int, height: int, max_size: int | None = None) -> tuple[int, int]:
+def downscaled_size(width: int, height: int, max_size: int | None) -> tuple[int, int]:
     """The size with the longest side at most ``max_size``, which never grows.
 
     The other side is rounded half up to at least 1.
@@ -44,15 +44,25 @@ def downscaled_size(width: int, height: int, max_size: int | None = None) -> tup
 def check_final_size(size: tuple[int, int], max_size: int | None, what: str) -> None:
     """Raise InputError if ``what``, of ``size`` (width, height), would have a side below 16 px."""
     width, height = downscaled_size(*size, max_size)
-    sizes = {"size": f"{width}x{height}", "full": f"{size[0]}x{size[1]}"}
-    limit = "" if max_size is None else f" with scene.max_size={max_size}"
-    given("view-size", min(width, height), what, limit=limit, **sizes)
+    given(
+        "view-size",
+        min(width, height),
+        what,
+        size=f"{width}x{height}",
+        full=f"{size[0]}x{size[1]}",
+        limit="" if max_size is None else f" with scene.max_size={max_size}",
+    )
 
 
 def require_enough(count: int, folder: Path, which: str, remedy: str = "") -> None:
     """Raise InputError for fewer than three photographs."""
-    mend = remedy or "give more photographs"
-    given("too-few-images", count, str(folder), which=which, mend=mend)
+    given(
+        "too-few-images",
+        count,
+        str(folder),
+        which=which,
+        mend=remedy or "give more photographs",
+    )
 
 
 TEST_EVERY = 8  # Mip-NeRF 360 and 3DGS hold out every 8th image, from the first
@@ -191,10 +201,9 @@ class SceneConfig(SplitRule):
 
     def _check_that_all_is_read(self) -> None:
         """Raise InputError for a setting that the scene's kind or split would ignore."""
-        defaults = {entry.name: entry.default for entry in fields(self)}
         unread = {
             key: f"by scene.kind={self.kind}, only by {' and '.join(kinds)}: leave it out "
-            f"(default: {defaults[key]})"
+            f"(default: {getattr(SceneConfig, key)})"
             for kinds, keys in READ_BY.items()
             if self.kind not in kinds
             for key in keys
@@ -203,5 +212,5 @@ class SceneConfig(SplitRule):
             why = f"with scene.split={self.split}: add scene.split=sector, or leave it out"
             unread |= dict.fromkeys(("sector", "sectors"), why)
         for key, why in unread.items():
-            if getattr(self, key) != defaults[key]:
+            if getattr(self, key) != getattr(SceneConfig, key):
                 raise InputError(f"scene.{key}={getattr(self, key)} is not read {why}")

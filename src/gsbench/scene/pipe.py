@@ -33,12 +33,6 @@ from gsbench.scene.types import Capture
 log = logging.getLogger(__name__)
 
 
-def drop_copies(raw: RawCapture, lists: SplitLists) -> RawCapture:
-    """Drop photographs of one name that differ in the extension; listed ones are kept."""
-    wanted = set(chain.from_iterable(filter(None, lists)))
-    return _without(raw, copies_by_name(raw.names, wanted))
-
-
 def hold_out_views(raw: RawCapture, options: SceneConfig, lists: SplitLists) -> RawCapture:
     """Choose the photographs that are used, and give each its role."""
     names, by_name = raw.names, {row.name: row for row in raw.photographs}
@@ -51,11 +45,6 @@ def hold_out_views(raw: RawCapture, options: SceneConfig, lists: SplitLists) -> 
     roles |= dict.fromkeys(for_testing, "test")
     kept = [replace(by_name[name], role=roles[name]) for name in sorted(roles)]
     return replace(raw, photographs=tuple(kept), held_out=description)
-
-
-def drop_copies_of_test_views(raw: RawCapture) -> RawCapture:
-    """Drop training photographs with the content of a test view, which would measure memory."""
-    return _without(raw, copies_of_test_views(raw.folder, raw.named("train"), raw.named("test")))
 
 
 def match_masks(raw: RawCapture, root: Path, masks: str | None) -> RawCapture:
@@ -93,9 +82,13 @@ def prepare(raw: RawCapture, options: SceneConfig, root: Path, model: Path | Non
         centers = np.array([row.center for row in raw.photographs])
     accept = tuple(options.accept)
     oddities = inspect("read", raw.noted, str(raw.folder), accept)
-    raw = drop_copies(raw, lists)
+    # of photographs of one name that differ in the extension, listed ones are kept
+    wanted = set(chain.from_iterable(filter(None, lists)))
+    raw = _without(raw, copies_by_name(raw.names, wanted))
     raw = hold_out_views(raw, options, lists)
-    raw = drop_copies_of_test_views(raw)
+    # trained on, a photograph with the content of a test view would measure memory
+    copies = copies_of_test_views(raw.folder, raw.named("train"), raw.named("test"))
+    raw = _without(raw, copies)
     which = "in the split lists" if options.by_lists else "left by the split"
     require_enough(len(raw.photographs), raw.folder, which)
     raw = match_masks(raw, root, options.masks)
@@ -138,13 +131,13 @@ def fingerprint(
     folder: Path,
     names: Iterable[str],
     model_files: Iterable[Path] = (),
-    masks: Mapping[str, Path] | None = None,
+    masks: Mapping[str, Path] = {},
 ) -> str:
     """sha256 over names and contents of images, model files and masks, wherever they lie."""
     digest = hashlib.sha256()
     entries = [(f"image/{name}", folder / name) for name in sorted(names)]
     entries += [(f"model/{file.name}", file) for file in sorted(model_files)]
-    entries += [(f"mask/{name}", file) for name, file in sorted((masks or {}).items())]
+    entries += [(f"mask/{name}", file) for name, file in sorted(masks.items())]
     for label, file in entries:
         require_regular(file)
         try:

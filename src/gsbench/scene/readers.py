@@ -74,10 +74,11 @@ def read_colmap(root: Path, options: SceneConfig) -> RawCapture:
         f"that the model {model_folder} has a pose for (it names {some_of(sorted(posed))})",
         "set scene.images to the folder of the model's photographs",
     )
-    moved = [f"{name} ({file})" for name, file in matches.items() if not same_folder(name, file)]
     noted = {
         "no-file": sorted(posed.keys() - matches.keys()),
-        "found-by-last-part": moved,
+        "found-by-last-part": [
+            f"{name} ({file})" for name, file in matches.items() if not same_folder(name, file)
+        ],
         "no-pose": _without_pose(folder, files, matches.values()),
     }
     images = {file: image for image, file in matches.items()}
@@ -123,8 +124,7 @@ READERS: Mapping[str, Reader] = {
 
 def read_raw(root: Path, options: SceneConfig, own: SceneReader | None = None) -> RawCapture:
     """The photographs in ``root`` by the reader of the scene's kind, or by a user's ``own``."""
-    readers = READERS if own is None else {"reader": lambda root, _: read_own(own, root)}
-    raw = readers[str(options.kind)](root, options)
+    raw = read_own(own, root) if own else READERS[str(options.kind)](root, options)
     require_enough(len(raw.photographs), raw.folder, "with a camera")
     return companions_beside(raw, root)
 

@@ -13,7 +13,7 @@ import numpy as np
 from gsbench.errors import InputError
 from gsbench.scene.images import open_image
 from gsbench.scene.rules import Finding
-from gsbench.scene.types import Array, CameraModel, nearest_rotation
+from gsbench.scene.types import Array, CameraModel, Posed, nearest_rotation
 from gsbench.scene.undistortion import as_colmap
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ class Photograph:
         return self._header[1] and self.size[0] == 2 * self.size[1]
 
     @property
-    def posed(self) -> tuple[CameraModel, Array, Array]:
+    def posed(self) -> Posed:
         """The camera and the pose, of a photograph that has them."""
         assert self.camera is not None
         assert self.rotation is not None
@@ -72,8 +72,7 @@ class Photograph:
     def center(self) -> Array:
         """The camera's centre [3] in world units."""
         _, rotation, translation = self.posed
-        center: Array = -rotation.T @ translation
-        return center
+        return -rotation.T @ translation
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,8 +84,7 @@ class AppliedTransform:
 
     def undo(self, saved: Array) -> Array:
         """Convert saved points [P, 3] to the coordinates of the original data."""
-        original: Array = (saved / self.scale - self.matrix[:, 3]) @ self.matrix[:, :3]
-        return original
+        return (saved / self.scale - self.matrix[:, 3]) @ self.matrix[:, :3]
 
     def equals(self, other: AppliedTransform) -> bool:
         """Return whether both are the same, to the last bit."""
@@ -129,6 +127,11 @@ class RawCapture:
     @property
     def has_cameras(self) -> bool:
         return any(photograph.camera is not None for photograph in self.photographs)
+
+    @property
+    def panoramas(self) -> list[str]:
+        """The names of the photographs without a camera that say that they are panoramas."""
+        return [row.name for row in self.photographs if row.camera is None and row.is_panorama]
 
     def named(self, role: Role) -> list[str]:
         """The names of the photographs of one role."""

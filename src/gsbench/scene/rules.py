@@ -108,12 +108,14 @@ def inspect(
 
     Raises InputError for what is not usable, unless its rule is in ``accept``.
     """
-    judged = (rule.judge(subject) for rule in RULES if rule.stage == stage)
-    return settle([found for found in judged if found is not None], where, accept)
+    return settle((rule.judge(subject) for rule in RULES if rule.stage == stage), where, accept)
 
 
-def settle(found: Sequence[Oddity], where: str, accept: Sequence[str] = ()) -> tuple[Oddity, ...]:
+def settle(
+    judged: Iterable[Oddity | None], where: str, accept: Sequence[str] = ()
+) -> tuple[Oddity, ...]:
     """Log oddities, here or earlier found, and refuse those that are not usable nor accepted."""
+    found = tuple(filter(None, judged))
     # Lines come first, because they may explain an error.
     for odd in sorted(found, key=lambda odd: odd.refused):
         if not odd.refused:
@@ -123,7 +125,7 @@ def settle(found: Sequence[Oddity], where: str, accept: Sequence[str] = ()) -> t
         else:
             way = "" if BY_ID[odd.rule].fixed else f" (or scene.accept=[{odd.rule}])"
             raise InputError(f"{where}: {odd.line}{way}")
-    return tuple(found)
+    return found
 
 
 def check_accept(accept: Sequence[str]) -> None:
@@ -180,17 +182,10 @@ def _left_out(subject: Any) -> Iterable[Finding]:
 
 def given(rule: str, value: float, where: str, **facts: Any) -> None:
     """Judge a value that the caller measured by one rule that cannot be accepted."""
-    found = BY_ID[rule].judge({rule: [Finding(value, (), facts)]})
-    settle([] if found is None else [found], where)
-
-
-def _panoramas(raw: Any) -> Iterable[Finding]:
-    names = [row.name for row in raw.photographs if row.camera is None and row.is_panorama]
-    yield Finding(len(names), names)
+    settle([BY_ID[rule].judge({rule: [Finding(value, (), facts)]})], where)
 
 
 MEASURES: Mapping[str, Callable[[Any], Iterable[Finding]]] = {
-    "panoramas": _panoramas,
     "left_out": _left_out,
     "near_twins": _near_twins,
     "far_cameras": _far_cameras,

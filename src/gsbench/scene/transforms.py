@@ -69,8 +69,11 @@ def find_files(folder: Path) -> dict[str, Path]:
 
     Raises InputError if the folder has neither.
     """
-    files = {split: folder / f"transforms_{split}.json" for split in ROLES if split}
-    files = {split: path for split, path in files.items() if path.is_file()}
+    files = {
+        split: path
+        for split in ROLES
+        if split and (path := folder / f"transforms_{split}.json").is_file()
+    }
     if (folder / ONE_FILE).is_file():
         if files:
             others = ", ".join(path.name for path in files.values())
@@ -405,8 +408,8 @@ def _check_center(
         return
     across, down = 2 * cx / width, 2 * cy / height  # 1 at the centre
     if abs(math.log(across / down)) <= math.log(1 + SAME_SCALE):
-        facts = {"cx": cx, "cy": cy, "width": width, "height": height}
-        given("principal-point-of-other-size", across, where, **facts)
+        rule = "principal-point-of-other-size"
+        given(rule, across, where, cx=cx, cy=cy, width=width, height=height)
 
 
 def _distortion(where: str, intrinsics: Mapping[str, Any]) -> tuple[str, tuple[float, ...]]:

@@ -111,6 +111,10 @@ class CameraModel:
         return self.name not in PINHOLE_NAMES
 
 
+# a camera with its rotation [3, 3] and translation [3] from the world to it
+Posed = tuple[CameraModel, Array, Array]
+
+
 def to_pinhole(camera: CameraModel) -> Camera:
     """Convert an undistorted COLMAP camera to a `Camera` at the origin."""
     fx, fy, cx, cy = (

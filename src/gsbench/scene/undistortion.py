@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gsbench.errors import InputError
+from gsbench.scene.names import grouped
 from gsbench.scene.rules import Finding
 from gsbench.scene.types import Array, ByteArray, Camera, CameraModel, to_pinhole
 from gsbench.system.isolate import CrashError, run_isolated
@@ -29,18 +30,14 @@ MAX_IGNORED_DISTORTION = 0.05
 GRID = 33  # points per side at which the distance is measured, borders included
 FOLD_GRID = 40  # pixels per side for `folded_share`
 
-Flattened = tuple[float, int, int]
-
 
 def lens_findings(cameras: Mapping[str, CameraModel]) -> dict[str, list[Finding]]:
     """Findings for the rules of lenses, of the distorted images' cameras."""
-    names: dict[CameraModel, list[str]] = {}
-    for name, camera in cameras.items():
-        names.setdefault(camera, []).append(name)
+    names = grouped(cameras, cameras.__getitem__)
     if not names:
         return {}
     try:
-        flattened: list[Flattened] = run_isolated(flatten, list(names), what="undistortion")
+        flattened = run_isolated(flatten, list(names), what="undistortion")
     except CrashError as error:
         raise InputError(f"{error}: check the cameras of {some_of(list(cameras))}") from error
     found: dict[str, list[Finding]] = {"lens-turns-back": [], "little-left": []}
@@ -56,7 +53,7 @@ def lens_findings(cameras: Mapping[str, CameraModel]) -> dict[str, list[Finding]
     return found
 
 
-def flatten(cameras: Sequence[CameraModel]) -> list[Flattened]:
+def flatten(cameras: Sequence[CameraModel]) -> list[tuple[float, int, int]]:
     """`folded_share` and the size in px of each camera's undistorted photograph.
 
     COLMAP's native code can abort, so run it isolated.
@@ -95,9 +92,13 @@ def as_colmap(camera: CameraModel, camera_id: int = 1) -> pycolmap.Camera:
     """The camera as an object of COLMAP's."""
     import pycolmap  # slow to load, and not needed for pinhole images
 
-    size = {"width": camera.width, "height": camera.height}
-    params = list(camera.params)
-    return pycolmap.Camera(camera_id=camera_id, model=camera.name, params=params, **size)
+    return pycolmap.Camera(
+        camera_id=camera_id,
+        model=camera.name,
+        width=camera.width,
+        height=camera.height,
+        params=list(camera.params),
+    )
 
 
 def as_values(camera: pycolmap.Camera) -> CameraModel:
@@ -180,5 +181,9 @@ def rays_through(pixels: Array, fx: float, fy: float, cx: float, cy: float) -> A
 
 
 def _pinhole_parameters(camera: pycolmap.Camera) -> list[float]:
-    names = "focal_length_x", "focal_length_y", "principal_point_x", "principal_point_y"
-    return [getattr(camera, name) for name in names]
+    return [
+        camera.focal_length_x,
+        camera.focal_length_y,
+        camera.principal_point_x,
+        camera.principal_point_y,
+    ]

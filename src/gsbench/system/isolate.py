@@ -61,8 +61,7 @@ def continue_in_child() -> bool:
     # the child may end its whole process group and wait for it
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    status = 0
-    ended = 0
+    ended = status = 0
     while ended != child:
         ended, status = os.waitpid(-1, 0)  # also reaps adopted orphans
     end_descendants()

@@ -261,10 +261,8 @@ def peak_resident_mb() -> float:
 
     On Linux it is VmHWM: ``ru_maxrss`` cannot be reset, and starts at the memory of the parent.
     """
-    if STATUS.exists():
-        peak = re.search(r"VmHWM:\s+(\d+) kB", STATUS.read_text())
-        if peak:
-            return int(peak.group(1)) * 1024 / MIB
+    if STATUS.exists() and (peak := re.search(r"VmHWM:\s+(\d+) kB", STATUS.read_text())):
+        return int(peak[1]) * 1024 / MIB
     if resource is not None:
         return _max_resident_mb(resource.RUSAGE_SELF)
     return float(psutil.Process().memory_info().peak_wset) / MIB

@@ -149,7 +149,12 @@ def send_beside(file: Path, lines: Iterable[str]) -> None:
         is_last = stop.wait(min(told["pause"], SECONDS_BETWEEN_LOOKS))
         now = {folder: _stamps(folder) for folder in left}
         begun = [folder for folder in left if now[folder] != left[folder]]
-        ended = [folder for folder in begun if _has_ended(folder, left[folder], now[folder])]
+        # these have written results or a failure, and are at work no longer
+        ended = [
+            folder
+            for folder in begun
+            if now[folder][1:] != left[folder][1:] and not is_held(TrialFolder(folder).lock)
+        ]
         # while the tracker refuses, a beginning or an end makes no further tries
         is_new = not fault and (ended or not set(begun) <= set(shown))
         if is_last or is_new or time.monotonic() - sent >= told["pause"]:
@@ -194,8 +199,3 @@ def _stamps(folder: Path) -> list[int]:
         except OSError:
             stamps.append(0)
     return stamps
-
-
-def _has_ended(folder: Path, before: Sequence[int], now: Sequence[int]) -> bool:
-    """Return whether a trial has written results or a failure, and is at work no longer."""
-    return now[1:] != before[1:] and not is_held(TrialFolder(folder).lock)

@@ -80,7 +80,7 @@ def _renew_parents(
     client: MlflowClient, experiment_id: str, comparison: Comparison, runs: Sequence[Run]
 ) -> dict[str, str]:
     """The ids of the parent runs by idea; each shows what its trials say now."""
-    by_arm = group_by(comparison.trials, lambda trial: trial.arm)
+    by_arm = group_by(comparison.trials, "arm")
     single_init = len({arm.init for arm in by_arm}) == 1
     present: dict[str, Run] = {}
     for run in runs:

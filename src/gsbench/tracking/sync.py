@@ -61,8 +61,7 @@ def make_sink(options: Tracking, allowed: Sequence[str]) -> Sink:
     """
     left_out = (*NOT_OPTIONS, "uri") if options.get("uri") is None else NOT_OPTIONS
     own = {key: value for key, value in options.items() if key not in left_out}
-    sink: Sink = build("tracking", own | {"_target_": class_of(options)}, list(allowed))
-    return sink
+    return build("tracking", own | {"_target_": class_of(options)}, list(allowed))
 
 
 # the errors of a tracker's client; a user's class may even end the process

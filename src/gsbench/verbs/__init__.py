@@ -13,5 +13,4 @@ VERBS: dict[str, dict[str, Any]] = table_beside(__file__, "verbs.yaml")
 def load_verb(name: str) -> Callable[[list[str], Path], int]:
     """The function of a verb; its module is imported only now."""
     module = importlib.import_module(f"gsbench.verbs.{VERBS[name]['module']}")
-    function: Callable[[list[str], Path], int] = getattr(module, name)
-    return function
+    return getattr(module, name)

@@ -111,7 +111,7 @@ def _dataset(catalog: Mapping[str, PublicDataset], name: str) -> PublicDataset:
         if name in dataset.scenes:
             raise InputError(f"{name} is a scene: gsbench fetch {dataset.name} {name}")
     raise InputError(
-        f"no data set {name!r}{did_you_mean(name, list(catalog))} (there are: {', '.join(catalog)})"
+        f"no data set {name!r}{did_you_mean(name, catalog)} (there are: {', '.join(catalog)})"
     )
 
 
@@ -119,7 +119,7 @@ def _scenes(dataset: PublicDataset, names: Sequence[str]) -> Sequence[str]:
     for name in names:
         if name not in dataset.scenes:
             raise InputError(
-                f"{dataset.name} has no scene {name!r}{did_you_mean(name, list(dataset.scenes))} "
+                f"{dataset.name} has no scene {name!r}{did_you_mean(name, dataset.scenes)} "
                 f"(it has: {', '.join(dataset.scenes)})"
             )
     return list(dict.fromkeys(names)) or dataset.scenes

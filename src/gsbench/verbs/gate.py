@@ -45,14 +45,15 @@ def gate(argv: Sequence[str], runs: Path) -> int:
     Raises GsbenchError (exit code 1) if trials fail, and InputError (2) for bad input. With
     ``--bisect`` nothing is raised, and the codes are those of ``git bisect run``.
     """
-    if "--bisect" not in argv:
-        return EXIT_CODES[_result(options_of("gate", argv))]
+    bisects = "--bisect" in argv
     try:
-        code = EXIT_CODES[_result(options_of("gate", argv))]
+        result = _result(options_of("gate", argv))
     except GsbenchError as error:
+        if not bisects:
+            raise
         print(f"gsbench: {printable(str(error))}", file=sys.stderr)
         return STOP if isinstance(error, InputError) else SKIP
-    return SKIP if code == EXIT_CODES[NOT_DECIDED] else code
+    return SKIP if bisects and result == NOT_DECIDED else EXIT_CODES[result]
 
 
 def _result(options: argparse.Namespace) -> str:

@@ -231,7 +231,7 @@ def _only_densifier(trials: Sequence[Trial]) -> str:
         raise InputError(
             "ablate needs one initialiser and one densifier: only scene and seed may list values"
         )
-    return str(trials[0].values["densify"]["name"])
+    return trials[0].values["densify"]["name"]
 
 
 def declared_switches(
@@ -252,12 +252,12 @@ def declared_switches(
         where = f"densify.switches.{name}"
         if not isinstance(entry, Mapping) or "off" not in entry:
             raise InputError(f"{where} must be {{off: {{KEY: VALUE}}}}, got {entry!r}")
-        switches[str(name)] = Switch(**check_values(Switch, dict(entry), where))
+        switches[str(name)] = Switch(**check_values(Switch, entry, where))
     present = dict(values)
     return {
         name: switch
         for name, switch in switches.items()
-        if present | dict(switch.off) != present  # else it is off already
+        if present | switch.off != present  # else it is off already
     }
 
 

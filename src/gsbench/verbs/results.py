@@ -18,17 +18,9 @@ from gsbench.analysis.cells import (
 )
 from gsbench.analysis.comparison import Comparison, chosen, compare
 from gsbench.analysis.fairness import fairness_table
-from gsbench.analysis.paper import (
-    layout_of,
-    load_published,
-    paper_tables,
-    published_table,
-)
+from gsbench.analysis.paper import layout_of, load_published, paper_tables, published_table
 from gsbench.analysis.quantities import Quantity, quantity
-from gsbench.analysis.results import (
-    TrialResult,
-    load_experiment,
-)
+from gsbench.analysis.results import TrialResult, load_experiment
 from gsbench.analysis.table_formats import FORMATS, csv_of
 from gsbench.analysis.tables import build_table, format_cell
 from gsbench.errors import InputError

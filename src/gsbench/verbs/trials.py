@@ -65,10 +65,9 @@ def status(argv: Sequence[str], runs: Path) -> int:
     trials = states_of_experiment(home)
     if options.verify:
         for number, trial in enumerate(trials):
-            if trial.state in ("done", "superseded"):
-                fault = TrialFolder(trial.folder).fault_when_read()
-                if fault is not None:
-                    trials[number] = replace(trial, state="damaged", note=str(fault))
+            is_done = trial.state in ("done", "superseded")
+            if is_done and (fault := TrialFolder(trial.folder).fault_when_read()):
+                trials[number] = replace(trial, state="damaged", note=str(fault))
     if options.forget_superseded:
         superseded = [trial for trial in trials if trial.state == "superseded"]
         remove(home, [trial.folder for trial in superseded])

@@ -137,7 +137,7 @@ def read_test_views(trial: TrialResult, model_dir: Path) -> tuple[View, ...]:
         intrinsics = model.cameras[image.camera_id]
         if intrinsics.model_name not in PINHOLE_NAMES:
             intrinsics = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), intrinsics)
-        camera: Camera = pinhole_camera(intrinsics, image.cam_from_world()).resized(width, height)
+        camera = pinhole_camera(intrinsics, image.cam_from_world()).resized(width, height)
         if centred:
             camera = replace(camera, cx=width / 2, cy=height / 2)
         views.append(View(image.name, camera, picture))

@@ -51,10 +51,7 @@ def database(images, tmp_path):
     return path
 
 
-@pytest.mark.parametrize(
-    "sharing, expected",
-    TABLES["shared cameras"],
-)
+@pytest.mark.parametrize("sharing, expected", TABLES["shared cameras"])
 def test_images_share_a_camera_by_size_folder_or_not_at_all(images, sharing, expected):
     groups = groups_of(images, sharing=sharing)
     assert [sorted(names) for _, names in groups] == expected
@@ -82,10 +79,7 @@ TELEPHONE = {"make": "X", "model": "X 7", "mm": 6.8, "film": 26}
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp"])
-@pytest.mark.parametrize(
-    "change, cameras",
-    TABLES["lenses by EXIF"],
-)
+@pytest.mark.parametrize("change, cameras", TABLES["lenses by EXIF"])
 def test_photographs_share_a_camera_by_their_exif_data(tmp_path, suffix, change, cameras):
     names = [f"{k}{suffix}" for k in range(6)]
     for k, name in enumerate(names):

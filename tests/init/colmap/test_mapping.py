@@ -144,10 +144,7 @@ def ways(monkeypatch):
     return made
 
 
-@pytest.mark.parametrize(
-    "found, best, tried",
-    TABLES["strategies"],
-)
+@pytest.mark.parametrize("found, best, tried", TABLES["strategies"])
 def test_strategies_are_tried_until_one_places_nine_of_ten_images(ten, ways, found, best, tried):
     ways[:] = [(f"way {k}", sizes) for k, sizes in enumerate(found)]
     result = mapped(ten, "auto")

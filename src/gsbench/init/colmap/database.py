@@ -16,6 +16,7 @@ from gsbench.init.colmap.pairs import select_pairs
 from gsbench.init.options import ColmapOptions
 from gsbench.scene.colmap import posed_images, rescaled_camera
 from gsbench.scene.images import image_size, lens_of, open_image, read_image, write_png
+from gsbench.scene.names import grouped
 from gsbench.scene.types import ByteArray, Capture
 
 DEFAULT_FOCAL_LENGTH = 1.2  # of the longest side, as in COLMAP
@@ -86,9 +87,8 @@ def linked(files: Mapping[str, Path], folder: Path) -> Path:
 
 def reference_camera_groups(reference: pycolmap.Reconstruction) -> list[CameraGroup]:
     """The reference's cameras, marked as known, each with the sorted names of its posed images."""
-    groups: dict[int, list[str]] = {}
-    for name, image in sorted(posed_images(reference).items()):
-        groups.setdefault(image.camera_id, []).append(name)
+    images = posed_images(reference)
+    groups = grouped(sorted(images), lambda name: images[name].camera_id)
     result = []
     for camera_id, names in groups.items():
         original = reference.cameras[camera_id]
@@ -116,10 +116,8 @@ def unknown_camera_groups(
     The initial focal length in px is that of ``options``, else from the EXIF data of the group's
     first image if that means a plausible field of view, else `DEFAULT_FOCAL_LENGTH`.
     """
-    groups: dict[tuple[object, ...], list[str]] = {}
-    for name in names:
-        key = (SHARED_BY[options.camera](images, name), image_size(images / name))
-        groups.setdefault(key, []).append(name)
+    shared_by = SHARED_BY[options.camera]
+    groups = grouped(names, lambda name: (shared_by(images, name), image_size(images / name)))
     reading = pycolmap.ImageReaderOptions({"camera_model": options.camera_model})
     result = []
     for group in groups.values():

@@ -74,8 +74,15 @@ def match_sift(
             matched[index] = done
             progress(phase, sum(matched), len(pairs))
 
-        given = database, results[index], shares[index], sift
-        run_isolated(match_parts, *given, what="matching", progress=report_sum)
+        run_isolated(
+            match_parts,
+            database,
+            results[index],
+            shares[index],
+            sift,
+            what="matching",
+            progress=report_sum,
+        )
 
     progress("match", 0, len(pairs))
     if len(shares) == 1:
@@ -185,8 +192,7 @@ def verification_options(options: ColmapOptions) -> pycolmap.TwoViewGeometryOpti
 def verify_pairs(path: Path, options: ColmapOptions, progress: Progress) -> None:
     """Run COLMAP's geometric verification on all stored matches."""
     progress("verify", 0, 1)
-    verification = verification_options(options)
-    pycolmap.geometric_verification(path, two_view_geometry_options=verification)
+    pycolmap.geometric_verification(path, two_view_geometry_options=verification_options(options))
     progress("verify", 1, 1)
 
 

@@ -167,14 +167,12 @@ def _with_means(scale: float, turn: Rotation, source: Array, target: Array) -> p
 
 def _misses(similarity: pycolmap.Sim3d, source: Array, target: Array) -> Array:
     """Distances [N] of the transformed ``source`` from ``target`` [N, 3]."""
-    misses: Array = np.linalg.norm(similarity * source - target, axis=1)
-    return misses
+    return np.linalg.norm(similarity * source - target, axis=1)
 
 
 def _spread(centers: Array) -> Array:
     """The singular values [3] of centres around their mean, largest first."""
-    spread: Array = np.linalg.svd(centers - centers.mean(axis=0), compute_uv=False)
-    return spread
+    return np.linalg.svd(centers - centers.mean(axis=0), compute_uv=False)
 
 
 def compare_poses(

@@ -77,10 +77,10 @@ def count_agreements(descriptors: Sequence[NDArray[np.generic]]) -> NDArray[np.i
     Descriptors are whole numbers here, and their products stay below 2^24. They are exact in
     float32, so the counts are the same on every machine and with any number of threads.
     """
-    tables = [part[:STRONGEST].astype(np.float32) for part in descriptors]
-    for k, part in enumerate(descriptors):
-        if part.dtype.kind == "f":
-            tables[k] = (QUANTUM * tables[k]).round()
+    tables = []
+    for part in descriptors:
+        table = part[:STRONGEST].astype(np.float32)
+        tables.append((QUANTUM * table).round() if part.dtype.kind == "f" else table)
     squares = [(table**2).sum(axis=1) for table in tables]
     agreements = np.zeros((len(tables), len(tables)), dtype=np.int64)
     for i, j in combinations(range(len(tables)), 2):

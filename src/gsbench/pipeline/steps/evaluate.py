@@ -25,12 +25,7 @@ from gsbench.logs import progress
 from gsbench.pipeline.steps.regions import region_inputs, regions_of
 from gsbench.pipeline.steps.scene import Views
 from gsbench.runs.keys import EVALUATE, Step, options_of, rasterizer_inputs, step_of
-from gsbench.runs.layout import (
-    METRICS,
-    PER_VIEW,
-    POINT_CLOUD,
-    RENDERS,
-)
+from gsbench.runs.layout import METRICS, PER_VIEW, POINT_CLOUD, RENDERS
 from gsbench.runs.trial_record import Earlier, Evaluation
 from gsbench.scene.images import png_name
 from gsbench.scene.types import COUNTED, Scene, nearest_training_cameras

@@ -68,9 +68,8 @@ class CaptureSource:
             return _courtyard_step(self.options)
         if self._raw.model is not None or not self._raw.has_cameras:
             return None
-        reader = None
-        if self._reader is not None:
-            reader = options_of("scene", self._reader, self._user)
+        own = self._reader
+        reader = None if own is None else options_of("scene", own, self._user)
         return _cameras_step(self._raw, reader)
 
     def read(self, made: Path | None) -> Capture:
@@ -179,11 +178,9 @@ def normalizing_step(capture: Capture) -> Step | None:
         "capture": capture.fingerprint,
         "normalization": asdict(capture.advised_normalization),
     }
-
-    def build(folder: Path) -> None:
-        normalize_capture(capture, folder / MODEL_FOLDER)
-
-    return step_of(CAPTURE, inputs, build)
+    return step_of(
+        CAPTURE, inputs, lambda folder: normalize_capture(capture, folder / MODEL_FOLDER)
+    )
 
 
 def normalized_capture(capture: Capture, step: Step, folder: Path) -> Capture:

@@ -100,8 +100,7 @@ def hit_tube(size, origin, direction):
 def hit_primitive(kind, size, origin, direction):
     """The first distance > 0 along a local ray to the primitive, or inf if it misses."""
     if kind == BOX:
-        low, high = (-size[0], -size[1], -size[2]), (size[0], size[1], size[2])
-        entry, exit_ = enter_box(low, high, origin, inverses(direction))
+        entry, exit_ = enter_box(scaled(-1.0, size), size, origin, inverses(direction))
         return entry if 0.0 < entry <= exit_ else inf
     if kind == SPHERE:
         # |o + t d| = r with |d| = 1: t^2 + 2 b t + c = 0

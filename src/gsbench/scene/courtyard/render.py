@@ -17,7 +17,6 @@ from gsbench.scene.courtyard.layout import Layout, build_layout
 from gsbench.scene.types import ByteArray, Camera
 from gsbench.system.resources import in_threads
 
-VERSION = 1  # raise it when the images change
 # azimuth between neighbouring views; larger steps gave wrong SfM models of scenes like this one
 MAX_STEP = radians(7.5)
 RING_RADIUS = 4.55  # m
@@ -27,9 +26,9 @@ TARGET = (0.0, 0.0, 0.72)  # m, the point that all cameras look at
 
 def render_courtyard(
     output_dir: Path,
-    views: int = 48,
-    width: int = 400,
-    height: int = 300,
+    views: int,
+    width: int,
+    height: int,
     seed: int = 0,
     progress: Progress = no_progress,
 ) -> None:
