@@ -16,12 +16,12 @@ from tests.trials import write_results
 
 # Some trials of `threshold` by their names, which stay as they are from version to version.
 KNOWN = {
-    "sfm-volumetric-0.001/f032b69c-seed0",
-    "sfm-volumetric-0.003/0e41f96f-seed1",
-    "sfm-volumetric-0.01/13627950-seed2",
-    "sfm-volumetric-0.03/acc74860-seed0",
-    "sfm-volumetric-0.1/6cdf70e1-seed1",
-    "sfm-volumetric-0.3/4495d499-seed2",
+    "sfm-volumetric-0.001/7073da94-seed0",
+    "sfm-volumetric-0.003/fce528af-seed1",
+    "sfm-volumetric-0.01/12dd6a9a-seed2",
+    "sfm-volumetric-0.03/6aec03c5-seed0",
+    "sfm-volumetric-0.1/ac702be4-seed1",
+    "sfm-volumetric-0.3/2c2802d0-seed2",
 }
 
 

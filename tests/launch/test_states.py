@@ -172,7 +172,7 @@ def test_removed_trials_leave_the_plan_and_links_stay(tmp_path):
     )
     record([gone, linked, begun(tmp_path, 2)], asks=False)  # the last one has no overrides
     assert set(read_history(tmp_path / "x").planned) == {gone.folder, linked.folder}
-    remove(tmp_path / "x", iter([gone.folder]))
+    remove(tmp_path / "x", [gone.folder])
     assert not gone.folder.exists()
     assert list(read_history(tmp_path / "x").planned) == [linked.folder]
     elsewhere = linked.folder.rename(tmp_path / "elsewhere")

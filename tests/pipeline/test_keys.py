@@ -29,13 +29,13 @@ BARE = Capture(
     "garden", Path("photos"), ("a.jpg", "b.jpg", "c.jpg"), ("a.jpg",), None, False, "0" * 64
 )
 KEYS = [
-    ("config", "f0bb95969e4a0f1bd626e24196a1668aa0bdcc21d94c5295dbaa3af6f077b384"),
+    ("config", "2926acc1205ccb82f5292c60e86ffe4f4f0bb477ae5a7586d4145c516a32a29a"),
     # of the reference cameras
     ("init", "b92ef1cdec8634bd52daa8afeaec7fce0b13d00d70d0f715b5eb9a1c73fd5759"),
     ("init", "a3a44618398e68c025836e1031642269da49e069c9d615c9de8217baab805301"),
-    ("train", "309405282cd6d7496ff0dae46cdc0d30037747897cdb12504ec01aa76aefc272"),
+    ("train", "be5b5096203484811ef508cfe5253cdf0c7d13865390f0fcf9db1a33108f65a8"),
     ("ground_truth", "2713e948ccf37750ea64717542d37c5a6697a184fe9c108264563c57a4b1b66d"),
-    ("evaluate", "4fe0d609b4a3ae74680a9598fb989516670a8d4fa4acc6ee8facb5ea4523a313"),
+    ("evaluate", "761494d9b21f80b252c0f08d3b8a9466dc7b73ce3f3f6afa827fe24d48df4bb8"),
 ]
 
 

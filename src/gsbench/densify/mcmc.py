@@ -276,7 +276,7 @@ class MRNF(SpreadOut):
 
     def to_prune(self, gaussians: Gaussians) -> Tensor:
         """Mask [N] of the Gaussians that are transparent, too small, too large, or too far away."""
-        center, half, _ = bounds(gaussians.means)
+        center, half, _ = bounds(gaussians.means.detach())
         limit = REACH * half
         scales = gaussians.log_scales
         far = (gaussians.means - center).abs().amax(-1) > limit

@@ -92,7 +92,7 @@ def describe_plan(trials: Sequence[Trial], parallel: int = 1) -> list[str]:
             state = state_in_queue(folder.path, queue) or state
         note = ""
         if state == "done":
-            # what a run would do with it, as far as that is known without downloads
+            # A run may check it again; whether it would is asked without downloads.
             left = folder.why_not_done(
                 trial.values, lambda options: unavailable_now(options | {"download": False})
             )

@@ -73,7 +73,7 @@ def store_columns(context, builder, sig, args):
 
 @lowering(types.UniTuple(VECTOR, NEIGHBOURS), "before own after")
 def neighbour_sums(context, builder, sig, args):
-    """For 16 numbers of an interleaved row, the sums of their left and right neighbours.
+    """The sums of the left and the right neighbours of 16 numbers of an interleaved row.
 
     ``own`` are the numbers, ``before`` and ``after`` the 16 numbers beside them. Vector k has the
     neighbours k + 1 pixels away. Loads of them would cross cache lines.
