@@ -128,7 +128,9 @@ def test_each_missing_folder_is_named_once_with_the_way_to_get_it(tmp_path, monk
     assert lines[0] == f"scene a: the folder {tmp_path / 'none'} does not exist"
     assert lines[1] == f"scene b: the folder {tmp_path / 'file'} is a file"
     assert lines[2].startswith("scene c: ")
-    assert lines[3:] == ["set scene.path, or GSBENCH_DATA for a known scene"]
+    assert lines[3:] == [
+        "scene.path must name its folder, or GSBENCH_DATA that of the known scenes"
+    ]
     assert missing_folders(trials[:1]) == []
     named = [("eval", "z"), ("eval", "y"), ("init", str(tmp_path)), ("init", "z"), ("eval", None)]
     trials = [

@@ -108,5 +108,5 @@ def how_to_get(scenes: Iterable[tuple[str, Path]]) -> str:
         for dataset, names in sorted(wanted.items())
     ]
     if not commands:
-        return f"set scene.path, or {DATA_VARIABLE} for a known scene"
+        return f"scene.path must name its folder, or {DATA_VARIABLE} that of the known scenes"
     return f"{' and '.join(commands)} {'brings' if len(commands) == 1 else 'bring'} what is missing"
