@@ -12,7 +12,7 @@ from gsbench.analysis.report.where import compare_regions, discoveries
 
 FINDINGS = Path(__file__).parents[1]
 ARCHIVES = FINDINGS / "archives"
-EXPERIMENTS = ("paper_table1", "paper_free", "paper_table2")
+EXPERIMENTS = ("paper_table1", "paper_free", "paper_table2", "paper_threshold")
 sys.path.append(str(FINDINGS / "scripts"))
 import paper_tables  # noqa: E402
 
