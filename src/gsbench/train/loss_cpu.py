@@ -219,8 +219,8 @@ def loss_rows(first, past, memory, pictures, factors, gradient, sums):
     begin, end, differentiate = height * first // SHARDS, height * past // SHARDS, len(gradient) > 0
     numbers, length, padded = _sizes(width)
     lines, slopes = memory[first], memory[first][MAPS * padded :]
-    # The rings have the last eleven rows, blurred horizontally: of the maps, and of the derivatives
-    # of SSIM by them, which so never leave the cache.
+    # Two rings have the last eleven rows, blurred horizontally: that of the maps, and that of the
+    # derivatives of SSIM by them. So the derivatives are read while they are in the cache.
     blurred = slopes[SLOPES * padded :]
     pulled = blurred[MAPS * TAPS * length :]
     scratch = pulled[SLOPES * TAPS * length :]
@@ -235,7 +235,7 @@ def loss_rows(first, past, memory, pictures, factors, gradient, sums):
                 sums[row, 1] = _sum(l1, scratch)
         else:
             _clear_slot(blurred, slot, length, MAPS)
-        center = row - WINDOW_RADIUS  # the ring has all rows of its window
+        center = row - WINDOW_RADIUS  # the last row whose window is in the ring
         if center < begin - reach + WINDOW_RADIUS:
             continue
         slot = (center + TAPS) % TAPS * length
