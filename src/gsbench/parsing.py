@@ -144,14 +144,22 @@ def read_json(path: Path) -> Any:
 
     Raises as `read_bytes` does, and DamagedError if `fault_of` finds a fault.
     """
-    content = read_bytes(path)
-    try:
-        value = from_json(content)
-    except ValueError as error:
-        raise DamagedError(path, f"is not JSON ({error})") from None
+    value = parse_json(read_bytes(path), path)
     if fault := fault_of(value):
         raise DamagedError(path, f"is damaged: {fault}")
     return value
+
+
+def parse_json(content: bytes, path: Path) -> Any:
+    """Parse the JSON ``content`` of the file ``path``, whose values may have faults (`fault_of`).
+
+    Raises DamagedError. The parser refuses more than 200 levels and integers of more than 4,300
+    digits.
+    """
+    try:
+        return from_json(content)
+    except ValueError as error:
+        raise DamagedError(path, f"is not JSON ({error})") from None
 
 
 def read_yaml(path: Path, loader: Any = None) -> Any:
@@ -326,14 +334,18 @@ class Record:
 
 
 def _in_lines(schema: Any) -> Any:
-    """pydantic's schema of a record, in which each text that is not `Raw` becomes one line."""
+    """pydantic's schema of a record, in which each text that is not `Raw` becomes one line.
+
+    Lists and objects of JSON, as Python has them, are accepted as tuples and records.
+    """
     if isinstance(schema, list):
         return [_in_lines(item) for item in schema]
     if not isinstance(schema, dict):
         return schema
     if schema.get("type") == "str" and schema.get("metadata") != RAW:
         return core_schema.no_info_after_validator_function(as_line, cast(CoreSchema, schema))
-    return {key: _in_lines(value) for key, value in schema.items()}
+    plain = {"strict": False} if schema.get("type") in ("tuple", "dataclass") else {}
+    return {key: _in_lines(value) for key, value in schema.items()} | plain
 
 
 def lines_in(value: Any) -> Any:
@@ -368,11 +380,15 @@ def read_if_sound(path: Path, kind: type[T]) -> T | None:
 def parse_typed(content: bytes, kind: type[T], path: Path) -> T:
     """Parse the JSON ``content`` of the file ``path`` as an object of ``kind``.
 
-    Raises DamagedError for a misfit. The parser refuses more than 200 levels and integers of more
-    than 4,300 digits.
+    Raises DamagedError.
     """
+    return typed(parse_json(content, path), kind, path)
+
+
+def typed(value: Any, kind: type[T], path: Path) -> T:
+    """The JSON ``value`` of the file ``path`` as an object of ``kind``; raises DamagedError."""
     try:
-        return adapter(cast(Any, kind)).validate_json(content)
+        return adapter(cast(Any, kind)).validate_python(value)
     except ValidationError as error:
         raise DamagedError(path, describe_misfit(error)) from None
 
@@ -390,13 +406,9 @@ def describe_misfit(error: ValidationError) -> str:
     """Describe the first fault: ``is damaged: psnr is '27' (input should be a valid number)``."""
     first: ErrorDetails = error.errors(include_url=False)[0]
     key, kind = ".".join(str(part) for part in first["loc"]), first["type"]
-    if kind == "json_invalid":
-        return f"is not JSON ({first['msg'].removeprefix('Invalid JSON: ')})"
     if kind in ("missing", "missing_argument"):
         return f"is damaged: it lacks {key!r}"
+    message = first["msg"].removeprefix("Value error, ").partition(" or an instance")[0]
     if not key:
-        return f"is damaged: {first['msg'].removeprefix('Value error, ')}"
-    return (
-        f"is damaged: {key} is {reprlib.repr(first['input'])} "
-        f"({first['msg'].removeprefix('Value error, ').lower()})"
-    )
+        return f"is damaged: {message}"
+    return f"is damaged: {key} is {reprlib.repr(first['input'])} ({message.lower()})"

@@ -41,7 +41,7 @@ def test_hydra_and_report_files_beside_the_trials_are_ignored(tmp_path):
 DAMAGES = {  # keys of results.json, its new content, or a change of the folder
     "half a file": ('{"status": "comp', "not JSON"),
     "binary": (b"\xff\xfe\x00", "not JSON"),
-    "a list": ("[]", "should be an object"),
+    "a list": ("[]", "should be a dictionary"),
     "nan": ({"metrics": {"psnr": float("nan")}}, "metrics.psnr is nan"),
     "text for a number": ({"metrics": {"psnr": "27"}}, "metrics.psnr is '27'"),
     "no seconds": ({"seconds": None}, "seconds is None"),

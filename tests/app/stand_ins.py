@@ -1,5 +1,6 @@
 """Trials that are not composed, and trainings that take no time."""
 
+import json
 from itertools import chain
 
 import numpy as np
@@ -55,4 +56,6 @@ class Trainings:
             asked = history.covering(digest_of(values), values["scene"]["name"], values["seed"])
             code = {"packages": states_of(chain(*CODE_OF_STAGE.values()))}
             write_as(trial, _questions=[one.id for one in asked], _code=code, **views)
-        return outcome_of_results(trial.folder, record_from(results.read_bytes(), results))
+        return outcome_of_results(
+            trial.folder, record_from(json.loads(results.read_bytes()), results)
+        )

@@ -23,7 +23,7 @@ RESULTS = results_of(trial_values("runs"), num_gaussians=2)
 
 
 def record(**changes):
-    return record_from(json.dumps(RESULTS | changes).encode(), PATH)
+    return record_from(RESULTS | changes, PATH)
 
 
 def test_only_results_of_renders_may_lack_the_number_of_gaussians():
@@ -44,8 +44,8 @@ def test_the_states_of_packages_are_read_by_either_name(key):
 def test_unfinished_results_are_distinguished_from_damaged_ones():
     with pytest.raises(UnfinishedError, match="is unfinished, its status is 'running'"):
         record(status="running", seed="0")
-    with pytest.raises(UnfinishedError, match="is unfinished, its status is missing"):
-        record_from(b"{}", PATH)
+    with pytest.raises(UnfinishedError, match="is unfinished, its status is None"):
+        record_from({}, PATH)
     with pytest.raises(DamagedError, match="seed is '0'") as caught:
         record(seed="0")
     assert not isinstance(caught.value, UnfinishedError)

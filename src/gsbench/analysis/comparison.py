@@ -16,7 +16,7 @@ from gsbench.analysis.notes import Note, texts
 from gsbench.analysis.pairs import BASELINE
 from gsbench.analysis.quantities import choose_quantities
 from gsbench.analysis.questions import Asked, choose_pairs
-from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by
+from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by, trials_of
 from gsbench.analysis.sentences import asked_words, badge, headline, risk, sentence
 from gsbench.analysis.verdicts import State, Verdict, interval_of, judge
 from gsbench.runs.commands import Question, code_in
@@ -178,8 +178,11 @@ def compare(experiment: Experiment, baseline: str | None = None) -> Comparison:
     for name, words in EARLIER.items():
         if (experiment.folder / name).exists():
             state, why = "not tested", f"{words} ({name})"
-    intervals = [interval_of(trials, *pair, DEFAULT_METRIC, state, why) for pair in unasked]
-    answers = [*asked, *(_with_metrics(verdict, trials) for verdict in intervals)]
+    by_arm, answers = group_by(trials, "arm"), [*asked]
+    for pair in unasked:
+        own = [trial for arm in pair for trial in by_arm[arm]]
+        interval = interval_of(own, *pair, DEFAULT_METRIC, state, why)
+        answers.append(_with_metrics(interval, own))
     return Comparison(experiment, trials, tuple(answers))
 
 
@@ -216,7 +219,7 @@ def _with_metrics(
     verdict: Verdict, trials: Sequence[TrialResult], others: tuple[Verdict, ...] = ()
 ) -> Answer:
     pair = verdict.question.baseline, verdict.question.idea
-    own = [trial for trial in trials if trial.arm in pair]
+    own = trials_of(trials, *pair)
     known = [*(choose_quantities(own) if own else ()), *(one.quantity for one in others)]
     metrics = (
         interval_of(own, *pair, quantity.key)

@@ -106,9 +106,9 @@ class Experiment:
         return tuple(sorted({trial.seed for trial in self.trials}))
 
 
-def trials_of(trials: Sequence[TrialResult], arm: Arm) -> list[TrialResult]:
-    """The trials of one arm, in their order."""
-    return [trial for trial in trials if trial.arm == arm]
+def trials_of(trials: Sequence[TrialResult], *arms: Arm) -> list[TrialResult]:
+    """The trials of some arms, in their order."""
+    return [trial for trial in trials if trial.arm in arms]
 
 
 def group_by(items: Iterable[T], *by: str | Callable[[T], Any]) -> dict[Any, list[T]]:

@@ -12,7 +12,7 @@ from typing import Any
 from gsbench.parsing import DamagedError, lines_in
 from gsbench.runs.commands import Digest, make_digest, shared_hash
 from gsbench.runs.configuration import SHOWN, flatten, is_hashed, is_ignored
-from gsbench.runs.experiments import QUESTIONS, Arm, trial_key, unix_time
+from gsbench.runs.experiments import QUESTIONS, Arm, unix_time
 from gsbench.runs.freshness import Part, code_of
 from gsbench.runs.layout import CONFIG, RESULTS
 from gsbench.runs.trial_folder import TrialFolder
@@ -161,7 +161,7 @@ class TrialResult:
 
         Trials that differ only in their seeds share it.
         """
-        return trial_key(self.scene, f"{self.init}-{self.densify}", self.config_hash)
+        return f"{self.scene}/{self.init}-{self.densify}/{self.config_hash}"
 
     @cached_property
     def whole_config(self) -> Mapping[str, Any]:

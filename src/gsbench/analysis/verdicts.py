@@ -8,6 +8,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import chain
+from statistics import median_low
 from typing import Literal
 
 import numpy as np
@@ -17,7 +19,7 @@ from gsbench.analysis.notes import Note
 from gsbench.analysis.pairs import SAME_CAPTURE, Pairs, are_equal, pair
 from gsbench.analysis.quantities import Quantity, asked_quantity
 from gsbench.analysis.questions import look_shares
-from gsbench.analysis.results import TrialResult, Unfinished
+from gsbench.analysis.results import TrialResult, Unfinished, trials_of
 from gsbench.analysis.statistics import (
     ALPHA,
     Interval,
@@ -326,17 +328,16 @@ def find_outlying(pairs: Pairs) -> list[TrialResult]:
     arms.
     """
     rows = [row for row in pairs.rows if len(row.seeds) > LEAST_OTHERS]
-    deviations = [(float(row.baseline.std(ddof=1)), float(row.arm.std(ddof=1))) for row in rows]
-    ordered = sorted(deviation for both in deviations for deviation in both)
-    typical = FEW * ordered[(len(ordered) - 1) // 2] if ordered else 0.0
+    deviations = [[side.std(ddof=1) for side in (row.baseline, row.arm)] for row in rows]
+    typical = FEW * median_low(chain(*deviations)) if rows else 0.0
     outlying = []
     for row, both in zip(rows, deviations, strict=True):
         for side, values in enumerate((row.baseline, row.arm)):
-            for index, value in enumerate(values):
-                others = np.delete(values, index)
-                deviation = max(float(others.std(ddof=1)), both[1 - side], typical)
-                if abs(value - others.mean()) > OUTLYING * deviation > 0:
-                    outlying.append(row.trials[index][side])
+            others = np.stack([np.delete(values, index) for index in range(len(values))])
+            deviation = np.maximum(others.std(axis=1, ddof=1), max(both[1 - side], typical))
+            is_far = np.abs(values - others.mean(axis=1)) > OUTLYING * deviation
+            far = np.flatnonzero(is_far & (deviation > 0))
+            outlying += [row.trials[index][side] for index in far]
     return outlying
 
 
@@ -349,7 +350,7 @@ def interval_of(
     why: str = "",
 ) -> Verdict:
     """Mean and 95 % interval of all trials of two arms in any metric; it is no verdict."""
-    own = [trial for trial in trials if trial.arm in (baseline, idea)]
+    own = trials_of(trials, baseline, idea)
     quantity = asked_quantity(metric, own)
     first, second = (
         {(trial.scene, trial.seed) for trial in own if trial.arm == arm} for arm in (baseline, idea)

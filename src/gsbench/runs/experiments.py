@@ -126,11 +126,6 @@ AT = "@"  # psnr@extrapolation
 STAMP = "%Y-%m-%dT%H:%M:%SZ"  # UTC, as in the manifests of the store
 
 
-def trial_key(scene: str, arm: str, config_hash: str) -> str:
-    """The key of trials that differ only in the seed: ``garden/sfm-adc/3fa9c1d2``."""
-    return f"{scene}/{arm}/{config_hash}"
-
-
 @dataclass(frozen=True, order=True)
 class Arm:
     """An arm of a comparison: initialiser, densifier, and the swept settings that distinguish it.
@@ -140,6 +135,7 @@ class Arm:
     """
 
     __pydantic_config__ = STRICT
+    __get_pydantic_core_schema__ = Record.__get_pydantic_core_schema__  # texts of one line
 
     init: str
     densify: str

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from gsbench.files import file_sha256
-from gsbench.parsing import Amount, DamagedError, Raw, Record, fault_of, read_bytes
+from gsbench.parsing import Amount, DamagedError, Raw, Record, read_bytes
 from gsbench.runs import layout
 from gsbench.runs.code import config_hash, state_of
 from gsbench.runs.configuration import Values, sha256_of
@@ -49,10 +49,6 @@ class MadeOf(Record):
     digests: dict[Raw, str]
     settings: dict[str, Any]
     finished: Amount = 0.0
-
-    def __post_init__(self) -> None:
-        if fault := fault_of(self.settings):
-            raise ValueError(f"in settings {fault}")
 
 
 class ResultsFile(Record):

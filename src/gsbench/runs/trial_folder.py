@@ -14,25 +14,26 @@ import os
 import re
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
-
-from pydantic_core import from_json, to_json
 
 from gsbench.errors import InputError
 from gsbench.files import atomic, require_no_links
 from gsbench.parsing import (
     MAX_NUMBER,
     DamagedError,
+    fault_of,
     one_line,
-    parse_typed,
+    parse_json,
     read_bytes,
     read_if_sound,
     read_tail,
     read_typed,
     read_yaml,
+    typed,
 )
 from gsbench.runs import layout
 from gsbench.runs.code import PERMISSIONS, config_hash
@@ -97,7 +98,7 @@ class TrialFolder:
 
     @property
     def key(self) -> str:
-        """The folder in its experiment, without the seed (`gsbench.runs.experiments.trial_key`)."""
+        """The folder in its experiment, without the seed (``garden/sfm-adc/3fa9c1d2``)."""
         return self.path.relative_to(self.home).as_posix().rpartition(layout.SEED)[0]
 
     @property
@@ -176,7 +177,7 @@ class TrialFolder:
             values = read_yaml(path)
         except FileNotFoundError:
             raise InputError(f"{path} is not there: give the command of the trial again") from None
-        parse_typed(to_json(values), Configuration, path)
+        typed(values, Configuration, path)
         # only the user who gives a command may allow code to run
         return values | {PERMISSIONS: []}
 
@@ -190,12 +191,11 @@ class TrialFolder:
         and are accepted.
         """
         path = self.path / layout.RESULTS
-        content = read_bytes(path)
-        record = record_from(content, path)
-        made_of = parse_typed(content, ResultsFile, path).made_of
+        values = parse_json(read_bytes(path), path)
+        record, made_of = record_from(values, path), typed(values, ResultsFile, path).made_of
         if made_of is not None:
-            values = from_json(content)  # compared as values: white space does not matter
             del values[MADE_OF]
+            # compared as values: white space does not matter
             if made_of.results != sha256_of(values):
                 repair = command("retry", self.home.name)
                 reason = f"was changed after it was written: `{repair}` repairs it"
@@ -245,11 +245,13 @@ class TrialFolder:
 
         Raises FileNotFoundError and DamagedError.
         """
-        try:
-            made_of = self.made_of()
-        except FileNotFoundError:
-            made_of = None
-        return read_yaml(self.path / layout.CONFIG) if made_of is None else made_of.settings
+        with suppress(FileNotFoundError):
+            if made_of := self.made_of():
+                if fault := fault_of(made_of.settings):
+                    reason = f"is damaged: in settings {fault}"
+                    raise DamagedError(self.path / layout.RESULTS, reason)
+                return made_of.settings
+        return read_yaml(self.path / layout.CONFIG)
 
     def write_finished(
         self,
@@ -267,7 +269,7 @@ class TrialFolder:
         """
         path = self.path / layout.RESULTS
         # as it will be read: texts of libraries become one line
-        content = record_from(json.dumps(record.to_json()).encode(), path).to_json()
+        content = record_from(record.to_json(), path).to_json()
         present = self.sound_record()
         before = path.stat() if present is not None and present.to_json() == content else None
         # Verdicts count results from before their declaration by this time, so equal results

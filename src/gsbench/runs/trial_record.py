@@ -11,7 +11,7 @@ from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, TypeVar
 
-from pydantic import AfterValidator, AliasChoices, Field, ValidationError
+from pydantic import AfterValidator, AliasChoices, Field
 
 from gsbench.normalization import IDENTITY, Normalization
 from gsbench.parsing import (
@@ -25,12 +25,11 @@ from gsbench.parsing import (
     Record,
     Text,
     Whole,
-    adapter,
-    describe_misfit,
     fault_of,
     one_line,
     parse_typed,
     read_bytes,
+    typed,
 )
 from gsbench.settings import FolderName
 from gsbench.words import as_line
@@ -254,20 +253,14 @@ class UnfinishedError(DamagedError):
     """A ``results.json`` whose status is not "complete"."""
 
 
-def record_from(content: bytes, path: Path) -> TrialRecord:
-    """Parse the ``content`` of the results file ``path``.
+def record_from(values: Any, path: Path) -> TrialRecord:
+    """The record with the JSON ``values`` of the results file ``path``.
 
     Raises DamagedError and UnfinishedError.
     """
-    try:
-        return adapter(TrialRecord).validate_json(content)
-    except ValidationError as error:
-        for fault in error.errors():
-            if fault["loc"] == ("status",):
-                is_missing = fault["type"] == "missing"
-                status = "missing" if is_missing else reprlib.repr(fault["input"])
-                raise UnfinishedError(path, f"is unfinished, its status is {status}") from None
-        raise DamagedError(path, describe_misfit(error)) from None
+    if isinstance(values, dict) and (status := values.get("status")) != "complete":
+        raise UnfinishedError(path, f"is unfinished, its status is {reprlib.repr(status)}")
+    return typed(values, TrialRecord, path)
 
 
 class Training(Record):
