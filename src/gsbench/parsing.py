@@ -405,8 +405,8 @@ def adapter(kind: Any) -> TypeAdapter[Any]:
 def describe_misfit(error: ValidationError) -> str:
     """Describe the first fault: ``is damaged: psnr is '27' (input should be a valid number)``."""
     first: ErrorDetails = error.errors(include_url=False)[0]
-    key, kind = ".".join(str(part) for part in first["loc"]), first["type"]
-    if kind in ("missing", "missing_argument"):
+    key = ".".join(str(part) for part in first["loc"])
+    if first["type"] == "missing":
         return f"is damaged: it lacks {key!r}"
     message = first["msg"].removeprefix("Value error, ").partition(" or an instance")[0]
     if not key:

@@ -202,6 +202,10 @@ class Composer:
         config[PERMISSIONS] = list(self.allowed)  # any in a file counts nothing
         return config
 
+    def has_key(self, key: str) -> bool:
+        """Return whether the whole configuration has a value for the dotted ``key``."""
+        return OmegaConf.select(self.config, key) is not None
+
     def trials(self, jobs: Sequence[Sequence[str]]) -> list[Trial]:
         """The trials of ``jobs``, each the list of its words.
 

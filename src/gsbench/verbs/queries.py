@@ -5,8 +5,6 @@ import re
 from contextlib import suppress
 from pathlib import Path
 
-from omegaconf import OmegaConf
-
 from gsbench.app.hydra_main import run_main
 from gsbench.config.command_words import check_single, typed_permissions
 from gsbench.config.compose import Composer
@@ -49,7 +47,7 @@ def ask_hydra(argv: list[str]) -> int:
         folders = [options.config_dir] if options.config_dir else []
         check_single(options.overrides, "choose one whose configuration is shown")
         composer = Composer([*search_path(folders, options.overrides), *options.overrides])
-        if options.package and OmegaConf.select(composer.config, options.package) is None:
+        if options.package is not None and not composer.has_key(options.package):
             raise InputError(
                 f"--package {options.package}: there is no such part of the configuration"
             )
