@@ -2,6 +2,7 @@
 
 import hashlib
 import pickle
+import sys
 from pathlib import Path
 
 import pytest
@@ -201,6 +202,12 @@ def test_tensors_are_read_from_both_formats(tmp_path, name):
     state = load_state(path)
     assert state.keys() == STATE.keys()
     assert_close(state["a.weight"], STATE["a.weight"])
+
+
+def test_a_file_that_needs_a_package_counts_as_missing(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "safetensors.torch", None)
+    with pytest.raises(MissingWeightsError, match="needs the package safetensors: pip install"):
+        load_state(tmp_path / "net.safetensors")
 
 
 def test_tensors_are_read_from_an_entry_of_a_checkpoint(tmp_path):

@@ -141,7 +141,8 @@ def load_state(path: Path, entry: str | None = None) -> dict[str, Tensor]:
 
     ``path`` is a .safetensors file, or one of PyTorch, read with ``weights_only``. ``entry`` is the
     key of the tensors in a PyTorch file that holds more. Raises ``MissingWeightsError`` if the file
-    is truncated, is not a weights file, or holds anything but tensors.
+    is truncated, is not a weights file, or holds anything but tensors, and if safetensors is not
+    installed.
     """
     import torch
 
@@ -152,7 +153,7 @@ def load_state(path: Path, entry: str | None = None) -> dict[str, Tensor]:
             return load_file(path, device="cpu")
         state = torch.load(path, map_location="cpu", weights_only=True)
     except ModuleNotFoundError as error:
-        raise InputError(
+        raise MissingWeightsError(
             f"weights file {path} needs the package safetensors: pip install safetensors"
         ) from error
     # the two readers and pickle raise a dozen kinds of errors on a damaged or foreign file
