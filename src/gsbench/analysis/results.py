@@ -145,14 +145,18 @@ def load_all_trials(runs_dir: Path, name: str) -> Experiment:
 
 
 def read_experiment(folder: Path) -> Experiment:
-    """Read every trial of the experiment in ``folder``; it may have no trials yet."""
+    """Read every trial of the experiment in ``folder``; it may have no trials yet.
+
+    Raises InputError if the folder is a link.
+    """
     runs_dir = folder.parent
+    require_no_links(runs_dir, folder)
     trials: list[TrialResult] = []
     faults: dict[Path, str] = {}
     settings: Configurations = {}
     for path in map(Path, trial_folders(folder)):
         try:
-            trials.append(read_trial(path, runs_dir, settings))
+            trials.append(read_trial(path, settings))
         except UnusableError as reason:
             faults[path] = one_line(str(reason))
     of_settings = _read_settings(trials, settings)
@@ -358,11 +362,11 @@ class UnusableError(Exception):
     """A folder is not a usable trial; the text says why."""
 
 
-def read_trial(path: Path, runs_dir: Path, settings: Configurations) -> TrialResult:
-    """Read and check one trial folder; raises `UnusableError`."""
+def read_trial(path: Path, settings: Configurations) -> TrialResult:
+    """Read and check one of `trial_folders`; raises `UnusableError`."""
     folder = TrialFolder(path)
     try:
-        require_no_links(runs_dir, path, below=True)
+        require_no_links(path, path, below=True)  # nothing above it is a link
         record = folder.record()
         if change := folder.change():
             raise UnusableError(
@@ -383,7 +387,7 @@ def read_trial(path: Path, runs_dir: Path, settings: Configurations) -> TrialRes
     match = TRIAL_FOLDER.fullmatch(path.name)
     if match is None:
         raise UnusableError(f"{FOREIGN}, the folder is not named <hash8>-seed<k>")
-    names = (path.relative_to(runs_dir).parts[0], *path.parts[-3:-1], match["seed"])
+    names = (*path.parts[-4:-1], match["seed"])
     arm = f"{record.init}-{record.densify}"
     recorded = record.experiment, record.scene, arm, str(record.seed)
     for key, value, name in zip(
