@@ -32,6 +32,7 @@ FINDINGS = Path(__file__).resolve().parents[1]
 LINE = re.compile(r"^(\w+) +(?P<scene>\S+?)/\S+ seed (?P<seed>\d+) \(\w+\)")
 THRESHOLD = 0.03  # V_th of the paper
 GIVEN = "dataset-"  # in the names of arms that start from the scene's own cloud
+CURVE = "paper_curve"  # the experiment that sweeps the number of Gaussians
 PAGE = FINDINGS / "paper_tables.md"
 STATE, END = "<!-- state {} -->", "<!-- end -->"  # around the table of an experiment
 FIELDS = ("trial", "cpu_seconds", "gaussians", "share_below_threshold")
@@ -105,8 +106,7 @@ def save(clone: Path, experiment: str) -> None:
         with table.open() as stream:
             rows = {row["trial"]: row for row in csv.DictReader(stream)}
     for results in sorted(home.glob("*/*/*-seed*/results.json")):
-        scene, arm, trial = results.relative_to(home).parts[:3]
-        name = f"{scene}-{arm.removeprefix(GIVEN)}-{trial.partition('-seed')[2]}"
+        name = name_of(json.loads(results.read_text(encoding="utf-8")))
         model = results.parent / "point_cloud.ply"
         if model.exists():  # else it was trained elsewhere, and is in the files already
             count, share = share_below(model)
@@ -135,7 +135,7 @@ def state_table(experiment: str) -> str:
     table = ["| trial | PSNR | SSIM | LPIPS VGG raw | Gaussians | volumes ≤ V_th | CPU-s |"]
     table += ["|---|--:|--:|--:|--:|--:|--:|"]
     for trial in sorted(results_in(archives / f"{experiment}.zip"), key=_order):
-        own = beside[f"{trial['scene']}-{arm_of(trial)}-{trial['seed']}"]
+        own = beside[name_of(trial)]
         psnr, ssim, lpips = (trial["metrics"][key] for key in ("psnr", "ssim", "lpips_vgg_raw"))
         share = 100 * float(own["share_below_threshold"])
         table.append(
@@ -147,8 +147,16 @@ def state_table(experiment: str) -> str:
 
 
 def arm_of(trial: dict[str, Any]) -> str:
-    """The arm of a result, such as sfm-adc; without the initialiser if that is ``dataset``."""
-    return f"{trial['init']}-{trial['densify']}".removeprefix(GIVEN)
+    """The arm of a result, such as sfm-adc; without the initialiser if that is ``dataset``.
+
+    In `CURVE`, arms of one name differ in their number of Gaussians, which comes last.
+    """
+    count = f"-{trial['budget']['max_gaussians']}" if trial["experiment"] == CURVE else ""
+    return f"{trial['init']}-{trial['densify']}{count}".removeprefix(GIVEN)
+
+
+def name_of(trial: dict[str, Any]) -> str:
+    return f"{trial['scene']}-{arm_of(trial)}-{trial['seed']}"
 
 
 def _order(trial: dict[str, Any]) -> tuple[str, int, str]:

@@ -12,7 +12,7 @@ from gsbench.analysis.report.where import compare_regions, discoveries
 
 FINDINGS = Path(__file__).parents[1]
 ARCHIVES = FINDINGS / "archives"
-EXPERIMENTS = ("paper_table1", "paper_free", "paper_table2", "paper_threshold")
+EXPERIMENTS = ("paper_table1", "paper_free", "paper_table2", "paper_threshold", "paper_curve")
 sys.path.append(str(FINDINGS / "scripts"))
 import paper_tables  # noqa: E402
 
@@ -42,7 +42,7 @@ def test_regions_light_up_in_at_most_five_of_a_hundred_reports_of_one_arm():
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_what_lies_beside_the_archive_has_its_trials(experiment):
     results = {
-        f"{each['scene']}-{paper_tables.arm_of(each)}-{each['seed']}": each
+        paper_tables.name_of(each): each
         for each in paper_tables.results_in(ARCHIVES / f"{experiment}.zip")
     }
     with (ARCHIVES / f"{experiment}.csv").open() as stream:
