@@ -145,12 +145,8 @@ def load_all_trials(runs_dir: Path, name: str) -> Experiment:
 
 
 def read_experiment(folder: Path) -> Experiment:
-    """Read every trial of the experiment in ``folder``; it may have no trials yet.
-
-    Raises InputError if the folder is a link.
-    """
+    """Read every trial of the experiment in ``folder``; it may have no trials yet."""
     runs_dir = folder.parent
-    require_no_links(runs_dir, folder)
     trials: list[TrialResult] = []
     faults: dict[Path, str] = {}
     settings: Configurations = {}
@@ -366,7 +362,7 @@ def read_trial(path: Path, settings: Configurations) -> TrialResult:
     """Read and check one of `trial_folders`; raises `UnusableError`."""
     folder = TrialFolder(path)
     try:
-        require_no_links(path, path, below=True)  # nothing above it is a link
+        require_no_links(path, path, below=True)  # no folder between it and its experiment is one
         record = folder.record()
         if change := folder.change():
             raise UnusableError(
