@@ -19,6 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from gsbench.parsing import Record
+
 # units: the diagonal of the cameras' box after COLMAP's Reconstruction::Normalize
 COLMAP_SIZE = 10.0
 TRIMMED = 0.1  # the share of cameras left out at each end of each axis, as COLMAP does
@@ -37,6 +39,8 @@ MIN_SIZE = 1e-11
 @dataclass(frozen=True)
 class Normalization:
     """The map from a scene's own coordinates to those of its training: ``scale * (x - center)``."""
+
+    __get_pydantic_core_schema__ = Record.__get_pydantic_core_schema__  # read within records
 
     center: tuple[float, float, float] = (0.0, 0.0, 0.0)
     scale: float = 1.0

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from gsbench.normalization import Normalization
 from gsbench.parsing import DamagedError, parse_typed
 from gsbench.runs.trial_record import (
     Failure,
@@ -39,6 +40,15 @@ def test_only_results_of_renders_may_lack_the_number_of_gaussians():
 def test_the_states_of_packages_are_read_by_either_name(key):
     code = record(code={key: {"train": "a" * 16}}).code
     assert code.to_json() == {"packages": {"train": "a" * 16}}
+
+
+def test_a_result_has_the_same_normalization_after_reading():
+    moved = Normalization((2e6, -9e6, 0.5), 24.5)
+    read = record(normalization={"center": [2e6, -9e6, 0.5], "scale": 24.5})
+    assert read.normalization == moved
+    assert record_from(read.to_json(), PATH) == read
+    with pytest.raises(DamagedError, match="a normalisation needs a finite centre"):
+        record(normalization={"center": [0.0, 0.0, 0.0], "scale": -1.0})
 
 
 def test_unfinished_results_are_distinguished_from_damaged_ones():
