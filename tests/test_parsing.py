@@ -1,5 +1,6 @@
 """Reading files that may be strange, up to the limits and one beyond."""
 
+import importlib
 import json
 import os
 import re
@@ -21,6 +22,7 @@ from gsbench.parsing import (
     Record,
     Text,
     Whole,
+    adapter,
     fault_of,
     one_line,
     parse_typed,
@@ -254,3 +256,27 @@ def test_rows_are_read_up_to_the_first_damaged_one(content, amounts, warned, cap
     assert not any(line.endswith(("\n", "\r")) for line, _ in rows)
     assert len(caplog.messages) == bool(warned)
     assert warned in caplog.text
+
+
+def kinds_below(kind):
+    return {kind}.union(*map(kinds_below, kind.__subclasses__()))
+
+
+def strict_parts(schema):
+    """The tuples and dataclasses of a schema that accept nothing else than instances."""
+    if isinstance(schema, list):
+        return [part for item in schema for part in strict_parts(item)]
+    if not isinstance(schema, dict):
+        return []
+    is_own = schema.get("type") in ("tuple", "dataclass") and schema.get("strict") is not False
+    return [schema] * is_own + strict_parts(list(schema.values()))
+
+
+def test_all_records_accept_the_lists_and_objects_of_json():
+    """A dataclass within a record that is no record itself needs Record's schema."""
+    for name in ("gsbench.pipeline.trial", "gsbench.analysis.frames", "gsbench.tracking.sync"):
+        importlib.import_module(name)  # between them they import all that is written
+    kinds = kinds_below(Record) - {Record}
+    assert len(kinds) > 20
+    for kind in kinds:
+        assert strict_parts(adapter(kind).core_schema) == [], kind
