@@ -7,6 +7,7 @@ writes ``findings/pictures/threshold.png`` from ``findings/archives/paper_thresh
 
 from __future__ import annotations
 
+from dataclasses import astuple
 from typing import Any
 
 import matplotlib
@@ -16,7 +17,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from paper_tables import FINDINGS, THRESHOLD, results_in
-from scipy.stats import t
+
+from gsbench.analysis.statistics import t_test
 
 METRIC = "lpips_vgg_raw"
 SCENES = {"treehill": "C0", "garden": "C1"}
@@ -41,8 +43,9 @@ def differences(of_scene: Values) -> tuple[list[float], np.ndarray]:
 def draw(above: Axes, below: Axes, by_scene: dict[str, Values]) -> None:
     for number, (scene, color) in enumerate(SCENES.items()):
         thresholds, changes = differences(by_scene[scene])
-        seeds = changes.shape[1]
-        half = t.ppf(0.975, seeds - 1) * changes.std(axis=1, ddof=1) / np.sqrt(seeds)
+        tests = [t_test(of_threshold[None]) for of_threshold in changes]
+        ends = [astuple(test.interval()) if test else (np.nan, np.nan) for test in tests]
+        half = [(high - low) / 2 for low, high in ends]
         places = np.array(thresholds) * 1.06**number  # so that bars do not hide one another
         style: dict[str, Any] = {"color": color, "marker": "o", "label": scene}
         above.errorbar(places, changes.mean(axis=1), yerr=half, capsize=3, **style)

@@ -178,6 +178,7 @@ def compare(experiment: Experiment, baseline: str | None = None) -> Comparison:
     for name, words in EARLIER.items():
         if (experiment.folder / name).exists():
             state, why = "not tested", f"{words} ({name})"
+    # Grouped once: thousands of trials may have a hundred pairs of arms.
     by_arm, answers = group_by(trials, "arm"), [*asked]
     for pair in unasked:
         own = [trial for arm in pair for trial in by_arm[arm]]

@@ -362,7 +362,7 @@ def read_trial(path: Path, settings: Configurations) -> TrialResult:
     """Read and check one of `trial_folders`; raises `UnusableError`."""
     folder = TrialFolder(path)
     try:
-        require_no_links(path, path, below=True)  # no folder between it and its experiment is one
+        require_no_links(path, path, below=True)  # `trial_folders` has followed none to it
         record = folder.record()
         if change := folder.change():
             raise UnusableError(
