@@ -25,5 +25,7 @@ if "torch" in sys.modules and "OMP_WAIT_POLICY" not in os.environ:
         "torch was imported first, so its idle threads spin: import gsbench before it", stacklevel=2
     )
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+# Tensors of 2 MB or more get large pages of memory: Adam reads all of them, and waits less.
+os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
 
 __version__ = "0.1.0"

@@ -273,9 +273,9 @@ def _blend_batch(block, todo, entry, before_batch, state, frame, planes, batch, 
             batch[base + np.uint64(at.LOG2_OPACITY)],
         )
         blend = (power >= LOG2_ALPHA_MIN) & lanes
-        weight = before * minimum(exp2(power), splat(ALPHA_MAX))
+        weight = select(blend, before * minimum(exp2(power), splat(ALPHA_MAX)), ZERO)
         after = before - weight
-        stop = blend & (after < TRANSMITTANCE_MIN)
+        stop = after < TRANSMITTANCE_MIN
         stopped = mask_bits(stop)
         # Few entries stop a pixel: only these pay for the memory of ``last`` and ``live``.
         if stopped != 0:
@@ -284,18 +284,18 @@ def _blend_batch(block, todo, entry, before_batch, state, frame, planes, batch, 
             store(frame.last, state + place, select(stop, number, earlier))
             live[block] &= ~np.int64(stopped)
             lanes = mask_from_bits(live[block])
-            blend = blend & ~stop
+            weight = select(stop, ZERO, weight)
+            after = select(stop, before, after)
             if live[block] == 0:
                 alive &= ~bit
                 # later entries do not change this block: the backward pass skips them
                 while todo != 0:
                     frame.masks[entry + np.int64(lowest_bit(todo))] &= ~bit
                     todo &= todo - np.uint64(1)
-        weight = select(blend, weight, ZERO)
         r = fma(weight, batch[base + np.uint64(at.RED)], r)
         g = fma(weight, batch[base + np.uint64(at.GREEN)], g)
         b = fma(weight, batch[base + np.uint64(at.BLUE)], b)
-        before = select(blend, after, before)
+        before = after
     store(frame.transmittance, state + place, before)
     _store_planes(planes, place, r, g, b)
     return alive

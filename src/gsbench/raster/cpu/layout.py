@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from gsbench.raster.base import CameraNumbers
@@ -46,7 +47,8 @@ def kernel_memory(shards: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
 
     Kernels cannot allocate memory (see `gsbench.system.jit.kernel`).
     """
-    return np.empty((shards, 8 * TILE_PIXELS), np.float32), np.empty((shards, 2 * LANES), np.int64)
+    floats = torch.empty(shards, 8 * TILE_PIXELS).numpy()
+    return floats, torch.empty(shards, 2 * LANES, dtype=torch.int64).numpy()
 
 
 class Parameters(NamedTuple):

@@ -16,16 +16,13 @@ import torch
 from numpy.typing import DTypeLike, NDArray
 from torch import Tensor
 
-CACHE_LINE = 64  # bytes
 RANGES_PER_THREAD = 2  # so that a thread that is done early takes another
 HEADROOM = 1.25  # times the requested size, so that a growing scene does not allocate at every step
 
 
 def aligned_bytes(size: int) -> NDArray[np.uint8]:
     """``size`` uninitialised bytes that start on a cache line."""
-    raw = np.empty(size + CACHE_LINE, np.uint8)
-    offset = -raw.ctypes.data % CACHE_LINE
-    return raw[offset : offset + size]
+    return torch.empty(size, dtype=torch.uint8).numpy()
 
 
 class Arena:
