@@ -90,21 +90,19 @@ def highest(records, low_x, low_y, size):
 
     It is at the mean if the square contains it, or else on an edge.
     """
-    mean_x, mean_y, shear, curve_t, curve_y, top = (
-        records[:, k, None].astype(np.float64) for k in range(6)
-    )
+    mean_x, mean_y, u_x, u_y, v_y, top = (records[:, k, None].astype(np.float64) for k in range(6))
 
     def at(dx, dy):
-        return top + curve_t * (dx + shear * dy) ** 2 + curve_y * dy**2
+        return top - (u_x * dx + u_y * dy) ** 2 - (v_y * dy) ** 2
 
     left, upper = low_x - mean_x, low_y - mean_y  # [R, S]
     right, lower = left + size, upper + size
     best = at(np.clip(0, left, right), np.clip(0, upper, lower))
-    slope = -curve_t * shear / (curve_t * shear**2 + curve_y)
+    slope = -u_x * u_y / (u_y**2 + v_y**2)
     for dx in (left, right):
         best = np.maximum(best, at(dx, np.clip(slope * dx, upper, lower)))
     for dy in (upper, lower):
-        best = np.maximum(best, at(np.clip(-shear * dy, left, right), dy))
+        best = np.maximum(best, at(np.clip(-u_y / u_x * dy, left, right), dy))
     return best
 
 

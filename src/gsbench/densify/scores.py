@@ -5,7 +5,6 @@ from collections.abc import Callable, Sequence
 from itertools import product
 from typing import Protocol
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -33,14 +32,9 @@ def standard_normal(shape: tuple[int, ...], rng: torch.Generator, like: Tensor) 
 
 
 def lengths_of(vectors: Tensor) -> Tensor:
-    """The lengths [N] of ``vectors`` [N, 2]; on a CPU by a kernel, several times as fast."""
-    if (vectors.device.type, vectors.dtype) != ("cpu", torch.float32):
-        return vectors.norm(dim=-1)
-    from gsbench.raster.cpu.lengths import measure_lengths
-
-    lengths = np.empty(len(vectors), np.float32)
-    measure_lengths(vectors.numpy(), lengths)
-    return torch.from_numpy(lengths)
+    """The lengths [N] of ``vectors`` [N, 2]; on a CPU several times as fast as torch's norm."""
+    x, y = vectors.unbind(1)
+    return torch.addcmul(x * x, y, y).sqrt_()
 
 
 MIN_REVISED_OPACITY = 1e-6  # keeps the logit finite

@@ -186,11 +186,10 @@ def contour_range(center, half, tiles, size):
     return tile_range(ceil(center - half), floor(center + half) + 1.0, tiles, size)
 
 
-def record_entries(column, row, shear, a, curve_y, log2_opacity, rgb):
-    """The first nine entries of a record (`raster.cpu.layout`)."""
-    curve_t = a * (-0.5 * LOG2_E)
+def record_entries(column, row, form, log2_opacity, rgb):
+    """The first nine entries of a record (`layout` of an executor); ``form`` are three of them."""
     red, green, blue = maximum(0.0, rgb[0]), maximum(0.0, rgb[1]), maximum(0.0, rgb[2])
-    return column, row, shear, curve_t, curve_y, log2_opacity, red, green, blue
+    return column, row, form[0], form[1], form[2], log2_opacity, red, green, blue
 
 
 def covariance_gradients(q00, q01, q11, n0, n1, shear, scales):

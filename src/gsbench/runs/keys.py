@@ -68,7 +68,7 @@ class Step:
 # (name, version). Bump the version when the stage's code computes something else.
 CAPTURE = Stage("scene", 2)
 INIT = Stage("init", 4, resumable=True)
-TRAIN = Stage("train", 4, resumable=True, scratch=("checkpoint-*.pt",))
+TRAIN = Stage("train", 5, resumable=True, scratch=("checkpoint-*.pt",))
 GROUND_TRUTH = Stage("ground_truth", 1)
 EVALUATE = Stage("evaluate", 3)
 VIEWS = Stage("views", 5)  # undistorted photographs of their final size; no step of a trial

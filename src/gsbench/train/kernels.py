@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -28,7 +27,6 @@ def tiny_step(rasterizer: Rasterizer) -> Iterator[None]:
     Kernels for outputs that few densifiers request are compiled at their first call.
     """
     from gsbench.raster.cpu import CpuRasterizer
-    from gsbench.raster.cpu.lengths import measure_lengths
     from gsbench.train.adam_cpu import CpuAdam
 
     initial = CASE.gaussians().map(Tensor.float)
@@ -37,8 +35,6 @@ def tiny_step(rasterizer: Rasterizer) -> Iterator[None]:
     loss, target = PhotometricLoss(threads=1), torch.zeros_like(image, dtype=torch.uint8)
     yield
     loss(image, target)[0].backward()
-    yield
-    measure_lengths(np.zeros((1, 2), np.float32), np.zeros(1, np.float32))
     yield
     if isinstance(rasterizer, CpuRasterizer):
         own = CpuRasterizer(threads=1)

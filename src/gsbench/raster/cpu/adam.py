@@ -21,6 +21,7 @@ def _move(values, first, second, gradients, place, source, factor, root):
     """Step the 16 numbers from ``place`` by the gradients from ``source``."""
     prefetch_far(first, place + AHEAD)
     prefetch_far(second, place + AHEAD)
+    prefetch_far(values, place + AHEAD)
     gradient = load(gradients, source)
     mean = load(first, place) * BETA1 + gradient * REST1
     square = load(second, place) * BETA2 + gradient * gradient * REST2

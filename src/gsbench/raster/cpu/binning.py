@@ -64,13 +64,13 @@ def _put(key, digit, counts, target):
 
 
 @inlined
-def _columns(records, base, tile_y, first, past, reach, flatness):
+def _columns(records, base, tile_y, first, past, shear, reach, flatness):
     """The first and the past-the-last tile of row ``tile_y`` that the contour reaches.
 
-    Both are within ``first`` to ``past``. The contour is t^2 = ``reach`` - ``flatness`` dy^2, with
-    t = dx + shear dy.
+    Both are within ``first`` to ``past``. The contour is (dx + ``shear`` dy)^2 = ``reach`` -
+    ``flatness`` dy^2.
     """
-    shear, mean_y = np.float64(records[base + at.SHEAR]), np.float64(records[base + at.MEAN_Y])
+    mean_y = np.float64(records[base + at.MEAN_Y])
     top = tile_y * at.TILE - mean_y - PIXEL_MARGIN
     bottom = top + (at.TILE - 1) + 2 * PIXEL_MARGIN
     # As a function of y, the contour's right side is concave and its left side convex. So the
@@ -116,15 +116,14 @@ def _pair(begin, end, keys, records, record_ints, tiles_x, cutoff, counts, pairs
         base = int(record) * at.RECORD
         spans_x, spans_y = record_ints[base + at.TILES_X], record_ints[base + at.TILES_Y]
         first, past = spans_x & 0xFFFF, spans_x >> 16
-        inverse = -1.0 / np.float64(records[base + at.CURVE_T])
-        reach = (
-            np.float64(records[base + at.LOG2_OPACITY]) - cutoff + LOG2_ALPHA_MIN_MARGIN
-        ) * inverse
-        flatness = np.float64(records[base + at.CURVE_Y]) * -inverse
+        inverse = 1.0 / np.float64(records[base + at.U_X])
+        distance = np.float64(records[base + at.LOG2_OPACITY]) - cutoff + LOG2_ALPHA_MIN_MARGIN
+        reach, shear = distance * inverse * inverse, records[base + at.U_Y] * inverse
+        flatness = (records[base + at.V_Y] * inverse) ** 2
         for tile_y in range(spans_y & 0xFFFF, spans_y >> 16):
             low, high = first, past
             if past - first > 1:
-                low, high = _columns(records, base, tile_y, first, past, reach, flatness)
+                low, high = _columns(records, base, tile_y, first, past, shear, reach, flatness)
             for tile in range(tile_y * tiles_x + low, tile_y * tiles_x + high):
                 counts[tile] += 1
                 if place < room:

@@ -49,24 +49,19 @@ TRANSMITTANCE_MIN = np.float32(CONSTANTS.transmittance_min)
 LOG2_BLOCK_MIN = np.float32(math.log2(CONSTANTS.alpha_min) - 0.01)
 ONE = np.float32(1)
 ZERO = np.float32(0)
-BLOCK_SPAN = np.float32(BLOCK - 1)
-# -curve to entry of the inverse covariance, up to sign
-TO_PRECISION = np.float32(2 * math.log(2.0))
+SIDE, BLOCK_SPAN = np.float32(BLOCK), np.float32(BLOCK - 1)
 # entries that the forward pass blends at a time, block by block: the number of bits of a word
 BATCH = 64
+COPY = 5 * LANES  # numbers of each: u and v by lane, u and v by block, the record
 BATCH_AHEAD = 24  # entries ahead that the forward pass prefetches
 AHEAD = 6  # entries ahead that the backward pass prefetches; it works longer on each
 NEVER_STOPPED = np.float32(1e9)  # larger than the number of entries of any tile
 # Lanes of a footprint's row: number of pixels, sum of values, sum of distances; in the order of
 # ``lane_sums``.
-COVERED, VALUES, DISTANCES = at.SUM_H, at.SUM_H_T, at.SUM_H_Y
+COVERED, VALUES, DISTANCES = at.SUM_H, at.SUM_H_U, at.SUM_H_V
 
-BLOCKS = np.arange(LANES).reshape(-1, 1)  # [16, 1]
 LANE_X = (np.arange(LANES) % BLOCK).astype(np.float32)  # px within a block
 LANE_Y = (np.arange(LANES) // BLOCK).astype(np.float32)
-# px within a tile, by block and lane
-PIXEL_X = (BLOCKS % BLOCK * BLOCK + LANE_X).astype(np.float32).ravel()
-PIXEL_Y = (BLOCKS // BLOCK * BLOCK + LANE_Y).astype(np.float32).ravel()
 
 
 @inlined
@@ -100,68 +95,72 @@ def _store_planes(planes, place, red, green, blue):
 
 
 @inlined
-def _log2_alpha(dx, dy, shear, curve_t, curve_y, log2_opacity):
-    """log2(alpha) before the clamp, and t; see `layout`.
+def _coordinates(records, base, dx, dy, by_block, place):
+    """u and v of a record (`layout`) in a tile whose first pixel is (dx, dy) away from the mean.
+
+    A pixel's u is the sum of a number for its lane and one for its block, and so is its v. Returns
+    u and v by lane; writes u by block, then v, to ``by_block`` at ``place``.
+    """
+    u_x, u_y, v_y = records[base + at.U_X], records[base + at.U_Y], records[base + at.V_Y]
+    u = fma(load(LANE_Y, 0), u_y, load(LANE_X, 0) * u_x)
+    v = load(LANE_Y, 0) * v_y
+    # Block b lies in the tile as lane b lies in a block, ``SIDE`` times as far.
+    store(by_block, place, fma(u, SIDE, u_x * dx + u_y * dy))
+    store(by_block, place + LANES, fma(v, SIDE, v_y * dy))
+    return u, v
+
+
+@inlined
+def _log2_alpha(u, v, log2_opacity):
+    """log2(alpha) before the clamp.
 
     All kernels call this function, so that they round alike and blend the same pixels.
     """
-    t = fma(dy, shear, dx)
-    return fma(dy * curve_y, dy, fma(t * curve_t, t, log2_opacity)), t
+    return fma(-v, v, fma(-u, u, log2_opacity))
 
 
 @inlined
-def _log2_alpha_again(records, base, dx, dy):
-    """`_log2_alpha` of the record at ``base``, for passes behind the first."""
-    return _log2_alpha(
-        dx,
-        dy,
-        records[base + at.SHEAR],
-        records[base + at.CURVE_T],
-        records[base + at.CURVE_Y],
-        records[base + at.LOG2_OPACITY],
-    )
+def _at_block(frame, base, block, lanes, by_block, number, state):
+    """u, v and log2(alpha) of a record in a block, and where the forward pass blended it.
 
-
-@inlined
-def _at_block(frame, base, place, offset_x, offset_y, number, state):
-    """dx, dy, t and log2(alpha) of a record in a block, and where the forward pass blended it.
-
-    ``number`` counts the entries of the tile's list up to the record.
+    ``lanes`` and ``by_block`` are from `_coordinates`; ``number`` counts the entries of the tile's
+    list up to the record.
     """
-    dx, dy = load(PIXEL_X, place) + offset_x, load(PIXEL_Y, place) + offset_y
-    power, t = _log2_alpha_again(frame.records, base, dx, dy)
-    blended = (power >= LOG2_ALPHA_MIN) & (number <= load(frame.last, state + place))
-    return dx, dy, t, power, blended
+    u, v = lanes[0] + by_block[block], lanes[1] + by_block[block + np.uint64(LANES)]
+    power = _log2_alpha(u, v, frame.records[base + at.LOG2_OPACITY])
+    last = load(frame.last, state + block * np.uint64(LANES))
+    return u, v, power, (power >= LOG2_ALPHA_MIN) & (number <= last)
 
 
 @inlined
-def _touched_blocks(records, base, tile_x, tile_y, column, row):
-    """The blocks of the tile at pixel (tile_x, tile_y) that may have a pixel with alpha >= 1/255.
+def _touched_blocks(records, base, dx, dy):
+    """The blocks of a tile that may have a pixel with alpha >= 1/255.
 
-    Returns block b in bit b. Within a block, alpha is largest at the mean or, if the mean is
-    outside, on an edge that faces the mean. The maximum on a vertical or horizontal line has a
-    closed form, which is clamped to the block. The function computes all blocks at once: lane b is
-    block b.
+    The first pixel of the tile is (dx, dy) away from the mean. Returns block b in bit b. Within a
+    block, alpha is largest at the mean or, if the mean is outside, on an edge that faces the mean.
+    The maximum on a vertical or horizontal line has a closed form, which is clamped to the block.
+    The function computes all blocks at once: lane b is block b.
     """
+    u_x, u_y, v_y = records[base + at.U_X], records[base + at.U_Y], records[base + at.V_Y]
     # [16] dx of the first column of each block, dy of its first row
-    left = column + (tile_x - records[base + at.MEAN_X])
-    top = row + (tile_y - records[base + at.MEAN_Y])
-    right, bottom = left + BLOCK_SPAN, top + BLOCK_SPAN
-    shear = records[base + at.SHEAR]
-    curve_t, curve_y = splat(records[base + at.CURVE_T]), splat(records[base + at.CURVE_Y])
-    limit = splat(LOG2_BLOCK_MIN - records[base + at.LOG2_OPACITY])
-
-    edge_x = maximum(left, minimum(right, splat(ZERO)))
-    edge_y = maximum(top, minimum(bottom, splat(ZERO)))
+    left, top = fma(load(LANE_X, 0), SIDE, dx), fma(load(LANE_Y, 0), SIDE, dy)
+    edge_x = _nearest_to_zero(left, BLOCK_SPAN)
+    edge_y = _nearest_to_zero(top, BLOCK_SPAN)
     # dy of the best point on the vertical edge
-    on_x = maximum(top, minimum(bottom, edge_x * records[base + at.SLOPE]))
-    # dx of the best point on the horizontal edge
-    on_y = maximum(left, minimum(right, edge_y * (-shear)))
-    t_x = fma(on_x, shear, edge_x)
-    t_y = fma(edge_y, shear, on_y)
-    best_x = fma(curve_t * t_x, t_x, curve_y * on_x * on_x)
-    best_y = fma(curve_t * t_y, t_y, curve_y * edge_y * edge_y)
-    return mask_bits(maximum(best_x, best_y) >= limit)
+    on_x = maximum(top, minimum(top + BLOCK_SPAN, edge_x * records[base + at.SLOPE]))
+    u, v = fma(on_x, u_y, edge_x * u_x), on_x * v_y
+    vertical = fma(u, u, v * v)
+    # on the horizontal edge, u grows with dx
+    u, v = _nearest_to_zero(fma(edge_y, u_y, left * u_x), BLOCK_SPAN * u_x), edge_y * v_y
+    horizontal = fma(u, u, v * v)
+    reach = records[base + at.LOG2_OPACITY] - LOG2_BLOCK_MIN
+    return mask_bits(minimum(vertical, horizontal) <= splat(reach))
+
+
+@inlined
+def _nearest_to_zero(low, span):
+    """The number nearest to 0 from ``low`` to ``low + span``."""
+    return maximum(low, minimum(low + span, splat(ZERO)))
 
 
 @kernel
@@ -172,7 +171,7 @@ def composite_tiles(first, past, memory, frame, image, alpha):
     pass. ``last`` is `NEVER_STOPPED` for pixels that no entry stopped, and 0 outside the image.
     """
     floats, integers = memory[0][first], memory[1][first]
-    planes, batch = _planes(floats), floats[3 * at.TILE_PIXELS :]  # batch: [BATCH * RECORD]
+    planes, batch = _planes(floats), floats[3 * at.TILE_PIXELS :]  # batch: [BATCH * COPY]
     # [16] pixels that have not stopped, by block; [BATCH] blocks, by entry
     live, touched = integers[:LANES], integers[LANES:].view(np.uint16)
     for tile in range(frame.bounds[first], frame.bounds[past]):
@@ -228,21 +227,21 @@ def _start_blocks(left, top, state, frame, planes, live):
 def _gather_batch(entry, count, end, left, top, alive, frame, batch, touched):
     """Copy the records of ``count`` entries from ``entry``; fill ``touched`` and ``frame.masks``.
 
-    In a copied record, the vector from the mean to the tile's first pixel replaces the mean.
+    A copy has the coordinates of a record in the tile, then the record.
     """
     entries, records = frame.entries, frame.records
     tile_x, tile_y = np.float32(left), np.float32(top)
-    column, row = load(LANE_X, 0) * np.float32(BLOCK), load(LANE_Y, 0) * np.float32(BLOCK)
     for k in range(count):
-        base = entries[entry + k] * at.RECORD
+        base, copy = entries[entry + k] * at.RECORD, k * COPY
         prefetch(records, entries[min(entry + k + BATCH_AHEAD, end - 1)] * at.RECORD)
-        blocks = _touched_blocks(records, base, tile_x, tile_y, column, row) & alive
+        dx, dy = tile_x - records[base + at.MEAN_X], tile_y - records[base + at.MEAN_Y]
+        blocks = _touched_blocks(records, base, dx, dy) & alive
         touched[k] = blocks
         frame.masks[entry + k] = blocks
-        store(batch, k * at.RECORD, load(records, base))
-        # Once for each entry; in the second loop it would be once for each block.
-        batch[k * at.RECORD + at.MEAN_X] = tile_x - records[base + at.MEAN_X]
-        batch[k * at.RECORD + at.MEAN_Y] = tile_y - records[base + at.MEAN_Y]
+        u, v = _coordinates(records, base, dx, dy, batch, copy + 2 * LANES)
+        store(batch, copy, u)
+        store(batch, copy + LANES, v)
+        store(batch, copy + 4 * LANES, load(records, base))
     # ``lanes_with_bit`` reads a whole batch: what is behind the end of the list touches nothing.
     for k in range(count, BATCH):
         touched[k] = 0
@@ -256,20 +255,17 @@ def _blend_batch(block, todo, entry, before_batch, state, frame, planes, batch, 
     """
     bit = np.uint64(1) << block
     place = block * np.uint64(LANES)
-    pixel_x, pixel_y = load(PIXEL_X, place), load(PIXEL_Y, place)
     before = load(frame.transmittance, state + place)
     r, g, b = _load_planes(planes, place)
     lanes = mask_from_bits(live[block])
     while todo != 0:
         k = lowest_bit(todo)
         todo &= todo - np.uint64(1)
-        base = k * np.uint64(at.RECORD)
-        power, _ = _log2_alpha(
-            pixel_x + batch[base + np.uint64(at.MEAN_X)],
-            pixel_y + batch[base + np.uint64(at.MEAN_Y)],
-            batch[base + np.uint64(at.SHEAR)],
-            batch[base + np.uint64(at.CURVE_T)],
-            batch[base + np.uint64(at.CURVE_Y)],
+        copy = k * np.uint64(COPY)
+        base = copy + np.uint64(4 * LANES)
+        power = _log2_alpha(
+            load(batch, copy) + batch[copy + block + np.uint64(2 * LANES)],
+            load(batch, copy + np.uint64(LANES)) + batch[copy + block + np.uint64(3 * LANES)],
             batch[base + np.uint64(at.LOG2_OPACITY)],
         )
         blend = (power >= LOG2_ALPHA_MIN) & lanes
@@ -354,6 +350,7 @@ def composite_backward_tiles(first, past, memory, frame, g_image, g_alpha, rows,
     planes = _planes(floats)  # the gradient of the image
     # U, and T behind the current record
     behind, through = floats[3 * at.TILE_PIXELS :], floats[4 * at.TILE_PIXELS :]
+    by_block = floats[5 * at.TILE_PIXELS :]  # u, then v
     for tile in range(frame.bounds[first], frame.bounds[past]):
         shard = np.int64(frame.tile_shard[tile])
         left, top = _origin(tile, frame.camera.tiles_x)
@@ -371,33 +368,30 @@ def composite_backward_tiles(first, past, memory, frame, g_image, g_alpha, rows,
             if todo == 0:
                 continue
             base = entries[entry] * at.RECORD
-            offset_x = tile_x - records[base + at.MEAN_X]
-            offset_y = tile_y - records[base + at.MEAN_Y]
+            dx, dy = tile_x - records[base + at.MEAN_X], tile_y - records[base + at.MEAN_Y]
+            lanes = _coordinates(records, base, dx, dy, by_block, 0)
             number = splat(np.float32(entry - begin + 1))
             zero = splat(ZERO)
             sums = (zero, zero, zero, zero, zero, zero, zero, zero, zero)
-            sum_abs_t, sum_abs_y = zero, zero
+            sum_abs_u, sum_abs_y = zero, zero
             while todo != 0:
                 block = lowest_bit(todo)
                 todo &= todo - np.uint64(1)
                 place = block * np.uint64(LANES)
-                _, dy, t, power, blended = _at_block(
-                    frame, base, place, offset_x, offset_y, number, state
-                )
+                u, v, power, blended = _at_block(frame, base, block, lanes, by_block, number, state)
                 raw = select(blended, exp2(power), ZERO)
                 g = _load_planes(planes, place)
                 h, weight = _pull(records, base, place, raw, g, behind, through)
-                ht, hy = h * t, h * dy
-                sums = _add_moments(sums, h, ht, hy, t, dy, weight, g)
+                hu, hv = h * u, h * v
+                sums = _add_moments(sums, h, hu, hv, u, v, weight, g)
                 if want_absolute is not None:
-                    sum_abs_t += absolute(ht)
-                    # d power / d mean_y = shear a t + e dy, with a and e from the curves: curve =
-                    # -log2(e)/2 a
-                    shear_a = records[base + at.SHEAR] * records[base + at.CURVE_T]
-                    slope = fma(ht, shear_a, hy * records[base + at.CURVE_Y])
-                    sum_abs_y += absolute(slope) * TO_PRECISION
+                    sum_abs_u += absolute(hu)
+                    # d power / d mean_y, divided by 2 ln 2
+                    sum_abs_y += absolute(
+                        fma(hu, records[base + at.U_Y], hv * records[base + at.V_Y])
+                    )
             if want_absolute is not None:
-                total = lane_sums((*sums, sum_abs_t, sum_abs_y))
+                total = lane_sums((*sums, sum_abs_u, sum_abs_y))
             else:
                 total = lane_sums(sums)
             # No atomics: a shard of tiles is run by one thread, which alone writes to these rows.
@@ -420,19 +414,19 @@ def _pull(records, base, place, raw, g, behind, through):
     gain = light - later
     store(behind, place, fma(opacity, gain, later))
     store(through, place, before)
-    return before * raw * gain, before * opacity
+    return before * (raw * gain), before * opacity
 
 
 @inlined
-def _add_moments(sums, h, ht, hy, t, dy, weight, g):
+def _add_moments(sums, h, hu, hv, u, v, weight, g):
     """The first nine sums of a gradient row (`layout`) with those of one more block."""
     return (
         sums[0] + h,
-        sums[1] + ht,
-        sums[2] + hy,
-        fma(ht, t, sums[3]),
-        fma(ht, dy, sums[4]),
-        fma(hy, dy, sums[5]),
+        sums[1] + hu,
+        sums[2] + hv,
+        fma(hu, u, sums[3]),
+        fma(hu, v, sums[4]),
+        fma(hv, v, sums[5]),
         fma(weight, g[0], sums[6]),
         fma(weight, g[1], sums[7]),
         fma(weight, g[2], sums[8]),
@@ -489,7 +483,8 @@ def cover_tiles(first, past, memory, frame, values, covered, sums, distances):
     """
     entries, masks, records = frame.entries, frame.masks, frame.records
     floats = memory[0][first]
-    own, row = floats[: at.TILE_PIXELS], floats[at.TILE_PIXELS :]
+    own, totals = floats[: at.TILE_PIXELS], floats[at.TILE_PIXELS :]
+    by_block = floats[2 * at.TILE_PIXELS :]  # u, then v
     for tile in range(frame.bounds[first], frame.bounds[past]):
         left, top = _origin(tile, frame.camera.tiles_x)
         state = tile * at.TILE_PIXELS
@@ -500,22 +495,23 @@ def cover_tiles(first, past, memory, frame, values, covered, sums, distances):
             if todo == 0:
                 continue
             base = entries[entry] * at.RECORD
-            offset_x = np.float32(left) - records[base + at.MEAN_X]
-            offset_y = np.float32(top) - records[base + at.MEAN_Y]
+            dx = np.float32(left) - records[base + at.MEAN_X]
+            dy = np.float32(top) - records[base + at.MEAN_Y]
+            lanes = _coordinates(records, base, dx, dy, by_block, 0)
             number = splat(np.float32(entry - begin + 1))
             count, total, reach = splat(ZERO), splat(ZERO), splat(ZERO)
             while todo != 0:
                 block = lowest_bit(todo)
                 todo &= todo - np.uint64(1)
                 place = block * np.uint64(LANES)
-                dx, dy, _, _, blended = _at_block(
-                    frame, base, place, offset_x, offset_y, number, state
-                )
+                _, _, _, blended = _at_block(frame, base, block, lanes, by_block, number, state)
+                column, row = _corner(np.int64(block), dx, dy)
+                x, y = load(LANE_X, 0) + np.float32(column), load(LANE_Y, 0) + np.float32(row)
                 count += select(blended, splat(ONE), ZERO)
                 total += select(blended, load(own, place), ZERO)
-                reach += select(blended, square_root(fma(dx, dx, dy * dy)), ZERO)
+                reach += select(blended, square_root(fma(x, x, y * y)), ZERO)
             shard, index = frame.tile_shard[tile], frame.record_ints[base + at.INDEX]
-            store(row, 0, lane_sums((count, total, reach)))
-            covered[shard, index] += np.int32(row[COVERED])
-            sums[shard, index] += row[VALUES]
-            distances[shard, index] += row[DISTANCES]
+            store(totals, 0, lane_sums((count, total, reach)))
+            covered[shard, index] += np.int32(totals[COVERED])
+            sums[shard, index] += totals[VALUES]
+            distances[shard, index] += totals[DISTANCES]

@@ -15,14 +15,13 @@ TILE = 16
 TILE_PIXELS = TILE * TILE
 
 # A record has what compositing needs of one visible Gaussian: 16 float32, one cache line. With
-# (dx, dy) = pixel - mean and t = dx + SHEAR dy,
-#     log2(alpha) = LOG2_OPACITY + CURVE_T t^2 + CURVE_Y dy^2.
-# The conic is a sum of squares here: unlike a dx^2 + 2b dx dy + c dy^2, it has no cancellation for
-# needles, and the exponent is never positive.
+# (dx, dy) = pixel - mean, u = U_X dx + U_Y dy and v = V_Y dy,
+#     log2(alpha) = LOG2_OPACITY - u^2 - v^2.
+# The conic [[a, b], [b, c]] is a sum of squares here: unlike a dx^2 + 2b dx dy + c dy^2, it has no
+# cancellation for needles, and the exponent is never positive.
 RECORD = LANES
 MEAN_X, MEAN_Y = 0, 1  # px, integer pixel centres
-SHEAR = 2  # b / a
-CURVE_T, CURVE_Y = 3, 4  # -log2(e)/2 a and -log2(e)/2 (c - b^2/a)
+U_X, U_Y, V_Y = 2, 3, 4  # sqrt(log2(e)/2 a), U_X b / a, sqrt(log2(e)/2 (c - b^2/a))
 LOG2_OPACITY = 5
 RED, GREEN, BLUE = 6, 7, 8
 SLOPE = 9  # -b / c: dy / dx of the highest point of a vertical line
@@ -37,9 +36,9 @@ CLAMPED = 15  # bit c: colour channel c was below 0
 # A row has the gradient sums of one Gaussian over the pixels of one shard of tiles, with h = d loss
 # / d log(alpha). A record has rows for the shards from that of its first tile to that of its last.
 ROW = LANES
-SUM_H, SUM_H_T, SUM_H_Y, SUM_H_TT, SUM_H_TY, SUM_H_YY = SUM_LANES[:6]
+SUM_H, SUM_H_U, SUM_H_V, SUM_H_UU, SUM_H_UV, SUM_H_VV = SUM_LANES[:6]
 SUM_RED, SUM_GREEN, SUM_BLUE = SUM_LANES[6:9]
-SUM_ABS_T, SUM_ABS_Y = SUM_LANES[9:11]  # |h t|, |h (d power / d dy)|
+SUM_ABS_U, SUM_ABS_Y = SUM_LANES[9:11]  # |h u|, |h (U_Y u + V_Y v)|
 
 
 def kernel_memory(shards: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
@@ -47,7 +46,7 @@ def kernel_memory(shards: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
 
     Kernels cannot allocate memory (see `gsbench.system.jit.kernel`).
     """
-    floats = torch.empty(shards, 8 * TILE_PIXELS).numpy()
+    floats = torch.empty(shards, 24 * TILE_PIXELS).numpy()
     return floats, torch.empty(shards, 2 * LANES, dtype=torch.int64).numpy()
 
 

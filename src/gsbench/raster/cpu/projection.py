@@ -79,6 +79,7 @@ NEAR = CONSTANTS.near
 ALPHA_MIN, LOG2_ALPHA_MIN = CONSTANTS.alpha_min, math.log2(CONSTANTS.alpha_min)
 MAX_CENTER, MAX_VARIANCE = CONSTANTS.max_center, CONSTANTS.max_variance
 ZERO, HALF, ONE, TWO, FOUR = (np.float32(value) for value in (0, 0.5, 1, 2, 4))
+TWO_LN_2 = np.float32(2 * math.log(2))
 
 FAR = 64  # Gaussians ahead whose harmonics are prefetched
 ALL_LANES = np.uint64((1 << LANES) - 1)
@@ -172,10 +173,10 @@ def _project(floats, indices, begin, end, gaussians, degree, v, outputs):
         clamped = select(red < ZERO, splat(ONE), ZERO)
         clamped += select(green < ZERO, splat(TWO), ZERO) + select(blue < ZERO, splat(FOUR), ZERO)
 
-        curve_y = (-0.5 * LOG2_E) / yy
+        u_x, v_y = square_root(a * (0.5 * LOG2_E)), square_root((0.5 * LOG2_E) / yy)
         # One vector per entry of a record, in the order of `layout`; one row per Gaussian of them.
         entries = (
-            *record_entries(column, row, -xy / yy, a, curve_y, log2_opacity, rgb),
+            *record_entries(column, row, (u_x, -xy / yy * u_x, v_y), log2_opacity, rgb),
             xy / xx,
             xy * square_root(reach / xx),
             z,
@@ -400,19 +401,21 @@ def _backproject(memory, record, past, origin, gaussians, degree, frame, rows, o
     scales = exponentials(log_scale)
     _, xy, yy, a = spread(scaled(n0, scales), scaled(n1, scales))
     e, shear = ONE / yy, -xy / yy  # power = -(a t^2 + e dy^2) / 2, t = dx + shear dy
+    by_u, by_v = square_root(a * TWO_LN_2), square_root(e * TWO_LN_2)  # a t / u and e dy / v
 
     # Mean on the image: d power / d mean = (a t, shear a t + e dy).
-    g_column = a * load(sums, at.SUM_H_T * LANES)
-    g_row = shear * g_column + e * load(sums, at.SUM_H_Y * LANES)
+    g_column = by_u * load(sums, at.SUM_H_U * LANES)
+    g_row = shear * g_column + by_v * load(sums, at.SUM_H_V * LANES)
     half_width, half_height = 0.5 * v.width, 0.5 * v.height  # from px to NDC
     scatter(g_screen, indices, (g_column * half_width, g_row * half_height))
     if len(g_absolute) > 0:
-        across, down = a * load(sums, at.SUM_ABS_T * LANES), load(sums, at.SUM_ABS_Y * LANES)
+        across = by_u * load(sums, at.SUM_ABS_U * LANES)
+        down = TWO_LN_2 * load(sums, at.SUM_ABS_Y * LANES)
         scatter(g_absolute, indices, (across * half_width, down * half_height))
 
-    q00 = a * a * load(sums, at.SUM_H_TT * LANES)
-    q01 = a * e * load(sums, at.SUM_H_TY * LANES)
-    q11 = e * e * load(sums, at.SUM_H_YY * LANES)
+    q00 = by_u * by_u * load(sums, at.SUM_H_UU * LANES)
+    q01 = by_u * by_v * load(sums, at.SUM_H_UV * LANES)
+    q11 = by_v * by_v * load(sums, at.SUM_H_VV * LANES)
     h = load(sums, at.SUM_H * LANES)
     if len(g_extra) > 0:
         free = image_rows(free_x, free_y, inverse_z, v)

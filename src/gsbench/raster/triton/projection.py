@@ -152,8 +152,8 @@ def project(
     place = index * RECORD
     seen |= index == count
     log2_opacity = tl.where(inside, log2_opacity, INVISIBLE)
-    curve_y = 1.0 / yy * (-0.5 * LOG2_E)
-    entries = record_entries(column, row, -xy / yy, a, curve_y, log2_opacity, rgb)
+    form = -xy / yy, a * (-0.5 * LOG2_E), 1.0 / yy * (-0.5 * LOG2_E)
+    entries = record_entries(column, row, form, log2_opacity, rgb)
     for k in tl.static_range(9):
         tl.store(records + place + k, entries[k], mask=seen)
     tl.store(records + place + RIGHTMOST_Y, xy * tl.sqrt(reach / xx), mask=seen)
