@@ -59,7 +59,11 @@ def test_the_ratio_is_near_that_of_cubic_polynomials_as_in_the_original_method()
     [
         (dict(zip(COUNTS, [1, 3, 2, 4], strict=True)).get, "always give the arm better quality"),
         (lambda n: np.log(n) + 1.2, "only 42% of the range"),  # of a range of 2.08, 0.88
-        (lambda n: np.log(n) + 3, "only 0% of the range"),
+        (
+            lambda n: np.log(n) + 3,
+            "the arm with 10,000 Gaussians is better than the baseline with 80",
+        ),
+        (lambda n: np.log(n) - 3, "the baseline with 10,000 Gaussians is better than the arm with"),
         (lambda n: np.nan, "always give the arm better quality"),
     ],
 )

@@ -100,7 +100,8 @@ class ADC(Budgeted):
         visible, statistics = render.visible, self.statistics
         statistics["gradient_sum"] += torch.where(visible, self.screen_gradient(render), 0.0)
         statistics["visible_count"] += visible
-        statistics["max_radii"] = torch.maximum(statistics["max_radii"], render.radii)
+        largest = statistics["max_radii"]
+        torch.maximum(largest, render.radii, out=largest)
 
     def screen_gradient(self, render: RenderOutput) -> Tensor:
         """Length of the gradient by each projected mean, [N] NDC."""

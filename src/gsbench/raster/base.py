@@ -164,7 +164,7 @@ class RenderOutput(NamesAttributes):
     @property
     def visible(self) -> Tensor:
         """[N] bool: the Gaussians that reach at least one tile."""
-        return self.radii > 0
+        return self.radii.bool()
 
     def require_footprint(self, values: Tensor | None = None) -> Footprint:
         """Return ``footprint(values)``. Raises RuntimeError if the rasterizer has no footprints."""

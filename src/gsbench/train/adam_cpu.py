@@ -77,8 +77,8 @@ class FusedStep:
         """
         values = gaussians.values.detach()
         check_settings(values, camera, degree, self._background)
-        points = torch.zeros_like(values.means[:, :2], requires_grad=True)
-        summed = torch.zeros_like(points) if absolute else None
+        points = torch.zeros(1).expand(len(values), 2).requires_grad_()  # no memory for zeros
+        summed = torch.zeros(points.shape) if absolute else None
         request = RenderRequest(camera, degree, self._background, summed, None, Lifetime())
         image, alpha, radii, passed = self._rasterizer.forward(values, request)
         scalars, g_image = self._loss.compute(image, target.contiguous(), differentiate=True)

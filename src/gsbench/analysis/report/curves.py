@@ -196,17 +196,23 @@ def log_ratio(arm: Curve, baseline: Curve, direction: int) -> float:
     """
     from scipy.interpolate import PchipInterpolator
 
-    curves = []
+    curves, ends = [], []
     for name, points in (("arm", arm), ("baseline", baseline)):
         counts, qualities = np.array(sorted(points)).T * [[1], [direction]]
         if not ((np.diff(counts) > 0).all() and (np.diff(qualities) > 0).all()):
             raise InputError(f"more Gaussians do not always give the {name} better quality")
         curves.append((qualities, np.log(counts)))
+        ends.append((name, (counts[0], counts[-1]), qualities[0]))
     low = max(qualities[0] for qualities, _ in curves)
     high = min(qualities[-1] for qualities, _ in curves)
+    if high < low:
+        (worse, (_, most), _), (better, (fewest, _), _) = sorted(ends, key=lambda end: end[2])
+        raise InputError(
+            f"the {better} with {fewest:,.0f} Gaussians is better than the {worse} with {most:,.0f}"
+        )
     share = (high - low) / max(np.ptp(qualities) for qualities, _ in curves)
     if share < LEAST_COMMON:
-        raise InputError(f"only {max(share, 0.0):.0%} of the range of quality is common")
+        raise InputError(f"only {share:.0%} of the range of quality is common")
     ours, theirs = (PchipInterpolator(*curve).integrate(low, high) for curve in curves)
     return float((ours - theirs) / (high - low))
 
