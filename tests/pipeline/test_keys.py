@@ -33,9 +33,9 @@ KEYS = [
     # of the reference cameras
     ("init", "b92ef1cdec8634bd52daa8afeaec7fce0b13d00d70d0f715b5eb9a1c73fd5759"),
     ("init", "a3a44618398e68c025836e1031642269da49e069c9d615c9de8217baab805301"),
-    ("train", "be5b5096203484811ef508cfe5253cdf0c7d13865390f0fcf9db1a33108f65a8"),
+    ("train", "905a9e3749af71c6bab5b6e430d16dee07270ef47347d1cfbb96b2703408eb9b"),
     ("ground_truth", "2713e948ccf37750ea64717542d37c5a6697a184fe9c108264563c57a4b1b66d"),
-    ("evaluate", "761494d9b21f80b252c0f08d3b8a9466dc7b73ce3f3f6afa827fe24d48df4bb8"),
+    ("evaluate", "5007653c9b10de39c2e268855a6efe5ce0853abbeec6f49ce21e0f2e202ba631"),
 ]
 
 
