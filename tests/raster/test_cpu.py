@@ -17,6 +17,7 @@ import torch
 from numba import types
 from numpy.testing import assert_allclose, assert_array_equal
 
+from gsbench.bench.measure import UNUSED_FOLDER, Setting, Stepper
 from gsbench.raster.contract import Case, render_with_gradients
 from gsbench.raster.cpu import (
     CpuRasterizer,
@@ -159,6 +160,27 @@ def test_a_record_is_listed_only_in_the_tiles_and_blocks_that_its_contour_reache
     assert (high - low < past - first).any()
 
 
+def test_a_batch_fits_into_the_scratch_memory_of_a_call():
+    assert 3 * layout.TILE_PIXELS + composite.BATCH * composite.COPY <= layout.SCRATCH
+
+
+def test_the_default_dtype_of_torch_changes_nothing():
+    """Also not in a step without autograd."""
+    expected, gradients = render_with_gradients(CpuRasterizer(threads=1), CASE, torch.float32)
+    steppers = [Stepper("cpu", Setting("trained", 40, 30, 200)) for _ in range(2)]
+    steppers[0].trainer.iterate(UNUSED_FOLDER)
+    torch.set_default_dtype(torch.float64)
+    try:
+        output, others = render_with_gradients(CpuRasterizer(threads=1), CASE, torch.float32)
+        steppers[1].trainer.iterate(UNUSED_FOLDER)
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert torch.equal(output.image, expected.image)
+    assert all(torch.equal(others[name], gradients[name]) for name in gradients)
+    first, second = (stepper.trainer.gaussians.values.means for stepper in steppers)
+    assert torch.equal(first, second)
+
+
 def test_the_backward_pass_skips_entries_behind_the_one_that_stopped_a_block():
     case = Case(40, 40, 300, sh_degree=0, log_scale=-1.5, logit=3.0)
     frame = rendered(case).footprint.args[0].frame
@@ -202,6 +224,7 @@ def test_hosts_without_wide_vectors_match_the_reference(tmp_path):
 import sys, torch
 from gsbench.raster.cpu import CpuRasterizer
 from gsbench.raster.reference import ReferenceRasterizer, project, tile_rectangles
+from gsbench.bench.measure import UNUSED_FOLDER, Setting, Stepper
 from gsbench.raster.contract import Case, render_with_gradients
 case = Case(33, 49, 50, sh_degree=3)
 output, gradients = render_with_gradients(CpuRasterizer(threads=2), case, torch.float32)

@@ -136,7 +136,7 @@ class RenderOutput(NamesAttributes):
     """One rendered view.
 
     - ``image`` is [H, W, 3], not clamped above; ``alpha`` is [H, W].
-    - ``radii`` is [N] int32 in px, 0 for culled Gaussians.
+    - ``radii`` is [N] int32 in px, 0 for culled Gaussians, else positive.
     - ``screen_points`` is [N, 2], a leaf of zeros. After ``backward``, its ``.grad`` is the
       gradient of the loss by the projected means in NDC units, as in 3DGS (pixel gradient times
       W/2, H/2).

@@ -187,7 +187,10 @@ def contour_range(center, half, tiles, size):
 
 
 def record_entries(column, row, form, log2_opacity, rgb):
-    """The first nine entries of a record (`layout` of an executor); ``form`` are three of them."""
+    """The first nine entries of a record (an executor's `layout`).
+
+    ``form`` are the three that give log2(alpha) by the place.
+    """
     red, green, blue = maximum(0.0, rgb[0]), maximum(0.0, rgb[1]), maximum(0.0, rgb[2])
     return column, row, form[0], form[1], form[2], log2_opacity, red, green, blue
 

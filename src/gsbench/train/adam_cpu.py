@@ -77,8 +77,9 @@ class FusedStep:
         """
         values = gaussians.values.detach()
         check_settings(values, camera, degree, self._background)
-        points = torch.zeros(1).expand(len(values), 2).requires_grad_()  # no memory for zeros
-        summed = torch.zeros(points.shape) if absolute else None
+        # a leaf of zeros that has no memory of its own
+        points = values.means.new_zeros(1).expand(len(values), 2).requires_grad_()
+        summed = torch.zeros_like(points) if absolute else None
         request = RenderRequest(camera, degree, self._background, summed, None, Lifetime())
         image, alpha, radii, passed = self._rasterizer.forward(values, request)
         scalars, g_image = self._loss.compute(image, target.contiguous(), differentiate=True)

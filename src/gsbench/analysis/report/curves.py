@@ -202,11 +202,11 @@ def log_ratio(arm: Curve, baseline: Curve, direction: int) -> float:
         if not ((np.diff(counts) > 0).all() and (np.diff(qualities) > 0).all()):
             raise InputError(f"more Gaussians do not always give the {name} better quality")
         curves.append((qualities, np.log(counts)))
-        ends.append((name, (counts[0], counts[-1]), qualities[0]))
+        ends.append((qualities[0], name, counts[0], counts[-1]))
     low = max(qualities[0] for qualities, _ in curves)
     high = min(qualities[-1] for qualities, _ in curves)
     if high < low:
-        (worse, (_, most), _), (better, (fewest, _), _) = sorted(ends, key=lambda end: end[2])
+        (_, worse, _, most), (_, better, fewest, _) = sorted(ends)
         raise InputError(
             f"the {better} with {fewest:,.0f} Gaussians is better than the {worse} with {most:,.0f}"
         )

@@ -52,7 +52,8 @@ ZERO = np.float32(0)
 SIDE, BLOCK_SPAN = np.float32(BLOCK), np.float32(BLOCK - 1)
 # entries that the forward pass blends at a time, block by block: the number of bits of a word
 BATCH = 64
-COPY = 5 * LANES  # numbers of each: u and v by lane, u and v by block, the record
+# What an entry of a batch has: u and v by lane, u and v by block, the record.
+V_BY_LANE, U_BY_BLOCK, V_BY_BLOCK, RECORD, COPY = (k * LANES for k in range(1, 6))
 BATCH_AHEAD = 24  # entries ahead that the forward pass prefetches
 AHEAD = 6  # entries ahead that the backward pass prefetches; it works longer on each
 NEVER_STOPPED = np.float32(1e9)  # larger than the number of entries of any tile
@@ -72,7 +73,7 @@ def _origin(tile, tiles_x):
 
 @inlined
 def _corner(block, left, top):
-    """The column and row of the first pixel of a block, in the tile at pixel (left, top)."""
+    """The column and row of the first pixel of a block in the tile that starts at (left, top)."""
     return left + block % 4 * BLOCK, top + block // 4 * BLOCK
 
 
@@ -114,7 +115,8 @@ def _coordinates(records, base, dx, dy, by_block, place):
 def _log2_alpha(u, v, log2_opacity):
     """log2(alpha) before the clamp.
 
-    All kernels call this function, so that they round alike and blend the same pixels.
+    All kernels call this function and `_coordinates`, so that they round alike and blend the same
+    pixels.
     """
     return fma(-v, v, fma(-u, u, log2_opacity))
 
@@ -238,10 +240,10 @@ def _gather_batch(entry, count, end, left, top, alive, frame, batch, touched):
         blocks = _touched_blocks(records, base, dx, dy) & alive
         touched[k] = blocks
         frame.masks[entry + k] = blocks
-        u, v = _coordinates(records, base, dx, dy, batch, copy + 2 * LANES)
+        u, v = _coordinates(records, base, dx, dy, batch, copy + U_BY_BLOCK)
         store(batch, copy, u)
-        store(batch, copy + LANES, v)
-        store(batch, copy + 4 * LANES, load(records, base))
+        store(batch, copy + V_BY_LANE, v)
+        store(batch, copy + RECORD, load(records, base))
     # ``lanes_with_bit`` reads a whole batch: what is behind the end of the list touches nothing.
     for k in range(count, BATCH):
         touched[k] = 0
@@ -262,10 +264,10 @@ def _blend_batch(block, todo, entry, before_batch, state, frame, planes, batch, 
         k = lowest_bit(todo)
         todo &= todo - np.uint64(1)
         copy = k * np.uint64(COPY)
-        base = copy + np.uint64(4 * LANES)
+        base = copy + np.uint64(RECORD)
         power = _log2_alpha(
-            load(batch, copy) + batch[copy + block + np.uint64(2 * LANES)],
-            load(batch, copy + np.uint64(LANES)) + batch[copy + block + np.uint64(3 * LANES)],
+            load(batch, copy) + batch[copy + block + np.uint64(U_BY_BLOCK)],
+            load(batch, copy + np.uint64(V_BY_LANE)) + batch[copy + block + np.uint64(V_BY_BLOCK)],
             batch[base + np.uint64(at.LOG2_OPACITY)],
         )
         blend = (power >= LOG2_ALPHA_MIN) & lanes

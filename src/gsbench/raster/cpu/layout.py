@@ -41,12 +41,15 @@ SUM_RED, SUM_GREEN, SUM_BLUE = SUM_LANES[6:9]
 SUM_ABS_U, SUM_ABS_Y = SUM_LANES[9:11]  # |h u|, |h (U_Y u + V_Y v)|
 
 
+SCRATCH = 24 * TILE_PIXELS  # float32; the forward pass needs 3 * 256 + 64 * 80
+
+
 def kernel_memory(shards: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     """Scratch memory for ``shards``: a call of a kernel uses the row of its first one.
 
     Kernels cannot allocate memory (see `gsbench.system.jit.kernel`).
     """
-    floats = torch.empty(shards, 24 * TILE_PIXELS).numpy()
+    floats = torch.empty(shards, SCRATCH, dtype=torch.float32).numpy()
     return floats, torch.empty(shards, 2 * LANES, dtype=torch.int64).numpy()
 
 
