@@ -115,4 +115,4 @@ def test_the_new_setting_is_checked_recorded_and_has_its_effect(walked):
 def test_the_new_loss_is_trained_with_on_every_device_under_a_new_version(walked, answers):
     assert float(answers[1]) == pytest.approx(1e-3)
     assert answers[2] == "[True, True]"
-    assert walked.results["code"]["stages"]["train"] == 5
+    assert walked.results["code"]["stages"]["train"] == 6
