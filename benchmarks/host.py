@@ -26,7 +26,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from gsbench.bench.measure import UNUSED_FOLDER, constant_scene_options
 from gsbench.bench.scenes import SEED, make_scene
-from gsbench.densify import ADC, MCMC, Densifier
+from gsbench.densify import ADC, MCMC, Densifier, adc
 from gsbench.raster.triton import executor, lists
 from gsbench.raster.triton.executor import TritonRasterizer
 from gsbench.train import adam_triton, direct, loss_triton
@@ -128,6 +128,7 @@ class NullDevice:
             mock.patch.object(adam_triton, "launch", self._launch),
             mock.patch.object(executor, "Readback", _Sizes),
             mock.patch.object(direct, "Readback", _Sizes),
+            mock.patch.object(adc, "lengths_of", lambda vectors: vectors.norm(dim=-1)),
         ):
             for _ in range(WARM_UP):
                 self.step()

@@ -15,7 +15,7 @@ import tests.raster.conftest  # noqa: F401 - makes the interpreter faster
 from benchmarks.counters import counting_waits
 from gsbench.bench.measure import NEVER, constant_scene_options
 from gsbench.bench.scenes import make_scene
-from gsbench.densify import ADC, MCMC
+from gsbench.densify import ADC, MCMC, adc
 from gsbench.raster import create_rasterizer, staged
 from gsbench.raster.staged import Readback
 from gsbench.train.loss import torch_photometric_loss
@@ -32,6 +32,7 @@ def main(raster):
     Readback.arrived = property(lambda self: False)
     # On a GPU, this check does not read the values.
     staged._check_background = lambda background: None
+    adc.lengths_of = lambda vectors: vectors.norm(dim=-1)  # as on a GPU
     gaussians, scene = make_scene("trained", 20, 20, 12)
     for name, densifier in DENSIFIERS.items():
         rasterizer = create_rasterizer(raster, torch.device("cpu"))

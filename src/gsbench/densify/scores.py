@@ -32,8 +32,10 @@ def standard_normal(shape: tuple[int, ...], rng: torch.Generator, like: Tensor) 
 
 
 def lengths_of(vectors: Tensor) -> Tensor:
-    """The lengths [N] of ``vectors`` [N, 2]; on a CPU several times as fast as torch's norm."""
-    x, y = vectors.unbind(1)
+    """The lengths [N] of ``vectors`` [N, 2]."""
+    if vectors.device.type != "cpu":
+        return vectors.norm(dim=-1)
+    x, y = vectors.unbind(1)  # on a CPU, three times as fast as torch's norm
     return torch.addcmul(x * x, y, y).sqrt_()
 
 

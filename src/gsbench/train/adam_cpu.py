@@ -77,8 +77,7 @@ class FusedStep:
         """
         values = gaussians.values.detach()
         check_settings(values, camera, degree, self._background)
-        # a leaf of zeros that has no memory of its own
-        points = values.means.new_zeros(1).expand(len(values), 2).requires_grad_()
+        points = torch.zeros_like(values.means[:, :2], requires_grad=True)
         summed = torch.zeros_like(points) if absolute else None
         request = RenderRequest(camera, degree, self._background, summed, None, Lifetime())
         image, alpha, radii, passed = self._rasterizer.forward(values, request)

@@ -52,7 +52,7 @@ ZERO = np.float32(0)
 SIDE, BLOCK_SPAN = np.float32(BLOCK), np.float32(BLOCK - 1)
 # entries that the forward pass blends at a time, block by block: the number of bits of a word
 BATCH = 64
-# What an entry of a batch has: u and v by lane, u and v by block, the record.
+# places of an entry's numbers in a batch: u and v by lane, u and v by block, the record
 V_BY_LANE, U_BY_BLOCK, V_BY_BLOCK, RECORD, COPY = (k * LANES for k in range(1, 6))
 BATCH_AHEAD = 24  # entries ahead that the forward pass prefetches
 AHEAD = 6  # entries ahead that the backward pass prefetches; it works longer on each
@@ -156,13 +156,13 @@ def _touched_blocks(records, base, dx, dy):
     u, v = _nearest_to_zero(fma(edge_y, u_y, left * u_x), BLOCK_SPAN * u_x), edge_y * v_y
     horizontal = fma(u, u, v * v)
     reach = records[base + at.LOG2_OPACITY] - LOG2_BLOCK_MIN
-    return mask_bits(minimum(vertical, horizontal) <= splat(reach))
+    return mask_bits(minimum(vertical, horizontal) <= reach)
 
 
 @inlined
 def _nearest_to_zero(low, span):
     """The number nearest to 0 from ``low`` to ``low + span``."""
-    return maximum(low, minimum(low + span, splat(ZERO)))
+    return maximum(low, minimum(low + span, ZERO))
 
 
 @kernel

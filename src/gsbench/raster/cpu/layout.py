@@ -50,7 +50,7 @@ def kernel_memory(shards: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     Kernels cannot allocate memory (see `gsbench.system.jit.kernel`).
     """
     floats = torch.empty(shards, SCRATCH, dtype=torch.float32).numpy()
-    return floats, torch.empty(shards, 2 * LANES, dtype=torch.int64).numpy()
+    return floats, np.empty((shards, 2 * LANES), np.int64)
 
 
 class Parameters(NamedTuple):
