@@ -28,7 +28,7 @@ def draw(axes: Axes, by_arm: dict[str, Points]) -> None:
         means = np.array([np.mean(of_count, axis=0) for _, of_count in sorted(by_arm[arm].items())])
         axes.plot(*means.T, color=color, label=arm)
         every = np.array([point for of_count in by_arm[arm].values() for point in of_count])
-        axes.scatter(*every.T, color=color, s=14)
+        axes.scatter(every[:, 0], every[:, 1], color=color, s=14)
     axes.set_xscale("log")
     axes.xaxis.set_major_locator(FixedLocator(sorted(by_arm["adc"])))
     axes.xaxis.set_minor_locator(NullLocator())
