@@ -106,7 +106,7 @@ def write_table(axis: Axes, frame: pd.DataFrame) -> None:
     for cell in table.get_celld().values():
         cell.set_edgecolor("#cccccc")
     axis.text(
-        0.5, -0.02, verdicts(), ha="center", va="bottom", fontsize=11, transform=axis.transAxes
+        0.5, -0.08, verdicts(), ha="center", va="bottom", fontsize=11, transform=axis.transAxes
     )
 
 
@@ -129,9 +129,9 @@ def main(runs: Path) -> None:
         runs / "store" / "init" / key / "sparse" / "0", view, (truth.shape[1], truth.shape[0])
     )
 
-    figure = plt.figure(figsize=(12.5, 3.7), dpi=110)
+    figure = plt.figure(figsize=(12.5, 3.8), dpi=110)
     grid = figure.add_gridspec(
-        2, 5, height_ratios=(2.0, 1.3), left=0.005, right=0.995, top=0.92, bottom=0.02, wspace=0.02
+        2, 5, height_ratios=(2.0, 1.3), left=0.005, right=0.995, top=0.92, bottom=0.04, wspace=0.02
     )
     panels = {
         "photograph": truth,

@@ -40,7 +40,8 @@ def differences(of_scene: Values) -> tuple[list[float], np.ndarray]:
     return thresholds, np.array(rows)
 
 
-def draw(above: Axes, below: Axes, by_scene: dict[str, Values]) -> None:
+def draw(panels: tuple[Axes, Axes], by_scene: dict[str, Values]) -> None:
+    above, below = panels
     for number, (scene, color) in enumerate(SCENES.items()):
         thresholds, changes = differences(by_scene[scene])
         tests = [t_test(of_threshold[None]) for of_threshold in changes]
@@ -71,5 +72,5 @@ if __name__ == "__main__":
     for trial in results_in(FINDINGS / "archives/paper_threshold.zip"):
         found.setdefault(trial["scene"], {}).setdefault(trial["densify"], {})[trial["seed"]] = trial
     figure, axes = plt.subplots(2, 1, figsize=(6, 6.4), sharex=True, layout="constrained")
-    draw(*axes, found)
+    draw((axes[0], axes[1]), found)
     figure.savefig(FINDINGS / "pictures/threshold.png", dpi=110)
