@@ -12,6 +12,7 @@ without one, the columns about texture are left out. The errors of regions are t
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterable
 from dataclasses import astuple
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 from paper_tables import FINDINGS
 from PIL import Image
 
-from gsbench.analysis.images import SIDE, texture_energy
+from gsbench.analysis.images import region_means, texture_energy
 from gsbench.analysis.report.where import compare_regions, discoveries, region_psnr
 from gsbench.analysis.statistics import t_test
 
@@ -43,13 +44,9 @@ def errors_of(scene: str, arm: str) -> list[dict[str, Array]]:
     return found
 
 
-def regions(values: Array, shape: tuple[int, ...]) -> Array:
-    """The means of a picture [H, W] over its regions ``shape``; borders as in the errors."""
-    starts = [np.arange(count) * SIDE for count in shape]
-    sums, counts = values, np.ones_like(values)
-    for axis, first in enumerate(starts):
-        sums, counts = (np.add.reduceat(each, first, axis) for each in (sums, counts))
-    return sums / counts
+def flat_psnr(errors: dict[str, Array]) -> Array:
+    """The PSNR in dB of all regions of a trial's views, [N]."""
+    return np.concatenate([region_psnr(error).ravel() for error in errors.values()])
 
 
 def photograph(folder: Path, view: str) -> NDArray[np.uint8]:
@@ -62,14 +59,14 @@ def photograph(folder: Path, view: str) -> NDArray[np.uint8]:
     return np.asarray(picture.resize(size, Image.Resampling.BOX))
 
 
-def of_photographs(folder: Path, shapes: dict[str, tuple[int, ...]]) -> tuple[Array, Array]:
+def of_photographs(folder: Path, views: Iterable[str]) -> tuple[Array, Array]:
     """The texture of all regions, and the share of their pixels in which green is largest."""
     texture, green = [], []
-    for view, shape in shapes.items():
+    for view in views:
         pixels = photograph(folder, view)
-        texture.append(regions(texture_energy(pixels), shape).ravel())
+        texture.append(region_means(texture_energy(pixels)).ravel())
         is_green = (pixels[..., 1] > pixels[..., 0]) & (pixels[..., 1] > pixels[..., 2])
-        green.append(regions(is_green.astype(float), shape).ravel())
+        green.append(region_means(is_green.astype(float)).ravel())
     return np.concatenate(texture), np.concatenate(green)
 
 
@@ -88,27 +85,19 @@ if __name__ == "__main__":
     compared = {scene: compare_regions(*own) for scene, own in pairs.items()}
     lit = iter(discoveries([view.p for scene in compared.values() for view in scene.values()]))
     for scene, views in compared.items():
-        change = np.concatenate([view.change.ravel() for view in views.values()])
-        ours, theirs = (
-            np.array(
-                [
-                    np.concatenate([region_psnr(each).ravel() for each in one.values()])
-                    for one in arm
-                ]
-            )
-            for arm in pairs[scene]
-        )
+        ours, theirs = (np.array([flat_psnr(errors) for errors in arm]) for arm in pairs[scene])
+        changes = ours - theirs  # [K, N]
+        change = changes.mean(axis=0)
         flags = np.concatenate([next(lit).ravel() for _ in views])
         words = f"{scene}: {(flags & (change > 0)).sum()} better, {(flags & (change < 0)).sum()} "
         words += f"worse of {len(change)}; {change.mean():+.2f} dB"
         folder = Path(sys.argv[1]) / scene if len(sys.argv) > 1 else None
         if folder is not None and folder.is_dir():
-            shapes = {view: one.change.shape for view, one in views.items()}
-            texture, green = of_photographs(folder, shapes)
+            texture, green = of_photographs(folder, views)
             low, high = np.quantile(texture, (FIFTH, 1 - FIFTH))
             words += f"; least textured fifth {change[texture <= low].mean():+.2f} dB, most "
             words += f"{change[texture >= high].mean():+.2f} dB, most minus least "
-            words += contrast(ours - theirs, texture >= high, texture <= low)
+            words += contrast(changes, texture >= high, texture <= low)
             words += f"; {(green > 0.5).mean():.0%} of regions are green, and gain "
-            words += contrast(ours - theirs, green > 0.5, green <= 0.5) + " more than others"
+            words += contrast(changes, green > 0.5, green <= 0.5) + " more than others"
         print(words)

@@ -224,7 +224,6 @@ def test_hosts_without_wide_vectors_match_the_reference(tmp_path):
 import sys, torch
 from gsbench.raster.cpu import CpuRasterizer
 from gsbench.raster.reference import ReferenceRasterizer, project, tile_rectangles
-from gsbench.bench.measure import UNUSED_FOLDER, Setting, Stepper
 from gsbench.raster.contract import Case, render_with_gradients
 case = Case(33, 49, 50, sh_degree=3)
 output, gradients = render_with_gradients(CpuRasterizer(threads=2), case, torch.float32)

@@ -91,9 +91,13 @@ def region_errors(render: Pixels, truth: Pixels) -> Array:
     """
     # whole numbers, since reports read hundreds of pictures
     squared = (render.astype(np.int32) - truth) ** 2
-    error = squared.sum(axis=-1) / squared.shape[-1]  # [H, W]
-    starts = [np.arange(max(1, round(size / SIDE))) * SIDE for size in error.shape]
-    sums, counts = error, np.ones_like(error)
+    return region_means(squared.sum(axis=-1) / squared.shape[-1])
+
+
+def region_means(values: Array) -> Array:
+    """The means [R, C] of a picture [H, W] over the regions of `region_errors`."""
+    starts = [np.arange(max(1, round(size / SIDE))) * SIDE for size in values.shape]
+    sums, counts = values, np.ones_like(values)
     for axis, first in enumerate(starts):
         sums, counts = (np.add.reduceat(each, first, axis) for each in (sums, counts))
     return sums / counts

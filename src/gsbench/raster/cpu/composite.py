@@ -96,6 +96,12 @@ def _store_planes(planes, place, red, green, blue):
 
 
 @inlined
+def _from_mean(records, base, left, top):
+    """The vector (dx, dy) from the mean of a record to the pixel (left, top)."""
+    return np.float32(left) - records[base + at.MEAN_X], np.float32(top) - records[base + at.MEAN_Y]
+
+
+@inlined
 def _coordinates(records, base, dx, dy, by_block, place):
     """u and v of a record (`layout`) in a tile whose first pixel is (dx, dy) away from the mean.
 
@@ -232,11 +238,10 @@ def _gather_batch(entry, count, end, left, top, alive, frame, batch, touched):
     A copy has the coordinates of a record in the tile, then the record.
     """
     entries, records = frame.entries, frame.records
-    tile_x, tile_y = np.float32(left), np.float32(top)
     for k in range(count):
         base, copy = entries[entry + k] * at.RECORD, k * COPY
         prefetch(records, entries[min(entry + k + BATCH_AHEAD, end - 1)] * at.RECORD)
-        dx, dy = tile_x - records[base + at.MEAN_X], tile_y - records[base + at.MEAN_Y]
+        dx, dy = _from_mean(records, base, left, top)
         blocks = _touched_blocks(records, base, dx, dy) & alive
         touched[k] = blocks
         frame.masks[entry + k] = blocks
@@ -356,7 +361,6 @@ def composite_backward_tiles(first, past, memory, frame, g_image, g_alpha, rows,
     for tile in range(frame.bounds[first], frame.bounds[past]):
         shard = np.int64(frame.tile_shard[tile])
         left, top = _origin(tile, frame.camera.tiles_x)
-        tile_x, tile_y = np.float32(left), np.float32(top)
         state = tile * at.TILE_PIXELS
         begin, end = frame.starts[tile], frame.processed[tile]
         if begin == end:
@@ -370,7 +374,7 @@ def composite_backward_tiles(first, past, memory, frame, g_image, g_alpha, rows,
             if todo == 0:
                 continue
             base = entries[entry] * at.RECORD
-            dx, dy = tile_x - records[base + at.MEAN_X], tile_y - records[base + at.MEAN_Y]
+            dx, dy = _from_mean(records, base, left, top)
             lanes = _coordinates(records, base, dx, dy, by_block, 0)
             number = splat(np.float32(entry - begin + 1))
             zero = splat(ZERO)
@@ -497,8 +501,7 @@ def cover_tiles(first, past, memory, frame, values, covered, sums, distances):
             if todo == 0:
                 continue
             base = entries[entry] * at.RECORD
-            dx = np.float32(left) - records[base + at.MEAN_X]
-            dy = np.float32(top) - records[base + at.MEAN_Y]
+            dx, dy = _from_mean(records, base, left, top)
             lanes = _coordinates(records, base, dx, dy, by_block, 0)
             number = splat(np.float32(entry - begin + 1))
             count, total, reach = splat(ZERO), splat(ZERO), splat(ZERO)

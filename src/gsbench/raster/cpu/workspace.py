@@ -21,7 +21,7 @@ HEADROOM = 1.25  # times the requested size, so that a growing scene does not al
 
 
 def aligned_bytes(size: int) -> NDArray[np.uint8]:
-    """``size`` uninitialised bytes that start on a cache line."""
+    """``size`` uninitialised bytes that start on a cache line, as all memory of torch does."""
     return torch.empty(size, dtype=torch.uint8).numpy()
 
 
